@@ -1,0 +1,44 @@
+"""DeviceError: what a device was asked, what it answered, what was expected, what to do, and what has (not) moved."""
+
+from __future__ import annotations
+
+
+class DeviceError(Exception):
+    """A device did not do what it was asked.
+
+    The message is one readable paragraph; the parts stay available for machines.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        problem: str,
+        *,
+        request: str = "",
+        reply: str = "",
+        expected: str = "",
+        advice: str = "",
+        state: str = "",
+    ) -> None:
+        self.device, self.problem, self.request, self.reply = device, problem, request, reply
+        self.expected, self.advice, self.state = expected, advice, state
+        parts = [f"{device}: {problem}"]
+        if request:
+            parts.append(f"Asked {request!r}")
+        if reply:
+            parts.append(f"Answered {reply!r}")
+        if expected:
+            parts.append(f"Expected {expected}")
+        if advice:
+            parts.append(advice)
+        if state:
+            parts.append(state)
+        super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
+
+
+class DeviceTimeout(DeviceError):  # noqa: N818 - it is the name operators know
+    """A device did not answer, or a frame did not come, in the time allowed."""
+
+
+class DeviceRefused(DeviceError):  # noqa: N818
+    """The device (or its driver) refuses a setting; nothing has changed."""

@@ -1,0 +1,217 @@
+"""Device Protocols: what acquisition asks of a rotation stage, a camera and a shutter; angles in radians, time in s."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class StageLimits:
+    """What a stage can do.
+
+    Attributes:
+        counts_per_turn: encoder counts (or motor pulses) for 2π; triggers fall on whole counts.
+        max_speed, acceleration: rad/s, rad/s².
+        low, high: soft limits in radians.
+        trigger_output: it can emit position-synchronised trigger pulses.
+    """
+
+    counts_per_turn: int
+    max_speed: float
+    acceleration: float
+    low: float
+    high: float
+    trigger_output: bool
+
+
+@dataclass(frozen=True)
+class TriggerTrain:
+    """Position-synchronised pulses at start, start + interval, ... (n of them), in whole counts.
+
+    A negative interval means that the stage turns the other way.
+    """
+
+    start: int
+    interval: int
+    n: int
+
+    @property
+    def end(self) -> int:
+        """Count of the last pulse."""
+        return self.start + self.interval * (self.n - 1)
+
+
+class RotationStage(Protocol):
+    """A rotation stage with a position-synchronised trigger output."""
+
+    name: str
+
+    @property
+    def limits(self) -> StageLimits: ...
+
+    def to_counts(self, angle: float) -> int:
+        """The nearest whole count to an angle in radians."""
+        ...
+
+    def to_angle(self, counts: int) -> float: ...
+
+    def position(self) -> float:
+        """Radians, read from the device."""
+        ...
+
+    def start_move(self, angle: float, speed: float) -> None:
+        """Begin a move at `speed` (rad/s) and return at once. Refuses a target outside the limits."""
+        ...
+
+    def moving(self) -> bool: ...
+
+    def wait(self, timeout: float) -> float:
+        """Wait for the move to end; the position in radians. Raises DeviceTimeout, or DeviceError if it stopped short."""
+        ...
+
+    def arm(self, train: TriggerTrain) -> None:
+        """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
+        ...
+
+    def disarm(self) -> None: ...
+
+    def stop(self) -> None:
+        """Decelerate and stand. Legal in every state."""
+        ...
+
+    def abort(self) -> None:
+        """Stop at once, without deceleration. Legal in every state."""
+        ...
+
+    def describe(self) -> dict[str, str | int | float]:
+        """Identity and settings for the file's metadata."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class TriggerSource(StrEnum):
+    INTERNAL = "internal"
+    EXTERNAL = "external"
+    SOFTWARE = "software"
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """What is asked of a camera, and (as the return value of configure) what it accepted.
+
+    Attributes:
+        exposure: s.
+        trigger: who starts an exposure.
+        roi: (row0, col0, rows, cols) of the sensor; None is the full sensor.
+        binning: pixels summed per side.
+        readout: "standard" or "ultra_quiet".
+    """
+
+    exposure: float
+    trigger: TriggerSource
+    roi: tuple[int, int, int, int] | None = None
+    binning: int = 1
+    readout: str = "standard"
+
+
+@dataclass(frozen=True)
+class CameraTiming:
+    """What the camera says about its present settings; read, never computed by the caller.
+
+    Attributes:
+        shape: (rows, cols) of the frames that will come.
+        min_period: s between triggers below which pulses are ignored.
+        readout: s for a full frame.
+        row_period: s by which each row starts later than the one above (rolling shutter); 0 for a global one.
+        bits: of a count; saturation is 2**bits - 1.
+    """
+
+    shape: tuple[int, int]
+    min_period: float
+    readout: float
+    row_period: float
+    bits: int
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFrame:
+    """What a camera gives: pixels, its own frame counter (from 0 at arm), and the time of the trigger in s."""
+
+    counts: NDArray[np.uint16]
+    framestamp: int
+    time: float
+
+
+class Camera(Protocol):
+    """A triggered area camera with a ring of buffers."""
+
+    name: str
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        """Apply and read back. Raises DeviceRefused where the camera cannot."""
+        ...
+
+    @property
+    def timing(self) -> CameraTiming: ...
+
+    def arm(self, n_frames: int) -> None:
+        """Allocate the ring and wait for triggers; framestamps start at 0."""
+        ...
+
+    def software_trigger(self) -> None:
+        """Expose one frame (trigger source SOFTWARE)."""
+        ...
+
+    def next_frame(self, timeout: float) -> CameraFrame:
+        """The oldest frame not yet taken. Raises DeviceTimeout when none comes within `timeout` s."""
+        ...
+
+    def disarm(self) -> None:
+        """Stop and free the ring; legal in every state."""
+        ...
+
+    def describe(self) -> dict[str, str | int | float]: ...
+
+    def close(self) -> None: ...
+
+
+class Shutter(Protocol):
+    """Beam shutter. Darks need it closed."""
+
+    name: str
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def is_open(self) -> bool: ...
+
+
+class SampleMover(Protocol):
+    """Moves the sample out of the beam for flats, and back."""
+
+    name: str
+
+    def out(self) -> None: ...
+
+    def back(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Devices:
+    """The instrument as acquisition sees it; made by the composition root."""
+
+    stage: RotationStage
+    camera: Camera
+    shutter: Shutter
+    sample: SampleMover
+
+    def names(self) -> Sequence[str]:
+        return [self.stage.name, self.camera.name, self.shutter.name, self.sample.name]

@@ -1,0 +1,55 @@
+"""Grid and Volume: a box of voxels in the sample's frame, and the attenuation in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry import Geometry
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A box of cubic voxels; voxel [k, j, i] has its centre at centre + ((i, j, k) - (n - 1) / 2) * voxel_size.
+
+    Attributes:
+        shape: (nz, ny, nx) in voxels; z runs along the rotation axis.
+        voxel_size: edge in mm.
+        centre: (z, y, x) of the box's centre in mm; the rotation axis is x = y = 0.
+    """
+
+    shape: tuple[int, int, int]
+    voxel_size: float = 1.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or min(self.shape) < 1:
+            raise ValueError(f"grid shape must be (nz, ny, nx) >= 1, got {self.shape}")
+        if not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
+            raise ValueError(f"voxel_size must be a positive length in mm, got {self.voxel_size}")
+
+    @classmethod
+    def matching(cls, geometry: Geometry) -> Grid:
+        """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis."""
+        rows, cols = geometry.detector_shape
+        return cls((rows, cols, cols), geometry.pixel_pitch)
+
+    def coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Voxel centres along each axis: (z [nz], y [ny], x [nx]) in mm."""
+        return tuple(  # type: ignore[return-value]
+            c + (np.arange(n) - (n - 1) / 2) * self.voxel_size for n, c in zip(self.shape, self.centre, strict=True)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Attenuation on a grid. `data` is float32 [z, y, x] in 1/mm (1/pixel where the pitch is 1)."""
+
+    data: NDArray[np.float32]
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        if self.data.shape != self.grid.shape:
+            raise ValueError(f"volume data has shape {self.data.shape}, its grid {self.grid.shape}")
