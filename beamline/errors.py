@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class BeamlineError(Exception):
-    """A failure the operator can act on. The message says what happened, what was expected, what to do, what is untouched."""
+    """A failure the operator can act on: what happened, what was expected, what to do, what is untouched."""
 
     exit_code = 1
 

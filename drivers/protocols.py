@@ -72,7 +72,7 @@ class RotationStage(Protocol):
     def moving(self) -> bool: ...
 
     def wait(self, timeout: float) -> float:
-        """Wait for the move to end; the position in radians. Raises DeviceTimeout, or DeviceError if it stopped short."""
+        """Wait for the move to end; the position in rad. Raises DeviceTimeout, or DeviceError if it stopped short."""
         ...
 
     def arm(self, train: TriggerTrain) -> None:

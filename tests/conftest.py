@@ -1,0 +1,24 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with a fixed seed: a failing test fails again."""
+    return np.random.default_rng(20261120)
+
+
+@pytest.fixture
+def shared_data() -> Path:
+    """Folder of real scans beside the checkout; tests that need it skip where it is absent."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip("real scans are not beside this checkout (../shared/data)")
+    return SHARED_DATA
