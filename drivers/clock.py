@@ -15,7 +15,7 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """Wall-clock time that never goes back: epoch at start plus the monotonic counter, so no clock step reorders frames."""
+    """Wall-clock time that never goes back: epoch at start plus the monotonic counter, so that frames stay in order."""
 
     def __init__(self) -> None:
         self._epoch = time.time() - time.monotonic()

@@ -1,0 +1,121 @@
+"""ScanPlan: what a scan will do, as a value; its timeline says when, how fast, how blurred and how many bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frame import FrameKind
+from drivers.protocols import TriggerTrain
+
+
+class Mode(StrEnum):
+    FLY = "fly"
+    STEP = "step"
+    STATIC = "static"  # darks and flats: the stage stands
+
+
+class Place(StrEnum):
+    NONE = "none"
+    START = "start"
+    END = "end"
+    BOTH = "both"
+
+
+@dataclass(frozen=True)
+class FieldPlan:
+    """Darks or flats: how many, where in the scan, and their own exposure in s."""
+
+    count: int
+    at: Place
+    exposure: float
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPlan:
+    """What the operator asked for.
+
+    Attributes:
+        angles: float64 [view] radians, in the order of acquisition.
+        mode: FLY (pulses from the moving stage) or STEP (move, settle, expose).
+        exposure: s per view.
+        period: s between views of a fly scan (sets the speed); for a step scan the least time per view.
+        settle: s to wait after each move of a step scan.
+        darks, flats: reference frames.
+        scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
+    """
+
+    angles: NDArray[np.float64]
+    mode: Mode
+    exposure: float
+    period: float
+    settle: float
+    darks: FieldPlan
+    flats: FieldPlan
+    scheme: str
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A run of frames taken in one way; blocks follow one another in the file, row after row.
+
+    Attributes:
+        kind: what the frames show.
+        mode: how they are triggered.
+        first_row: file row of the block's first frame.
+        angles: float64 [frame] radians at whole counts, the angles that each row will carry (NaN in darks and flats
+            until acquisition fills in where the stage stands).
+        exposure, period: s.
+        trains: for FLY, one pulse train a pass (interlaced plans need several); their n add up to the block's.
+        speed: rad/s during the pulses (FLY).
+        taxi: radians of run-up before the first and after the last pulse (FLY).
+    """
+
+    kind: FrameKind
+    mode: Mode
+    first_row: int
+    angles: NDArray[np.float64]
+    exposure: float
+    period: float
+    trains: tuple[TriggerTrain, ...] = ()
+    speed: float = 0.0
+    taxi: float = 0.0
+
+    @property
+    def n(self) -> int:
+        return int(self.angles.size)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """A plan worked out for one stage and one camera. `violations` is empty exactly when the scan may start.
+
+    Attributes:
+        blocks: in the order of acquisition.
+        duration: s, with taxi, settling, moves and reference frames.
+        frame_bytes, total_bytes: uint16 pixels, per frame and for the whole file.
+        step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
+        step: radians that these counts are.
+        blur_px: how far a point at the detector's edge moves during an exposure, in pixels.
+        skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
+        violations: every limit that is broken, each one sentence with values and what to do.
+        remarks: what the operator should know though it breaks nothing.
+    """
+
+    blocks: tuple[Block, ...]
+    duration: float
+    frame_bytes: int
+    total_bytes: int
+    step_counts: int
+    step: float
+    blur_px: float
+    skew_px: float
+    violations: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def n_frames(self) -> int:
+        return sum(block.n for block in self.blocks)
