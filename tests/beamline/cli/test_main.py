@@ -1,0 +1,98 @@
+"""The command group: help without heavy imports, and one exit code for each kind of failure."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from beamline import errors
+from beamline.cli import main as module
+from drivers.errors import DeviceError, DeviceTimeout
+
+
+def _raiser(error: BaseException) -> Callable[[], None]:
+    def command() -> None:
+        raise error
+
+    return command
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> click.testing.Result:
+    fake = SimpleNamespace(demo=click.command("demo")(_raiser(error)))
+    monkeypatch.setattr(module, "import_module", lambda name: fake)
+    return CliRunner().invoke(module.main, ["demo"])
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (errors.ConfigError("bad key"), 2),
+        (errors.InstrumentError("stage gone"), 3),
+        (DeviceError("stage", "does not answer"), 3),
+        (DeviceTimeout("camera", "sent no frame"), 3),
+        (errors.ScanStopped("stopped at 12 of 90"), 4),
+        (errors.DataError("no flats"), 5),
+        (errors.QualityError("residual too large"), 6),
+        (errors.BeamlineError("something"), 1),
+        (OSError(errno.ENOSPC, "No space left on device", "out.h5"), 5),
+        (PermissionError(errno.EACCES, "Permission denied", "out.h5"), 5),
+        (KeyboardInterrupt(), 130),
+        (click.UsageError("what?"), 2),
+    ],
+)
+def test_each_failure_has_its_code_and_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int
+) -> None:
+    result = _run(monkeypatch, error)
+    assert result.exit_code == code
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert result.stderr.strip()
+    if str(error) and not isinstance(error, click.ClickException):
+        assert str(error) in result.stderr
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _run(monkeypatch, ZeroDivisionError("defect"))
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["--nonsense"]])
+def test_unknown_words_are_usage(arguments: list[str]) -> None:
+    result = CliRunner().invoke(module.main, arguments)
+    assert result.exit_code == 2
+    assert "nonsense" in result.stderr
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from click.testing import CliRunner; from beamline.cli.main import main;"
+        "r = CliRunner().invoke(main, ['--help']); assert r.exit_code == 0, r.output; print(r.stdout);"
+        "bad = {'torch', 'numba', 'h5py', 'matplotlib', 'scipy', 'pydantic'} & set(sys.modules); assert not bad, bad"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    for name in module.LazyGroup().list_commands(click.Context(module.main)):
+        assert f"  {name} " in done.stdout
+
+
+def test_every_command_exists() -> None:
+    context = click.Context(module.main)
+    for name in module.main.list_commands(context):
+        command = module.main.get_command(context, name)
+        assert command is not None
+        assert command.name == name
+
+
+def test_version() -> None:
+    result = CliRunner().invoke(module.main, ["--version"])
+    assert result.exit_code == 0
+    assert result.stdout.startswith("beamline, version ")
