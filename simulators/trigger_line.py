@@ -1,0 +1,71 @@
+"""Trigger line: the cable from the stage's trigger output to the camera; the stage schedules, the camera consumes.
+
+Pulses are put on the line with the time at which they will rise, often ahead of that time: the stage knows its motion
+when it starts. A consumer takes a pulse as sent only once the clock has passed its time, for a stop cancels the rest.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from operator import attrgetter
+
+from drivers.clock import Clock
+
+
+@dataclass(frozen=True, order=True)
+class Pulse:
+    """A rising edge: its time in s since the Unix epoch and the stage's true angle at that time in radians."""
+
+    time: float
+    angle: float
+
+
+class TriggerLine:
+    """Pulses in the order of time, and the true angle of whatever turns the sample. Safe from several threads."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self._pulses: list[Pulse] = []
+        self._angle: Callable[[float], float] | None = None
+        self._lock = threading.Lock()
+
+    def schedule(self, pulses: Iterable[Pulse]) -> None:
+        """Put pulses on the line, in any order.
+
+        Raises:
+            ValueError: a time is not finite; the line stays as it was.
+        """
+        new = list(pulses)
+        if bad := [pulse for pulse in new if not math.isfinite(pulse.time)]:
+            raise ValueError(f"a pulse needs a finite time, got {bad[0]}; no pulse was scheduled")
+        with self._lock:
+            self._pulses = sorted([*self._pulses, *new])
+
+    def cancel_after(self, time: float) -> int:
+        """Take away the pulses later than `time`; the number of them."""
+        with self._lock:
+            keep = bisect_right(self._pulses, time, key=attrgetter("time"))
+            cancelled = len(self._pulses) - keep
+            del self._pulses[keep:]
+            return cancelled
+
+    def next_after(self, time: float) -> Pulse | None:
+        """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
+        with self._lock:
+            at = bisect_right(self._pulses, time, key=attrgetter("time"))
+            return self._pulses[at] if at < len(self._pulses) else None
+
+    def attach_angle(self, angle: Callable[[float], float]) -> None:
+        """Say what turns the sample: `angle(time)` is its true angle in radians. A later one replaces it."""
+        with self._lock:
+            self._angle = angle
+
+    def angle_at(self, time: float) -> float:
+        """The true angle in radians at `time`; 0 where nothing turns the sample."""
+        with self._lock:
+            angle = self._angle
+        return 0.0 if angle is None else float(angle(time))
