@@ -1,0 +1,96 @@
+"""Angle plans: which views to take, in which order; every plan is float64 [view] in radians."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""The golden section; modulo one, its multiples stay spread at every length (three-gap theorem, Sós 1957)."""
+
+
+def _require(views: int, at_least: int = 1) -> None:
+    if views < at_least:
+        raise ValueError(f"a plan needs at least {at_least} view(s), got {views}")
+
+
+def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
+    """Equal steps of span / views from `start`; the end is excluded, for it is the start again (or its mirror).
+
+    A negative span turns the other way.
+    """
+    _require(views)
+    return start + np.arange(views, dtype=np.float64) * (span / views)
+
+
+def sector(views: int, first: float, last: float) -> NDArray[np.float64]:
+    """Equal steps from `first` to `last`, both included: a limited-angle scan. One view stands at `first`."""
+    _require(views)
+    return np.linspace(first, last, views)
+
+
+def random(views: int, start: float = 0.0, span: float = math.pi, *, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Uniformly random over [start, start + span), sorted along the span, so that the stage passes it once."""
+    _require(views)
+    return start + span * np.sort(rng.random(views))
+
+
+def pass_order(passes: int) -> NDArray[np.intp]:
+    """The order in which the gaps of the first pass are filled: a permutation of 0 ... passes - 1.
+
+    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, without the values that `passes` does not
+    reach; so each pass falls near the middle of the largest gap that is left, for any number of passes.
+    """
+    _require(passes)
+    bits = (passes - 1).bit_length()
+    values = np.arange(1 << bits)
+    reversed_bits = sum((((values >> bit) & 1) << (bits - 1 - bit) for bit in range(bits)), np.zeros_like(values))
+    return reversed_bits[reversed_bits < passes].astype(np.intp)
+
+
+def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
+    """The `fixed` angles in `passes` sweeps of the span; each sweep goes the same way and takes every passes-th view.
+
+    One direction for all sweeps, because a motor's backlash would shift the views of the sweeps against each other.
+
+    Raises:
+        ValueError: the passes do not divide the views, or leave fewer than two views a pass.
+    """
+    _require(views)
+    if passes < 1 or views % passes or (passes > 1 and views // passes < 2):
+        legal = [p for p in range(1, views // 2 + 1) if views % p == 0] or [1]
+        some = ", ".join(map(str, legal[:12])) + (" ..." if len(legal) > 12 else "")
+        raise ValueError(f"{views} views cannot be taken in {passes} equal passes of two or more; legal passes: {some}")
+    index = (pass_order(passes)[:, None] + np.arange(0, views, passes)[None, :]).ravel()
+    return fixed(views, start, span)[index]
+
+
+def golden(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
+    """View k stands at start + span * frac(k * GOLDEN) (Köhler 2004): well spread whenever the scan ends."""
+    _require(views)
+    return start + span * np.mod(np.arange(views, dtype=np.float64) * GOLDEN, 1.0)
+
+
+def from_text(text: str) -> NDArray[np.float64]:
+    """Degrees, one a line, in the order of acquisition; # starts a comment, empty lines count for nothing.
+
+    Raises:
+        ValueError: a line holds no finite number, or there is none; it names the line.
+    """
+    degrees = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        word = line.split("#", 1)[0].strip()
+        if not word:
+            continue
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees, such as 12.5")
+        degrees.append(value)
+    if not degrees:
+        raise ValueError("there is no angle in it; expected degrees, one a line")
+    return np.deg2rad(np.array(degrees, dtype=np.float64))
