@@ -1,0 +1,196 @@
+"""FrameDigest: what the monitor, the operator and the file need to know about a frame, gathered in one pass.
+
+Counts (uint16) are looked at once: a histogram of grey values holds every statistic but the preview exactly. Other
+types need the range before the histogram, so they are looked at twice. Pixels that are not finite, or hold the
+no-data value, are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+ENTROPY_BINS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class FrameDigest:
+    """Statistics of the valid pixels of one frame. Where no pixel is valid, the numbers are NaN.
+
+    Attributes:
+        minimum, maximum, mean: in the frame's own unit (counts for a raw frame).
+        variance: population variance (divisor n), unit squared.
+        sum_abs: sum of absolute values.
+        invalid_fraction: pixels that are not finite or hold the no-data value, over all pixels.
+        saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
+        entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
+            (0 for a constant frame, at most 8).
+        checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
+        preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
+            none); blocks at the lower and right edge are smaller where bin does not divide the shape.
+    """
+
+    minimum: float
+    maximum: float
+    mean: float
+    variance: float
+    sum_abs: float
+    invalid_fraction: float
+    saturated_fraction: float
+    entropy: float
+    checksum: int
+    preview: NDArray[np.float32]
+
+
+def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
+    """Shape of the preview of a frame of `shape`."""
+    return -(-shape[0] // preview_bin), -(-shape[1] // preview_bin)
+
+
+def digest(
+    image: NDArray[np.generic], saturation: float | None = None, preview_bin: int = 4, no_data: float | None = None
+) -> FrameDigest:
+    """Digest of one frame [row, col] of any real type.
+
+    Args:
+        saturation: the value from which a pixel counts as saturated (65535 for a full 16-bit range).
+        preview_bin: pixels per side of a preview block.
+        no_data: a value that marks pixels without a measurement.
+
+    Raises ValueError for an array that is not two-dimensional, empty or complex, or for a bin below 1.
+    """
+    if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
+        raise ValueError(f"A frame is a non-empty real [row, col] array, not {image.dtype} {image.shape}.")
+    if preview_bin < 1:
+        raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
+    image = np.ascontiguousarray(image)
+    checksum = zlib.crc32(memoryview(image).cast("B"))
+    preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
+    if image.dtype == np.uint16 and no_data is None:
+        histogram = _count_greys(image, preview_bin, preview)
+        numbers = _from_greys(histogram, saturation)
+    else:
+        if image.dtype not in (np.float32, np.float64):
+            image = image.astype(np.float64)
+        numbers = _from_reals(image, saturation, preview_bin, no_data, preview)
+    return FrameDigest(*numbers, checksum, preview)
+
+
+Numbers = tuple[float, float, float, float, float, float, float, float]
+
+
+def _from_greys(histogram: NDArray[np.int64], saturation: float | None) -> Numbers:
+    greys = np.flatnonzero(histogram)
+    n = histogram[greys]
+    size = int(n.sum())
+    total = int((greys * n).sum())  # below 2**63 for any frame under 2**47 pixels
+    low, high = int(greys[0]), int(greys[-1])
+    mean = total / size
+    variance = float((n * (greys - mean) ** 2).sum()) / size
+    saturated = 0 if saturation is None else int(n[greys >= saturation].sum())
+    bins = np.minimum((greys - low) * ENTROPY_BINS // max(high - low, 1), ENTROPY_BINS - 1)
+    folded = np.bincount(bins, weights=n, minlength=ENTROPY_BINS)
+    return float(low), float(high), mean, variance, float(total), 0.0, saturated / size, _entropy(folded)
+
+
+def _from_reals(
+    image: NDArray[np.floating], saturation: float | None, preview_bin: int, no_data: float | None, preview: NDArray
+) -> Numbers:
+    marker = np.nan if no_data is None else image.dtype.type(no_data)
+    threshold = np.inf if saturation is None else saturation
+    n, low, high, mean, squares, sum_abs, saturated = _sum_reals(image, threshold, preview_bin, marker, preview)
+    invalid = (image.size - n) / image.size
+    if n == 0:
+        return np.nan, np.nan, np.nan, np.nan, np.nan, invalid, 0.0, np.nan
+    entropy = _entropy(_count_reals(image, low, high, marker)) if high > low else 0.0
+    return low, high, mean, squares / n, sum_abs, invalid, saturated / image.size, entropy
+
+
+def _entropy(histogram: NDArray) -> float:
+    p = histogram[histogram > 0] / histogram.sum()
+    return max(0.0, float(-(p * np.log2(p)).sum()))
+
+
+@numba.njit(nogil=True, cache=True)
+def _count_greys(image, preview_bin, preview):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Histogram of all 65536 grey values; fills the preview on the way."""
+    rows, cols = image.shape
+    # Two histograms by turns: neighbours are often equal, and an increment must not wait for the one before it.
+    even = np.zeros(65536, np.int64)
+    odd = np.zeros(65536, np.int64)
+    sums = np.empty(preview.shape[1], np.uint64)
+    for block in range(preview.shape[0]):
+        first, last = block * preview_bin, min((block + 1) * preview_bin, rows)
+        sums[:] = 0
+        for row in range(first, last):
+            for block_col in range(preview.shape[1]):
+                left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
+                total = np.uint64(0)
+                for col in range(left, right):
+                    grey = image[row, col]
+                    if col & 1:
+                        odd[grey] += 1
+                    else:
+                        even[grey] += 1
+                    total += np.uint64(grey)
+                sums[block_col] += total
+        for block_col in range(preview.shape[1]):
+            width = min(preview_bin, cols - block_col * preview_bin)
+            preview[block, block_col] = sums[block_col] / (width * (last - first))
+    return even + odd
+
+
+@numba.njit(nogil=True, cache=True)
+def _sum_reals(image, saturation, preview_bin, no_data, preview):  # type: ignore[no-untyped-def]
+    """Range and moments of the valid pixels, block by block (Chan, Golub & LeVeque 1983), and the preview."""
+    rows, cols = image.shape
+    n, saturated = 0, 0
+    low, high, mean, squares, sum_abs = np.inf, -np.inf, 0.0, 0.0, 0.0
+    for block in range(preview.shape[0]):
+        first, last = block * preview_bin, min((block + 1) * preview_bin, rows)
+        for block_col in range(preview.shape[1]):
+            left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
+            n_block, sum_block = 0, 0.0
+            for row in range(first, last):
+                for col in range(left, right):
+                    value = image[row, col]
+                    if np.isfinite(value) and value != no_data:
+                        n_block += 1
+                        sum_block += value
+                        sum_abs += abs(value)
+                        low = min(low, value)
+                        high = max(high, value)
+                        if value >= saturation:
+                            saturated += 1
+            if n_block == 0:
+                preview[block, block_col] = np.nan
+                continue
+            mean_block = sum_block / n_block
+            preview[block, block_col] = mean_block
+            for row in range(first, last):
+                for col in range(left, right):
+                    value = image[row, col]
+                    if np.isfinite(value) and value != no_data:
+                        squares += (value - mean_block) ** 2
+            step = mean_block - mean
+            squares += step * step * n * n_block / (n + n_block)
+            mean += step * n_block / (n + n_block)
+            n += n_block
+    return n, low, high, mean, squares, sum_abs, saturated
+
+
+@numba.njit(nogil=True, cache=True)
+def _count_reals(image, low, high, no_data):  # type: ignore[no-untyped-def]
+    """Histogram of the valid pixels in ENTROPY_BINS equal bins over [low, high]."""
+    histogram = np.zeros(ENTROPY_BINS, np.int64)
+    scale = ENTROPY_BINS / (high - low)
+    for row in range(image.shape[0]):
+        for col in range(image.shape[1]):
+            value = image[row, col]
+            if np.isfinite(value) and value != no_data:
+                histogram[min(int((value - low) * scale), ENTROPY_BINS - 1)] += 1
+    return histogram
