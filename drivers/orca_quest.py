@@ -1,0 +1,68 @@
+"""ORCA-Quest figures: what the data sheet says about settings and timing, for planning where no camera may be asked.
+
+C15550-20UP: limits and line times from the vendor's property table; a real camera's own answer always goes before
+these. Two rows are read together in one line time, so row r starts r / 2 line times after row 0.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from drivers.protocols import CameraSettings, CameraTiming
+
+SENSOR_SHAPE = (2304, 4096)
+PITCH_MM = 4.6e-3
+BITS = 16
+ROI_STEP = 4
+BINNINGS = (1, 2, 4)
+LINE_TIME = MappingProxyType({"standard": 7.2e-6, "ultra_quiet": 172.8e-6})
+"""s for two rows; also the shortest exposure."""
+MAX_EXPOSURE = 1800.0
+FRAME_OVERHEAD_LINES = 5
+"""Line times between frames: with 1152 lines they make the 120 frames/s of the standard mode."""
+LINK_BYTES_PER_S = MappingProxyType({"usb3": 4096 * 2304 * 2 * 17.6996, "coaxpress": 4096 * 2304 * 2 * 120.04})
+"""From the full-frame 16-bit rates of the two interfaces."""
+
+
+def refusal(settings: CameraSettings) -> str:
+    """Why the camera would refuse the settings, with the legal values; empty where it would not."""
+    if settings.readout not in LINE_TIME:
+        return f"readout {settings.readout!r} is unknown; legal: {', '.join(LINE_TIME)}"
+    if settings.binning not in BINNINGS:
+        return f"binning {settings.binning} is not offered; legal: {', '.join(map(str, BINNINGS))}"
+    shortest = LINE_TIME[settings.readout]
+    if not shortest <= settings.exposure <= MAX_EXPOSURE:
+        return f"exposure {settings.exposure:g} s lies outside {shortest:g} ... {MAX_EXPOSURE:g} s ({settings.readout})"
+    row0, col0, rows, cols = settings.roi or (0, 0, *SENSOR_SHAPE)
+    if any(value % ROI_STEP for value in (row0, col0, rows, cols)):
+        return f"roi {[row0, col0, rows, cols]} must be in steps of {ROI_STEP} pixels"
+    if not (0 <= row0 < row0 + rows <= SENSOR_SHAPE[0] and 0 <= col0 < col0 + cols <= SENSOR_SHAPE[1]):
+        return (
+            f"roi {[row0, col0, rows, cols]} (row0, col0, rows, cols) does not lie on the sensor of "
+            f"{SENSOR_SHAPE[0]} x {SENSOR_SHAPE[1]}"
+        )
+    return ""
+
+
+def timing(settings: CameraSettings, link: str = "usb3") -> CameraTiming:
+    """Frame shape and times under external or software triggers, where readout does not overlap the next exposure.
+
+    The least period is exposure + readout, or the time the link takes for a frame where that is longer.
+
+    Raises:
+        ValueError: the camera would refuse the settings.
+    """
+    if problem := refusal(settings):
+        raise ValueError(problem)
+    _, _, rows, cols = settings.roi or (0, 0, *SENSOR_SHAPE)
+    shape = (rows // settings.binning, cols // settings.binning)
+    line = LINE_TIME[settings.readout]
+    readout = rows / 2 * line
+    transfer = shape[0] * shape[1] * 2 / LINK_BYTES_PER_S[link]
+    return CameraTiming(
+        shape=shape,
+        min_period=max(settings.exposure + readout + FRAME_OVERHEAD_LINES * line, transfer),
+        readout=readout,
+        row_period=line / 2 * settings.binning,
+        bits=BITS,
+    )
