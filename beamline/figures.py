@@ -1,0 +1,194 @@
+"""Pictures for reports: arrays to PNG bytes, with labelled axes, units and a stated grey window."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from recon.geometry import Geometry
+from recon.volume import Volume
+
+Window = tuple[float, float]
+_DPI = 110
+_WIDTH = 8.6  # inches; the report's column
+
+
+def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> Window:
+    """The range of grey values that shows all `arrays` alike: percentiles of what they hold together."""
+    finite = np.concatenate([a[np.isfinite(a)].ravel() for a in arrays])
+    if finite.size == 0:
+        return 0.0, 1.0
+    bottom, top = (float(v) for v in np.percentile(finite, [low, high]))
+    return (bottom, top) if top > bottom else (bottom, bottom + 1.0)
+
+
+def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
+    """One corrected view [row, col], with the axis where the reconstruction put it."""
+    rows, cols = geometry.detector_shape
+    pitch = geometry.pixel_pitch
+    left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
+    height = np.clip(0.82 * _WIDTH * rows / cols, 1.6, 6.0)
+    figure, axes = _figure((_WIDTH, height + 0.8))
+    image = axes.imshow(
+        data[view],
+        cmap="gray",
+        extent=(left * pitch, right * pitch, -rows / 2 * pitch, rows / 2 * pitch),
+        origin="lower",
+        interpolation="nearest",
+        norm=Normalize(*grey_window([data[view]])),
+    )
+    axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
+    axes.set(
+        xlabel=f"u ({unit})",
+        ylabel=f"z ({unit})",
+        title=f"View at {np.degrees(geometry.angles[view]):.2f}°",
+    )
+    figure.colorbar(image, ax=axes, label="line integral", shrink=0.9, pad=0.02)
+    return _png(figure)
+
+
+def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
+    """All views of one detector row, in order of angle."""
+    order = np.argsort(geometry.angles, kind="stable")
+    angles = np.degrees(geometry.angles[order])
+    image_rows = data[order, row]
+    figure, axes = _figure((_WIDTH, 4.2))
+    image = axes.imshow(
+        image_rows, cmap="gray", aspect="auto", interpolation="nearest", norm=Normalize(*grey_window([image_rows]))
+    )
+    axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
+    ticks = np.unique(np.linspace(0, len(order) - 1, min(len(order), 7)).round().astype(int))
+    axes.set_yticks(ticks, [f"{angles[i]:.0f}" for i in ticks])
+    axes.set(xlabel="column (px)", ylabel="angle (°)", title=f"Sinogram of row {row}, {len(order)} views")
+    figure.colorbar(image, ax=axes, label="line integral", pad=0.02)
+    return _png(figure)
+
+
+def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window | None = None) -> bytes:
+    """Three orthogonal slices through the middle of each volume, side by side in one grey window.
+
+    Args:
+        volumes: by name, all on grids of the same size.
+        unit: of length; the volumes are in 1/unit.
+        window: grey values in 1/unit; None takes the 1st to 99.5th percentile of all the slices shown.
+    """
+    first = next(iter(volumes.values())).grid
+    nz, ny, nx = first.shape
+    slices = {name: _middle(volume) for name, volume in volumes.items()}
+    window = window or grey_window([image for images in slices.values() for image in images])
+    # A stack of few rows stays visible, at the cost of its aspect.
+    heights = [ny / nx, max(nz / nx, 0.06), max(nz / ny, 0.06)]
+    column = min((_WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
+    size = (1.2 + column * len(volumes), 1.3 + (column - 0.35) * sum(heights) + 0.35 * len(heights))
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
+    z, y, x = (_edges(first.centre[i], first.shape[i], first.voxel_size) for i in range(3))
+    planes = (("x", "y", x, y), ("x", "z", x, z), ("y", "z", y, z))
+    for j, (name, images) in enumerate(slices.items()):
+        for i, (image, (across, up, h_edges, v_edges)) in enumerate(zip(images, planes, strict=True)):
+            axes = panels[i][j]
+            thin = image.shape[0] < 0.06 * image.shape[1]
+            shown = axes.imshow(
+                image,
+                cmap="gray",
+                origin="lower",
+                extent=(*h_edges, *v_edges),
+                aspect="auto" if thin else "equal",
+                interpolation="nearest",
+                norm=Normalize(*window),
+            )
+            axes.tick_params(labelsize=7)
+            axes.set_xlabel(f"{across} ({unit})", fontsize=8)
+            if j == 0:
+                axes.set_ylabel(f"{up} ({unit})", fontsize=8)
+            else:
+                axes.tick_params(labelleft=False)
+            if i == 0:
+                axes.set_title(name, fontsize=11)
+    bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
+    bar.set_label(f"attenuation (1/{unit})")
+    return _png(figure)
+
+
+def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
+    """The figure of merit of the rotation axis over its candidates (columns), and the one chosen."""
+    figure, axes = _figure((_WIDTH, 2.8))
+    axes.plot(candidates, curve, color="0.25", lw=1.2)
+    axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
+    axes.set(xlabel="axis candidate (column, px)", ylabel="score (arb. units)")
+    axes.set_title("Rotation axis: " + ("a clear optimum" if confident else "NOT a clear optimum"))
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+    return _png(figure)
+
+
+def quality_against_time(
+    history: Mapping[str, NDArray[np.floating]], psnr: Sequence[tuple[float, float]] = ()
+) -> bytes:
+    """Loss and residual of the fit against time; PSNR of snapshots where there is a truth; views where they grow.
+
+    Args:
+        history: equally long "seconds", "loss", and where known "residual", "n_views", "n_gaussians".
+        psnr: (seconds, dB) of each snapshot.
+    """
+    seconds = history["seconds"]
+    growing = [
+        (name, label)
+        for name, label in (("n_views", "views"), ("n_gaussians", "Gaussians"))
+        if name in history and np.ptp(history[name]) > 0
+    ]
+    panels = 1 + bool(psnr) + bool(growing)
+    figure = Figure(figsize=(_WIDTH, 3.1), dpi=_DPI, layout="constrained")
+    left, *others = np.atleast_1d(figure.subplots(1, panels))
+    for name, colour in (("loss", "tab:blue"), ("residual", "tab:orange")):
+        if name in history and np.any(np.isfinite(history[name])):
+            left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=name)
+    positive = [line for line in left.get_lines() if np.all(np.asarray(line.get_ydata()) > 0)]
+    if len(positive) == len(left.get_lines()):
+        left.set_yscale("log")
+    left.set(xlabel="time (s)", title="Misfit")
+    left.legend(fontsize=8)
+    if psnr:
+        axes = others.pop(0)
+        axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
+        axes.set(xlabel="time (s)", ylabel="PSNR (dB)", title="Quality against the truth")
+    if growing:
+        axes = others.pop(0)
+        for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):
+            values = history[name] / np.max(history[name])
+            axes.step(seconds, values, where="post", color=colour, lw=1.2, label=f"{label} / {history[name].max():.0f}")
+        axes.set(xlabel="time (s)", ylabel="share of the largest", ylim=(0, 1.05), title="Growth")
+        axes.legend(fontsize=8, loc="lower right")
+    for panel in figure.axes:
+        panel.grid(alpha=0.3)
+        panel.tick_params(labelsize=8)
+    return _png(figure)
+
+
+def _middle(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    nz, ny, nx = volume.grid.shape
+    return volume.data[nz // 2], volume.data[:, ny // 2], volume.data[:, :, nx // 2]
+
+
+def _edges(centre: float, n: int, size: float) -> tuple[float, float]:
+    return centre - n / 2 * size, centre + n / 2 * size
+
+
+def _figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    return figure, figure.subplots()
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()
