@@ -1,0 +1,146 @@
+"""Trapezoid move: speed up, cruise, slow down, in closed form: position at a time and time at a position.
+
+With distance D, speed v and acceleration a the move takes D/v + v/a; where D < v²/a it never reaches v and takes
+2√(D/a) (constant-acceleration kinematics). A stop on the way is another such move that shares the past of the first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Constant acceleration for a while. Times are s after the move began; the rest is in the unit of the position."""
+
+    begin: float
+    duration: float
+    position: float
+    velocity: float
+    acceleration: float
+
+    @property
+    def end(self) -> float:
+        return self.begin + self.duration
+
+    def position_after(self, seconds: float) -> float:
+        return self.position + (self.velocity + 0.5 * self.acceleration * seconds) * seconds
+
+    def velocity_after(self, seconds: float) -> float:
+        return self.velocity + self.acceleration * seconds
+
+
+@dataclass(frozen=True)
+class TrapezoidMove:
+    """A move from `start` to `target` that began at `begin` (s, on any clock). Built by `between`."""
+
+    begin: float
+    start: float
+    target: float
+    phases: tuple[Phase, ...]
+
+    @classmethod
+    def between(cls, start: float, target: float, speed: float, acceleration: float, begin: float) -> TrapezoidMove:
+        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration.
+
+        Raises:
+            ValueError: speed or acceleration is not positive.
+        """
+        if not (speed > 0 and acceleration > 0):
+            raise ValueError(f"speed and acceleration must be positive, not {speed} and {acceleration}")
+        distance, sign = abs(target - start), math.copysign(1.0, target - start)
+        peak = min(speed, math.sqrt(distance * acceleration))
+        ramp = peak / acceleration
+        cruise = max(0.0, distance / peak - ramp) if peak > 0 else 0.0
+        up = Phase(0.0, ramp, start, 0.0, sign * acceleration)
+        flat = Phase(ramp, cruise, start + sign * 0.5 * peak * ramp, sign * peak, 0.0)
+        down = Phase(flat.end, ramp, target - sign * 0.5 * peak * ramp, sign * peak, -sign * acceleration)
+        return cls(begin, start, target, tuple(phase for phase in (up, flat, down) if phase.duration > 0))
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.phases[-1].end if self.phases else 0.0
+
+    @property
+    def end(self) -> float:
+        """When it stands again."""
+        return self.begin + self.duration
+
+    @property
+    def direction(self) -> int:
+        """+1, -1, or 0 for a move to where it stands."""
+        return (self.target > self.start) - (self.target < self.start)
+
+    def position(self, time: float) -> float:
+        seconds = time - self.begin
+        if seconds <= 0:
+            return self.start
+        phase = self._phase(seconds)
+        if phase is None:
+            return self.target
+        low, high = sorted((self.start, self.target))
+        return min(max(phase.position_after(seconds - phase.begin), low), high)
+
+    def velocity(self, time: float) -> float:
+        seconds = time - self.begin
+        phase = self._phase(seconds) if seconds >= 0 else None
+        return 0.0 if phase is None else phase.velocity_after(seconds - phase.begin)
+
+    def acceleration(self, time: float) -> float:
+        seconds = time - self.begin
+        phase = self._phase(seconds) if seconds >= 0 else None
+        return 0.0 if phase is None else phase.acceleration
+
+    def time_at(self, position: float) -> float:
+        """When the move passes `position`.
+
+        Raises:
+            ValueError: it never does.
+        """
+        low, high = sorted((self.start, self.target))
+        if not low <= position <= high:
+            raise ValueError(f"a move from {self.start} to {self.target} does not pass {position}")
+        sign = self.direction
+        for phase in self.phases:
+            ahead = sign * (position - phase.position)
+            if ahead <= sign * (phase.position_after(phase.duration) - phase.position):
+                return self.begin + phase.begin + min(_seconds_for(max(ahead, 0.0), phase, sign), phase.duration)
+        return self.end
+
+    def braked(self, time: float, acceleration: float) -> TrapezoidMove:
+        """The same move until `time`, then slowed down to a stand with `acceleration` (> 0)."""
+        past, velocity, here = self._until(time), self.velocity(time), self.position(time)
+        seconds = abs(velocity) / acceleration
+        if seconds == 0:
+            return TrapezoidMove(self.begin, self.start, here, past)
+        slow = Phase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
+        return TrapezoidMove(self.begin, self.start, slow.position_after(seconds), (*past, slow))
+
+    def halted(self, position: float) -> TrapezoidMove:
+        """The same move until it reaches `position`, where it stands at once, as an emergency stop does.
+
+        Raises:
+            ValueError: the move does not pass there.
+        """
+        return TrapezoidMove(self.begin, self.start, position, self._until(self.time_at(position)))
+
+    def _phase(self, seconds: float) -> Phase | None:
+        """The phase at `seconds` after the beginning; None once it stands."""
+        return next((phase for phase in self.phases if seconds < phase.end), None)
+
+    def _until(self, time: float) -> tuple[Phase, ...]:
+        seconds = time - self.begin
+        return tuple(
+            replace(phase, duration=min(phase.end, seconds) - phase.begin)
+            for phase in self.phases
+            if phase.begin < seconds
+        )
+
+
+def _seconds_for(distance: float, phase: Phase, sign: int) -> float:
+    """Time to cover `distance` ahead in a phase: the root of d = vt + at²/2 in the form that does not cancel."""
+    velocity, acceleration = sign * phase.velocity, sign * phase.acceleration
+    root = math.sqrt(max(velocity * velocity + 2.0 * acceleration * distance, 0.0))
+    return 2.0 * distance / (velocity + root) if velocity + root > 0 else 0.0
