@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -52,7 +53,7 @@ def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
 
 
 def digest(
-    image: NDArray[np.generic], saturation: float | None = None, preview_bin: int = 4, no_data: float | None = None
+    image: NDArray[Any], saturation: float | None = None, preview_bin: int = 4, no_data: float | None = None
 ) -> FrameDigest:
     """Digest of one frame [row, col] of any real type.
 
@@ -68,7 +69,7 @@ def digest(
     if preview_bin < 1:
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image)
-    checksum = zlib.crc32(memoryview(image).cast("B"))
+    checksum = zlib.crc32(image.data.cast("B"))
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     if image.dtype == np.uint16 and no_data is None:
         histogram = _count_greys(image, preview_bin, preview)
@@ -98,7 +99,7 @@ def _from_greys(histogram: NDArray[np.int64], saturation: float | None) -> Numbe
 
 
 def _from_reals(
-    image: NDArray[np.floating], saturation: float | None, preview_bin: int, no_data: float | None, preview: NDArray
+    image: NDArray[Any], saturation: float | None, preview_bin: int, no_data: float | None, preview: NDArray[np.float32]
 ) -> Numbers:
     marker = np.nan if no_data is None else image.dtype.type(no_data)
     threshold = np.inf if saturation is None else saturation
@@ -110,7 +111,7 @@ def _from_reals(
     return low, high, mean, squares / n, sum_abs, invalid, saturated / image.size, entropy
 
 
-def _entropy(histogram: NDArray) -> float:
+def _entropy(histogram: NDArray[Any]) -> float:
     p = histogram[histogram > 0] / histogram.sum()
     return max(0.0, float(-(p * np.log2(p)).sum()))
 
@@ -120,28 +121,27 @@ def _count_greys(image, preview_bin, preview):  # type: ignore[no-untyped-def]  
     """Histogram of all 65536 grey values; fills the preview on the way."""
     rows, cols = image.shape
     # Two histograms by turns: neighbours are often equal, and an increment must not wait for the one before it.
-    even = np.zeros(65536, np.int64)
-    odd = np.zeros(65536, np.int64)
-    sums = np.empty(preview.shape[1], np.uint64)
+    histogram = np.zeros((2, 65536), np.uint32)
+    sums = np.empty(cols, np.uint32)
     for block in range(preview.shape[0]):
         first, last = block * preview_bin, min((block + 1) * preview_bin, rows)
         sums[:] = 0
         for row in range(first, last):
-            for block_col in range(preview.shape[1]):
-                left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
-                total = np.uint64(0)
-                for col in range(left, right):
-                    grey = image[row, col]
-                    if col & 1:
-                        odd[grey] += 1
-                    else:
-                        even[grey] += 1
-                    total += np.uint64(grey)
-                sums[block_col] += total
+            line = image[row]
+            for col in range(0, cols - 1, 2):
+                histogram[0, line[col]] += 1
+                histogram[1, line[col + 1]] += 1
+            if cols & 1:
+                histogram[0, line[cols - 1]] += 1
+            for col in range(cols):
+                sums[col] += line[col]
         for block_col in range(preview.shape[1]):
-            width = min(preview_bin, cols - block_col * preview_bin)
-            preview[block, block_col] = sums[block_col] / (width * (last - first))
-    return even + odd
+            left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
+            total = np.uint64(0)
+            for col in range(left, right):
+                total += sums[col]
+            preview[block, block_col] = total / ((right - left) * (last - first))
+    return histogram.sum(0).astype(np.int64)
 
 
 @numba.njit(nogil=True, cache=True)

@@ -1,0 +1,261 @@
+"""The layout of our HDF5 scans: every path, type and unit, made once before the first frame and only grown after.
+
+    /entry                      NXentry, definition NXtomo (NeXus definitions 2026.01): title, start_time, end_time
+      instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
+                                count_time (s), x_pixel_size, y_pixel_size, distance (mm)
+      instrument/beam           incident_energy;  instrument/devices: what each device said of itself
+      sample                    name, rotation_angle (degree)
+      data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
+      frame_log                 trigger, framestamp, time, flags of each frame
+      digest                    statistics of each frame, and preview f32 [frame, row, col]
+      record                    plan (JSON), config (YAML), period, axis_col, quantity, program
+      progress                  frames_committed, finished, status, missing_triggers
+    /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
+
+image_key holds 0, 1, 2, 3; image_key_control holds ESRF's extension, -1 for an alignment frame (image_key 0).
+Float frames are no NXtomo (its data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from types import MappingProxyType
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.digest import FrameDigest, preview_shape
+from beamline.version import version
+from drivers.frame import FrameKind
+
+LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
+NXTOMO = "NXtomo"
+FLOAT_DEFINITION = "splatline_float_projections"
+
+ENTRY = "/entry"
+DETECTOR = "/entry/instrument/detector"
+DATA = f"{DETECTOR}/data"
+IMAGE_KEY = f"{DETECTOR}/image_key"
+ANGLE = "/entry/sample/rotation_angle"
+PREVIEW = "/entry/digest/preview"
+COMMITTED = "/entry/progress/frames_committed"
+FINISHED = "/entry/progress/finished"
+STATUS = "/entry/progress/status"
+MISSING = "/entry/progress/missing_triggers"
+END_TIME = "/entry/end_time"
+
+_SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
+
+COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {  # path: (type, unit)
+        IMAGE_KEY: ("<i4", ""),
+        f"{DETECTOR}/image_key_control": ("<i4", ""),
+        f"{DETECTOR}/count_time": ("<f8", "s"),
+        ANGLE: ("<f8", "degree"),
+        "/entry/frame_log/trigger": ("<i8", ""),
+        "/entry/frame_log/framestamp": ("<i8", ""),
+        "/entry/frame_log/time": ("<f8", "s"),
+        "/entry/frame_log/flags": ("<u4", ""),
+        "/entry/digest/minimum": ("<f8", ""),
+        "/entry/digest/maximum": ("<f8", ""),
+        "/entry/digest/mean": ("<f8", ""),
+        "/entry/digest/variance": ("<f8", ""),
+        "/entry/digest/sum_abs": ("<f8", ""),
+        "/entry/digest/invalid_fraction": ("<f8", ""),
+        "/entry/digest/saturated_fraction": ("<f8", ""),
+        "/entry/digest/entropy": ("<f8", "bit"),
+        "/entry/digest/checksum": ("<u4", ""),
+    }
+)
+
+Description = Mapping[str, str | int | float]
+
+
+@dataclass(frozen=True)
+class ScanInfo:
+    """What is known about a scan before its first frame; None where it is not known.
+
+    Attributes:
+        sample: name; title: one line for people.
+        pixel_size_mm: at the sample; energy_kev; distance_mm: sample to detector.
+        exposure, period: s.
+        axis_col: rotation axis in 0-based pixel-centre columns.
+        plan: JSON; config: YAML; both as text for the record.
+        devices: what each device says of itself, by its name.
+    """
+
+    sample: str
+    title: str = ""
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    distance_mm: float | None = None
+    exposure: float | None = None
+    period: float | None = None
+    axis_col: float | None = None
+    plan: str = "{}"
+    config: str = ""
+    devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True)
+class Record:
+    """What one row says about its frame beside the pixels; units as in drivers.frame.Frame (radians, s)."""
+
+    kind: FrameKind
+    angle: float
+    exposure: float = np.nan
+    trigger: int = -1
+    framestamp: int = -1
+    time: float = np.nan
+    flags: int = 0
+
+
+def iso_time(seconds: float) -> str:
+    """ISO 8601 in UTC from seconds since the Unix epoch."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
+def create(
+    file: h5py.File,
+    info: ScanInfo,
+    frame_shape: tuple[int, int],
+    dtype: np.dtype[Any],
+    *,
+    quantity: str,
+    preview_bin: int,
+    start: float | None,
+) -> None:
+    """Make every group, dataset and attribute that the file will have while it grows, with no frame in it yet."""
+    rows, cols = frame_shape
+    definition = NXTOMO if dtype.kind in "iu" else FLOAT_DEFINITION
+    for path, kind in (
+        (ENTRY, "NXentry"),
+        ("/entry/instrument", "NXinstrument"),
+        (DETECTOR, "NXdetector"),
+        ("/entry/instrument/source", "NXsource"),
+        ("/entry/instrument/beam", "NXbeam"),
+        ("/entry/instrument/devices", "NXcollection"),
+        ("/entry/sample", "NXsample"),
+        ("/entry/data", "NXdata"),
+        ("/entry/frame_log", "NXcollection"),
+        ("/entry/digest", "NXcollection"),
+        ("/entry/record", "NXcollection"),
+        ("/entry/progress", "NXcollection"),
+    ):
+        file.create_group(path).attrs["NX_class"] = np.bytes_(kind)
+    file.attrs["default"] = np.bytes_("entry")
+    file[ENTRY].attrs["default"] = np.bytes_("data")
+
+    _text(file, "/entry/definition", definition)
+    _text(file, "/entry/title", info.title or info.sample)
+    _text(file, "/entry/start_time", "" if start is None else iso_time(start))
+    _text(file, END_TIME, "", width=40)
+    _text(file, "/entry/sample/name", info.sample)
+    _text(file, "/entry/instrument/source/probe", "x-ray")
+    for path, value, unit in (
+        (f"{DETECTOR}/x_pixel_size", info.pixel_size_mm, "mm"),
+        (f"{DETECTOR}/y_pixel_size", info.pixel_size_mm, "mm"),
+        (f"{DETECTOR}/distance", info.distance_mm, "mm"),
+        ("/entry/instrument/beam/incident_energy", info.energy_kev, "keV"),
+        ("/entry/record/exposure", info.exposure, "s"),
+        ("/entry/record/period", info.period, "s"),
+        ("/entry/record/axis_col", info.axis_col, "pixel"),
+    ):
+        if value is not None:
+            file[path] = np.float64(value)
+            file[path].attrs["units"] = np.bytes_(unit)
+    for name, text in (
+        ("plan", info.plan),
+        ("config", info.config),
+        ("quantity", quantity),
+        ("program", f"splatline {version()}"),
+    ):
+        _text(file, f"/entry/record/{name}", text)
+    for device, description in info.devices.items():
+        group = file.create_group(f"/entry/instrument/devices/{device.replace('/', '_')}")
+        group.attrs["NX_class"] = np.bytes_("NXcollection")
+        for key, said in description.items():
+            path = f"{group.name}/{key.replace('/', '_')}"
+            if isinstance(said, str):
+                _text(file, path, said)
+            else:
+                file[path] = said
+
+    _growing(file, DATA, frame_shape, dtype)
+    _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
+    file[PREVIEW].attrs["bin"] = np.int64(preview_bin)
+    for path, (kind, unit) in COLUMNS.items():
+        _growing(file, path, (), np.dtype(kind))
+        if unit:
+            file[path].attrs["units"] = np.bytes_(unit)
+    file["/entry/frame_log/time"].attrs["description"] = np.bytes_("since 1970-01-01T00:00:00Z, at the trigger")
+    _nxdata(file, rows, cols, info.pixel_size_mm)
+
+    file[COMMITTED] = np.int64(0)
+    file[FINISHED] = np.int8(0)
+    _text(file, STATUS, "running", width=16)
+    _growing(file, MISSING, (), np.dtype("<i8"))
+    file[MISSING].attrs["description"] = np.bytes_("triggers of the scan, counted from 0, that gave no frame")
+
+
+class Rows:
+    """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete."""
+
+    def __init__(self, file: h5py.File) -> None:
+        self._data: h5py.Dataset = file[DATA]
+        self._preview: h5py.Dataset = file[PREVIEW]
+        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in COLUMNS}
+
+    def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
+        """Row `row`, which may exist or be the next: pixels first, then what is said about them."""
+        control = int(record.kind)
+        said = {
+            "image_key": 0 if record.kind is FrameKind.ALIGNMENT else control,
+            "image_key_control": control,
+            "count_time": record.exposure,
+            "rotation_angle": np.degrees(record.angle),
+            "trigger": record.trigger,
+            "framestamp": record.framestamp,
+            "time": record.time,
+            "flags": record.flags,
+        }
+        for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
+            self._grow(dataset, row + 1)
+            dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
+        for name, column in self._columns.items():
+            self._grow(column, row + 1)
+            column[row] = said[name] if name in said else vars(digest)[name]
+
+    @staticmethod
+    def _grow(dataset: h5py.Dataset, n: int) -> None:
+        if dataset.id.shape[0] < n:  # never shrinks: a reader may hold the rows beyond
+            dataset.id.set_extent((n, *dataset.id.shape[1:]))
+
+
+def _text(file: h5py.File, path: str, value: str, width: int = 0) -> None:
+    """A fixed-length UTF-8 string: variable-length ones cannot be read while a SWMR writer holds the file."""
+    encoded = value.encode()
+    file.create_dataset(path, data=encoded, dtype=h5py.string_dtype("utf-8", max(width, len(encoded), 1)))
+
+
+def _growing(file: h5py.File, path: str, item: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    chunks = (1, *item) if item else (_SCALARS_PER_CHUNK,)
+    file.create_dataset(path, (0, *item), dtype, maxshape=(None, *item), chunks=chunks)
+
+
+def _nxdata(file: h5py.File, rows: int, cols: int, pixel_size_mm: float | None) -> None:
+    group = file["/entry/data"]
+    group.attrs["signal"] = np.bytes_("data")
+    group.attrs["axes"] = np.array([b"rotation_angle", b"y", b"x"])
+    for path in (DATA, ANGLE, IMAGE_KEY):
+        file[path].attrs["target"] = np.bytes_(path)  # NeXus: a link is a link by the target that it names
+        group[path.rsplit("/", 1)[1]] = file[path]
+    for name, n in (("y", rows), ("x", cols)):
+        group[name] = np.arange(n) * (1.0 if pixel_size_mm is None else pixel_size_mm)
+        group[name].attrs["units"] = np.bytes_("pixel" if pixel_size_mm is None else "mm")
+    for index, name in enumerate(("rotation_angle", "y", "x")):
+        group.attrs[f"{name}_indices"] = np.int64(index)
