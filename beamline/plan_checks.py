@@ -98,7 +98,7 @@ def _timing(facts: Facts) -> Iterator[str]:
 
 
 def _speed(facts: Facts) -> Iterator[str]:
-    if facts.views.speed > facts.stage.max_speed:
+    if facts.views.speed > facts.stage.max_speed * (1 + 1e-9):
         period = facts.plan.period * facts.views.speed / facts.stage.max_speed
         yield (
             f"the scan needs {degrees(facts.views.speed)}/s, the stage turns at most "
