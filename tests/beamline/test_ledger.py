@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from random import Random
 
 import numpy as np
 import pytest
@@ -100,7 +101,9 @@ def test_without_a_known_start_a_camera_that_saw_the_first_trigger_is_enough(
     st.sets(st.integers(-1, 39), min_size=1, max_size=5),
     st.randoms(use_true_random=False),
 )
-def test_frames_that_no_trigger_made_are_named_and_cost_no_angle(fates: list[str], where: set[int], random) -> None:  # type: ignore[no-untyped-def]
+def test_frames_that_no_trigger_made_are_named_and_cost_no_angle(
+    fates: list[str], where: set[int], random: Random
+) -> None:
     after = frozenset(i for i in where if i < len(fates))
     jitter = [random.uniform(-0.1, 0.1) for _ in fates]
     sent = camera(fates, jitter, PERIOD, after)

@@ -1,0 +1,55 @@
+"""Rows that lose their light alone are a band; a beam that dims all rows, or a sample that turns, is not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from beamline.monitor.flag import Flag, Level
+from drivers.frame import Frame
+
+
+def only(flags: list[Flag]) -> list[Flag]:
+    return [f for f in flags if f.check == "bands"]
+
+
+def black(frame: Frame, first: int, n: int) -> Frame:
+    frame.counts[first : first + n] = 200
+    return frame
+
+
+@pytest.mark.parametrize(("n", "loss"), [(1, 0.25), (2, 0.5), (4, 1.0), (16, 1.0)])
+def test_black_rows_are_flagged_with_their_place(bench: Any, n: int, loss: float) -> None:
+    frames = bench.references() + bench.views(10)
+    black(frames[18], 20, n)
+    flags = only(bench.watch(frames))
+    assert [(f.view, f.level) for f in flags] == [(18, Level.ALARM)]
+    assert flags[0].score == pytest.approx(loss, abs=0.02)
+    assert "from 5)" in flags[0].advice
+
+
+def test_a_band_in_a_flat(bench: Any) -> None:
+    frames = bench.darks() + bench.flats(8)
+    black(frames[11], 0, 4)
+    assert [f.view for f in only(bench.watch(frames))] == [11]
+
+
+def test_a_band_that_stays_is_flagged_until_it_is_old_news(bench: Any) -> None:
+    frames = bench.references() + bench.views(40)
+    for view in frames[20:]:
+        black(view, 8, 4)
+    flags = only(bench.watch(frames))
+    assert [f.view for f in flags] == list(range(20, 40))
+
+
+def test_a_dimming_beam_is_no_band(bench: Any) -> None:
+    frames = bench.references() + bench.views(10) + bench.views(10, first=10, light=0.5)
+    assert only(bench.watch(frames)) == []
+
+
+def test_a_sample_seen_from_the_other_side_is_no_band(bench: Any) -> None:
+    frames = bench.references()
+    for i in range(20):  # an angle plan that jumps
+        frames += bench.views(1, first=i * 137 % 180)
+    assert only(bench.watch(frames, period=None)) == []

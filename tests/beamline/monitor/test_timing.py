@@ -1,0 +1,53 @@
+"""Frames that come early or late, and triggers without a frame, are flagged; pauses that belong to the plan are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from beamline.digest import digest
+from beamline.monitor import scan
+from beamline.monitor.flag import Context, Flag, Level
+
+PERIOD = 0.1  # as the bench makes them
+
+
+def only(flags: list[Flag]) -> list[Flag]:
+    return [f for f in flags if f.check == "timing"]
+
+
+@pytest.mark.parametrize(("shift", "views"), [(0.2, []), (-0.2, []), (0.3, [4, 5]), (-0.3, [4, 5])])
+def test_a_frame_off_its_time(bench: Any, shift: float, views: list[int]) -> None:
+    frames = bench.views(8)
+    frames[4] = replace(frames[4], time=frames[4].time + shift * PERIOD)
+    flags = only(bench.watch(frames))
+    assert [f.view for f in flags] == views
+    if flags:
+        assert flags[0].score == pytest.approx(shift)
+        assert flags[0].level is Level.WARN
+
+
+def test_a_missing_trigger_is_an_alarm_on_the_frame_after_it(bench: Any) -> None:
+    frames = bench.views(8)
+    del frames[3:5]
+    flags = only(bench.watch(frames))
+    assert [(f.view, f.score, f.level) for f in flags] == [(5, 2, Level.ALARM)]
+
+
+def test_a_step_scan_has_no_rhythm(bench: Any) -> None:
+    frames = [replace(f, time=f.time + f.trigger**2) for f in bench.views(8)]
+    assert only(bench.watch(frames, period=None)) == []
+
+
+def test_the_return_between_two_passes_is_no_finding(bench: Any) -> None:
+    frames = [replace(f, time=f.time + 30 * (f.trigger >= 4)) for f in bench.views(8)]
+    flags = []
+    for starts in (frozenset({0}), frozenset({0, 4})):
+        state, found = scan.start(Context(65535, 64 * 96, PERIOD, starts)), 0
+        for frame in frames:
+            state, new = scan.watch(state, frame, digest(frame.counts, 65535, 4))
+            found += len(only(new))
+        flags.append(found)
+    assert flags == [1, 0]
