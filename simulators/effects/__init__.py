@@ -1,0 +1,1 @@
+"""Effects: one departure from Beer-Lambert a file; a scene computes only those that it names."""

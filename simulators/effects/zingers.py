@@ -1,0 +1,37 @@
+"""Zingers: stray X-rays that hit the sensor itself and leave a bright pixel in one frame only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from simulators.effects.chain import Domain, Image, Shot
+
+
+@dataclass(frozen=True)
+class Zingers:
+    """Single bright pixels at random places.
+
+    Attributes:
+        rate: mean number a second in the frame.
+        charge: mean electrons of one (exponentially distributed).
+    """
+
+    rate: float
+    charge: float = 3000.0
+
+    name: ClassVar[str] = "zingers"
+    domain: ClassVar[Domain] = Domain.ELECTRONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.rate >= 0 and self.charge > 0):
+            raise ValueError(f"rate must be >= 0 a second and charge positive, got {self}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        n = int(shot.rng.poisson(self.rate * shot.exposure))
+        out = image.copy()
+        np.add.at(out.reshape(-1), shot.rng.integers(image.size, size=n), shot.rng.exponential(self.charge, n))
+        return out
