@@ -1,84 +1,26 @@
-"""ScanSource: one view of a scan, whatever the file; open_scan recognises the format."""
+"""open_scan: a scan in any format that we read, recognised by what is in it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from drivers.frame import Frame
+from beamline.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.angle_table import Angles, load_angles, parse_angles, select_rows
+from beamline.storage.dxchange import DataExchangeSource, is_data_exchange
+from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.nexus_places import find
+from beamline.storage.nxtomo_reader import NXtomoSource
+from beamline.storage.overlay import Overlay
+from beamline.storage.scan_source import Quantity, ScanSource
+from beamline.storage.tiff import SUFFIXES, TiffSeries, TiffStack, load_images
 
-Quantity = Literal["counts", "line_integrals", "unknown"]
-Attributes = Mapping[str, str | float | int]
-Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
-Images = Path | str | NDArray[np.generic]  # a file or folder of images, or [frame, row, col]
+__all__ = ["Angles", "Images", "NotReadyError", "Quantity", "ScanSource", "open_scan"]
 
-WHOLE = slice(None)
-
-
-class ScanSource(Protocol):
-    """The frames of one scan and what is known about them. Nothing is guessed: unknown is None, NaN or "unknown".
-
-    Attributes:
-        path: what was opened.
-        format: "nxtomo", "diamond_nexus", "data_exchange", "tiff_series", "tiff_stack", ...
-        shape: (rows, cols) of a frame.
-        dtype: of the pixels that read() returns.
-        quantity: what a pixel is. "unknown" where the file does not say and the caller did not.
-        image_key: int32 [frame], values of drivers.frame.FrameKind.
-        angles: float64 [frame] radians, NaN where unknown.
-        pixel_size_mm: at the sample.
-        axis_col: rotation axis in 0-based pixel-centre columns.
-        attributes: whatever else the file says, for the record.
-        finished: no more frames will come.
-    """
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def format(self) -> str: ...
-    @property
-    def shape(self) -> tuple[int, int]: ...
-    @property
-    def dtype(self) -> np.dtype[np.generic]: ...
-    @property
-    def quantity(self) -> Quantity: ...
-    @property
-    def image_key(self) -> NDArray[np.int32]: ...
-    @property
-    def angles(self) -> NDArray[np.float64]: ...
-    @property
-    def pixel_size_mm(self) -> float | None: ...
-    @property
-    def energy_kev(self) -> float | None: ...
-    @property
-    def axis_col(self) -> float | None: ...
-    @property
-    def attributes(self) -> Attributes: ...
-    @property
-    def finished(self) -> bool: ...
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[np.generic]:
-        """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
-        ...
-
-    def frames(self) -> Iterator[Frame]:
-        """The frames one after the other, as a camera gave them. DataError where pixels are not uint16 counts."""
-        ...
-
-    def refresh(self) -> int:
-        """Look again at a growing file; how many frames can be read now."""
-        ...
-
-    def close(self) -> None: ...
-    def __enter__(self) -> Self: ...
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [frame, row, col]
 
 
 def open_scan(
@@ -97,13 +39,70 @@ def open_scan(
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
             projection, or one for each frame.
-        angle_rows: "a:b", which rows of `angles` to use.
-        darks, flats: replace the file's.
+        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
+        darks, flats: replace the file's; they come before its frames.
         quantity: what the pixels are, where the file does not say.
         follow: the file may still be growing; refresh() then finds new frames.
 
     Raises:
         DataError: not there, not a format that we read, or not consistent; the message says what was found.
-        NotReadyError: the file is just being created; try again.
+        NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
-    raise NotImplementedError
+    path = Path(path)
+    if follow and (angles is not None or darks is not None or flats is not None):
+        raise DataError(f"{path} cannot be followed with other angles or references: its counts still change.")
+    base = _open(path, own_angles=angles is None, follow=follow)
+    try:
+        table = None if angles is None else load_angles(angles)
+        angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
+        if table is None and isinstance(base, TiffSeries) and base.angle_text is not None:
+            angles_from = f"{base.angle_text[0]} in {path}"
+            table = parse_angles(base.angle_text[1], angles_from)
+        if angle_rows is not None:
+            if table is None:
+                raise DataError(f"Angle rows {angle_rows!r} need angles to choose from: give an angle file.")
+            table = select_rows(table, angle_rows)
+        if table is None and darks is None and flats is None and quantity is None:
+            return base
+        return Overlay(
+            base,
+            angles=table,
+            angles_from=angles_from,
+            darks=None if darks is None else load_images(darks),
+            flats=None if flats is None else load_images(flats),
+            quantity=quantity,
+        )
+    except BaseException:
+        base.close()
+        raise
+
+
+def _open(path: Path, *, own_angles: bool, follow: bool) -> NXtomoSource | DataExchangeSource | TiffSeries | TiffStack:
+    if path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"):
+        return TiffSeries(path)
+    if path.is_file() and path.suffix.lower() in SUFFIXES:
+        return TiffStack(path)
+    if path.is_file() and not follow and not _is_hdf5(path):
+        raise DataError(f"{path} is neither HDF5 nor TIFF; a scan is one of these, or a folder or .zip of TIFFs.")
+    with hdf5.open_hdf5(path, follow) as file:
+        nexus, exchange = bool(find(file)), is_data_exchange(file)
+    if not nexus and not exchange:
+        raise DataError(
+            f"{path} holds no scan that we know: neither an NXdetector with frames and an image_key (NXtomo) "
+            "nor /exchange/data (Data Exchange)."
+        )
+    return (
+        NXtomoSource(path, follow=follow, own_angles=own_angles)
+        if nexus
+        else DataExchangeSource(path, own_angles=own_angles)
+    )
+
+
+def _is_hdf5(path: Path) -> bool:
+    """By its signature, at the start or after a user block (h5py.is_hdf5 says no to a file that is being written)."""
+    with path.open("rb") as file:
+        for offset in (0, 512, 1024, 2048):
+            file.seek(offset)
+            if file.read(8) == b"\x89HDF\r\n\x1a\n":
+                return True
+    return False

@@ -1,0 +1,125 @@
+"""HDF5 as readers need it: opening a file that may be growing, text, units, and frames in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.errors import DataError
+
+DEGREE = np.pi / 180
+ANGLE_UNITS = {
+    "deg": DEGREE,
+    "degree": DEGREE,
+    "degrees": DEGREE,
+    "°": DEGREE,
+    "rad": 1.0,
+    "radian": 1.0,
+    "radians": 1.0,
+}
+LENGTH_UNITS = {  # mm
+    "m": 1e3, "metre": 1e3, "meter": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3,
+    "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "micrometre": 1e-3, "nm": 1e-6,
+}  # fmt: skip
+ENERGY_UNITS = {"ev": 1e-3, "kev": 1.0}  # keV
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}  # s
+
+
+class NotReadyError(DataError):
+    """The file is just being created: nothing is wrong with it, try again."""
+
+
+def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
+    """Open for reading, also a file that is being written or whose writer died (SWMR).
+
+    Raises DataError where it is no readable HDF5 file, NotReadyError where it may become one (`follow`).
+    """
+    if not path.is_file():
+        raise (NotReadyError if follow else DataError)(f"{path} is not there.")
+    problems = []
+    # Without a lock: a follower must not stop the writer from adding the /exchange view at the end.
+    for swmr in (True, False) if follow else (False, True):
+        try:
+            return h5py.File(path, "r", swmr=swmr, locking=False)
+        except (OSError, ValueError) as error:
+            problems.append(str(error))
+    if follow:
+        raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
+    raise DataError(
+        f"{path} cannot be read as HDF5 ({problems[0]}). If a scan just begins, try again; "
+        "if its writer died before the first frame, there is nothing in it."
+    )
+
+
+def text(value: Any) -> str:
+    """A string from what HDF5 gives for one: str, bytes, or an array of one of these."""
+    if isinstance(value, np.ndarray):
+        value = value.reshape(-1)[0] if value.size else ""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def attribute(item: h5py.HLObject, name: str) -> str:
+    """An attribute as text; "" where there is none."""
+    return text(item.attrs[name]) if name in item.attrs else ""
+
+
+def resolve(group: h5py.Group, path: str) -> Any | None:
+    """What a path leads to; None where it leads nowhere, also by a link to a file that is not there."""
+    try:
+        return group[path]
+    except (KeyError, OSError):
+        return None
+
+
+def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
+    """The dataset at a path; None where there is none."""
+    item = resolve(group, path)
+    return item if isinstance(item, h5py.Dataset) else None
+
+
+def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
+    """A number in our unit; None where it is absent, not finite, or in a unit (or none) that we do not know."""
+    item = dataset(group, path)
+    factor = None if item is None else units.get(attribute(item, "units").lower())
+    if item is None or factor is None or item.size == 0 or item.dtype.kind not in "uif":
+        return None
+    value = float(np.ravel(item[()])[0]) * factor
+    return value if np.isfinite(value) else None
+
+
+def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
+    """Angles in radians by the `units` attribute, or by `default` where there is none and a default is given."""
+    unit = attribute(item, "units") or default
+    factor = ANGLE_UNITS.get(unit.lower())
+    if factor is None:
+        raise DataError(
+            f"{item.name} in {item.file.filename} has {f'the units {unit!r}' if unit else 'no units attribute'}; "
+            "expected degrees or radians. Give the angles yourself (a file in degrees), or set the attribute."
+        )
+    return np.atleast_1d(np.asarray(item[()], np.float64)) * factor
+
+
+def missing_links(item: h5py.Dataset) -> list[Path]:
+    """Files that a virtual dataset draws on and that are not there (HDF5 gives fill values without a word)."""
+    if not item.is_virtual:
+        return []
+    folder = Path(item.file.filename).parent
+    names = {source.file_name for source in item.virtual_sources()} - {"."}
+    return sorted(folder / name for name in names if not (folder / name).is_file())
+
+
+def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
+    """Fill out [frame, row, col] with frames in the order asked for; consecutive ones are read at once."""
+    start = 0
+    while start < indices.size:
+        stop = start + 1
+        while stop < indices.size and indices[stop] == indices[stop - 1] + 1:
+            stop += 1
+        out[start:stop] = item[indices[start] : indices[start] + stop - start, rows]
+        start = stop

@@ -1,0 +1,208 @@
+"""NXtomoSource: scans as NXtomo lays them out: ours (also while they grow), ESRF's, and Diamond's NeXus with links.
+
+What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage import nxtomo_layout as layout
+from beamline.storage.nexus_places import choose, find
+from beamline.storage.scan_source import WHOLE, Quantity, count_in_blocks, frame_indices, require_counts
+from drivers.frame import Frame, FrameKind
+
+
+class NXtomoSource:
+    """A scan in NXtomo's structure; see ScanSource."""
+
+    def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
+        """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units."""
+        self.path = path
+        self._file = hdf5.open_hdf5(path, follow)
+        try:
+            self._places = places = choose(self._file, find(self._file))
+            self._ours = layout.COMMITTED in self._file
+            self._check()
+            shape = places.data.shape
+            self.shape = (int(shape[1]), int(shape[2]))
+            self.dtype: np.dtype[Any] = places.data.dtype
+            definition = hdf5.text(_value(places.entry, "definition")) or hdf5.attribute(places.entry, "definition")
+            self.format = _format(definition, hdf5.text(_value(places.entry, "program_name")))
+            said = hdf5.text(_value(self._file, "/entry/record/quantity"))
+            self.quantity = _quantity(said, self.dtype)
+            self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
+            energy = (hdf5.scalar(places.entry, f"{where}/incident_energy", hdf5.ENERGY_UNITS) for where in BEAMS)
+            self.energy_kev = next((value for value in energy if value is not None), None)
+            # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
+            axis = _value(self._file, "/entry/record/axis_col")
+            self.axis_col = float(axis) if np.size(axis) == 1 and np.isfinite(axis) else None
+            self.n = 0
+            self._own_angles = own_angles
+            self.refresh()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _check(self) -> None:
+        lost = hdf5.missing_links(self._places.data)
+        if lost:
+            raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there ({len(lost)} missing).")
+
+    def refresh(self) -> int:
+        """Look again at a growing file; how many frames can be read now."""
+        places, control = self._places, hdf5.dataset(self._places.detector, "image_key_control")
+        key = places.image_key if control is None else control
+        if self._ours:
+            committed = self._file[layout.COMMITTED]
+            committed.refresh()
+            n = int(committed[()])
+            if n > self.n:
+                for item in (places.data, key, places.angle):
+                    if item is not None:
+                        item.refresh()
+        else:
+            n = int(places.data.shape[0])
+        angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
+        keys = np.ravel(key[()])
+        if not self._ours and not n == keys.size == angles.size:
+            raise DataError(
+                f"{self.path}: {n} frames, {keys.size} image keys and {angles.size} angles; expected as many of each."
+            )
+        self.n, self.image_key, self.angles = n, keys[:n].astype(np.int32), angles[:n]
+        return n
+
+    @property
+    def finished(self) -> bool:
+        if not self._ours:
+            return True
+        flag = self._file[layout.FINISHED]
+        flag.refresh()
+        return bool(flag[()])
+
+    @property
+    def attributes(self) -> dict[str, str | float | int]:
+        """What else the file says: sample, title, times, status, missing triggers, flagged frames."""
+        entry = self._places.entry
+        said: dict[str, str | float | int] = {}
+        for name, where in TEXTS.items():
+            value = hdf5.text(_value(entry, where))
+            if value:
+                said[name] = value
+        for name, where, units in NUMBERS:
+            number = hdf5.scalar(entry, where, units)
+            if number is not None:
+                said[name] = number
+        position = hdf5.dataset(self._places.detector, "x_rotation_axis_pixel_position")
+        if position is not None:
+            said["x_rotation_axis_pixel_position"] = f"{position[()]} (not used: its origin is not defined)"
+        if self._places.angle_problem:
+            said["angles"] = f"unknown: {self._places.angle_problem}"
+        if self._ours:
+            for item in (self._file[layout.STATUS], self._file[layout.MISSING]):
+                item.refresh()
+            said["status"] = hdf5.text(self._file[layout.STATUS][()]) or "running"
+            said["missing_triggers"] = int(self._file[layout.MISSING].shape[0])
+            flags = self._file["/entry/frame_log/flags"]
+            flags.refresh()
+            said["flagged_frames"] = int(np.count_nonzero(flags[: self.n]))
+        return said
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order."""
+        indices = frame_indices(frames, self.n)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        hdf5.read_frames(self._places.data, indices, rows, out)
+        return out
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames one after the other, with all that the file knows about each."""
+        require_counts(self)
+        exposure = self._seconds(self._places.detector, "count_time")
+        time = self._seconds(self._places.entry, "frame_log/time")
+        trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
+        framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
+        for i in range(self.n):
+            yield Frame(
+                counts=self.read([i])[0],
+                kind=FrameKind(int(self.image_key[i])),
+                index=i,
+                trigger=int(trigger[i]),
+                framestamp=int(framestamp[i]),
+                angle=float(self.angles[i]),
+                time=float(time[i]),
+                exposure=float(exposure[i]),
+            )
+
+    def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
+        item = hdf5.dataset(self._places.entry, path)
+        if item is None:
+            return default
+        if self._ours:
+            item.refresh()
+        return np.asarray(item[()])
+
+    def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
+        item = hdf5.dataset(group, path)
+        factor = None if item is None else hdf5.TIME_UNITS.get(hdf5.attribute(item, "units").lower())
+        if item is None or factor is None:
+            return np.full(self.n, np.nan)
+        if self._ours:
+            item.refresh()
+        values = np.ravel(item[()]).astype(np.float64) * factor
+        return np.broadcast_to(values, self.n) if values.size == 1 else values[: self.n]
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+BEAMS = ("instrument/beam", "beam", "sample/beam")
+TEXTS = {
+    "sample": "sample/name",
+    "title": "title",
+    "definition": "definition",
+    "program": "program_name",
+    "start_time": "start_time",
+    "end_time": "end_time",
+    "instrument": "instrument/name",
+}
+NUMBERS = (
+    ("exposure_s", "record/exposure", hdf5.TIME_UNITS),
+    ("period_s", "record/period", hdf5.TIME_UNITS),
+    ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
+)
+
+
+def _value(group: h5py.Group, path: str) -> Any:
+    item = hdf5.dataset(group, path)
+    return b"" if item is None else item[()]
+
+
+def _format(definition: str, program: str) -> str:
+    if definition == layout.FLOAT_DEFINITION:
+        return "float_projections"
+    if program.startswith("GDA"):
+        return "diamond_nexus"
+    return "nxtomo" if definition == layout.NXTOMO else "nexus"
+
+
+def _quantity(said: str, dtype: np.dtype[Any]) -> Quantity:
+    if said == "line_integrals":
+        return "line_integrals"
+    return (
+        "counts" if said == "counts" or (not said and dtype.kind in "iu") else "unknown"
+    )  # NXtomo: data are integers, as detected

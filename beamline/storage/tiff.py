@@ -1,0 +1,259 @@
+"""TIFF scans: a folder (or .zip) with one image a file, and one file with a page for each frame.
+
+Files tell what they are by name: `dark`, `flat`, `white` or `open_beam` at the start of a word of the name or of a
+folder above it; the others must be one series. They are put in the order of the numbers in their names, never of a
+listing. Pages and files are read one at a time, so that memory does not grow with the scan.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+import tifffile
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.errors import DataError
+from beamline.storage.scan_source import WHOLE, Quantity, bare_frames, frame_indices
+from drivers.frame import Frame, FrameKind
+
+SUFFIXES = (".tif", ".tiff")
+REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
+ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+UNREADABLE = (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile)
+
+
+class TiffStack:
+    """One TIFF with a page for each frame, read page by page; see ScanSource. Angles come from the caller."""
+
+    format = "tiff_stack"
+    finished = True
+    quantity: Quantity = "unknown"
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    axis_col: float | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._tif = tifffile.TiffFile(path)
+        except UNREADABLE as error:
+            raise DataError(f"{path} cannot be read as TIFF ({error}).") from error
+        try:
+            series = self._tif.series[0]
+            if len(series.shape) not in (2, 3) or len(self._tif.series) != 1:
+                raise DataError(
+                    f"{path} holds {', '.join(str(part.shape) for part in self._tif.series)}; "
+                    "expected one stack of grey images [page, row, col]."
+                )
+            n = 1 if len(series.shape) == 2 else int(series.shape[0])
+            self.shape = (int(series.shape[-2]), int(series.shape[-1]))
+            self.dtype: np.dtype[Any] = np.dtype(series.dtype)
+            # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
+            self._offset = series.dataoffset
+            self._stored = self.dtype.newbyteorder(self._tif.byteorder)
+        except BaseException:
+            self._tif.close()
+            raise
+        self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
+        self.angles = np.full(n, np.nan)
+        self.attributes: dict[str, str | float | int] = {
+            "pages": len(self._tif.pages),
+            "bigtiff": "yes" if self._tif.is_bigtiff else "no",
+        }
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the pages asked for, in that order."""
+        indices = frame_indices(frames, self.image_key.size)
+        wanted = range(self.shape[0])[rows]
+        out = np.empty((indices.size, len(wanted), self.shape[1]), self.dtype)
+        for i, page in enumerate(indices):
+            try:
+                out[i] = self._rows(int(page), rows)
+            except UNREADABLE as error:
+                raise DataError(f"Page {page} of {self.path} cannot be read ({error}).") from error
+        return out
+
+    def _rows(self, page: int, rows: slice) -> NDArray[Any]:
+        if self._offset is None:
+            return np.asarray(self._tif.pages[page].asarray())[rows]
+        first, last, _ = rows.indices(self.shape[0]) if rows.step in (None, 1) else (0, self.shape[0], 1)
+        line = self.shape[1] * self.dtype.itemsize
+        handle = self._tif.filehandle
+        handle.seek(self._offset + (page * self.shape[0] + first) * line)
+        content = handle.read(max(last - first, 0) * line)
+        block = np.frombuffer(content, self._stored).reshape(max(last - first, 0), self.shape[1])
+        return block if rows.step in (None, 1) else block[rows]
+
+    def frames(self) -> Iterator[Frame]:
+        return bare_frames(self)
+
+    def refresh(self) -> int:
+        return int(self.image_key.size)
+
+    def close(self) -> None:
+        self._tif.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class TiffSeries:
+    """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series.
+
+    Attribute `angle_text`: (name, content) of the one file that is named after angles, or None.
+    """
+
+    format = "tiff_series"
+    finished = True
+    quantity: Quantity = "unknown"
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    axis_col: float | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._zip = _open_zip(path) if path.is_file() else None
+        try:
+            names = self._names()
+            images = sorted((name for name in names if name.lower().endswith(SUFFIXES)), key=natural)
+            kinds = {name: kind_of(name) for name in images}
+            series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
+            _check_one_series(path, series)
+            order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
+            self._files = order + series
+            self.image_key = np.array([kinds[name] for name in self._files], np.int32)
+            self.angles = np.full(len(self._files), np.nan)
+            samples = [self._image(name) for name in (*order, series[0])]
+            self.shape: tuple[int, int] = samples[-1].shape[0], samples[-1].shape[1]
+            self.dtype: np.dtype[Any] = np.result_type(*(image.dtype for image in samples))
+            texts = [name for name in names if ANGLE_FILE.search(name.lower())]
+            self.angle_text = (texts[0], self._bytes(texts[0]).decode("utf-8", "replace")) if len(texts) == 1 else None
+        except BaseException:
+            self.close()
+            raise
+        self.attributes: dict[str, str | float | int] = {"series": f"{series[0]} ... {series[-1]}"}
+        gaps = _gaps(series)
+        if gaps:
+            self.attributes["missing_numbers"] = ", ".join(map(str, gaps[:20]))
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the files asked for, in that order."""
+        indices = frame_indices(frames, self.image_key.size)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        for i, number in enumerate(indices):
+            name = self._files[number]
+            image = self._image(name)
+            if image.shape != self.shape:
+                raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
+            out[i] = image[rows]
+        return out
+
+    def frames(self) -> Iterator[Frame]:
+        return bare_frames(self)
+
+    def refresh(self) -> int:
+        return int(self.image_key.size)
+
+    def close(self) -> None:
+        if self._zip is not None:
+            self._zip.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _names(self) -> list[str]:
+        if self._zip is not None:
+            return [name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name]
+        return [item.relative_to(self.path).as_posix() for item in self.path.rglob("*") if item.is_file()]
+
+    def _bytes(self, name: str) -> bytes:
+        return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
+
+    def _image(self, name: str) -> NDArray[Any]:
+        try:
+            image = read_image(io.BytesIO(self._bytes(name)))
+        except UNREADABLE as error:
+            raise DataError(f"{name} in {self.path} cannot be read as TIFF ({error}).") from error
+        if image.ndim != 2:
+            raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
+        return image
+
+
+def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
+    """Reference frames [frame, row, col]: from an array, one TIFF (any pages) or a folder of TIFFs, all in memory."""
+    if not isinstance(images, Path | str):
+        stack = np.asarray(images)
+        return stack[None] if stack.ndim == 2 else stack
+    path = Path(images)
+    files = (
+        sorted((item for item in path.iterdir() if item.suffix.lower() in SUFFIXES), key=lambda f: natural(f.name))
+        if path.is_dir()
+        else [path]
+    )
+    if not files:
+        raise DataError(f"{path} holds no .tif or .tiff file.")
+    try:
+        parts = [read_image(file) for file in files]
+        return np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
+    except UNREADABLE as error:
+        raise DataError(f"The reference frames in {path} cannot be read as TIFFs of one shape ({error}).") from error
+
+
+def read_image(file: Path | BinaryIO) -> NDArray[Any]:
+    """All pages of a TIFF; [row, col] for one page."""
+    return np.asarray(tifffile.imread(file))
+
+
+def kind_of(name: str) -> FrameKind:
+    """What a file shows, by its name relative to the scan's folder."""
+    match = REFERENCE.search(name.lower())
+    if match is None:
+        return FrameKind.PROJECTION
+    return FrameKind.DARK if match[1] == "dark" else FrameKind.FLAT
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """A sort key by which image_9 comes before image_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
+
+
+def _open_zip(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except UNREADABLE as error:
+        raise DataError(f"{path} cannot be read as a zip file ({error}).") from error
+
+
+def _prefix(name: str) -> str:
+    return re.sub(r"\d+(?=\.\w+$)", "", name)
+
+
+def _check_one_series(path: Path, names: list[str]) -> None:
+    prefixes = sorted({_prefix(name) for name in names})
+    if not names:
+        raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
+    if len(prefixes) > 1:
+        found = ", ".join(f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6])
+        raise DataError(
+            f"{path} holds several series of images: {found}. Name darks and flats so (dark_0001.tif, flat_0001.tif), "
+            "or give the folder of the projections and, apart, the darks and flats."
+        )
+
+
+def _gaps(names: list[str]) -> list[int]:
+    """Numbers that a series leaves out between its first and its last."""
+    found = [re.search(r"(\d+)\.\w+$", name) for name in names]
+    numbers = {int(match[1]) for match in found if match is not None}
+    return sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
