@@ -1,0 +1,297 @@
+"""The DCAM-API v4 through ctypes: its structures, its library, and one Python method for each call that we use.
+
+Structures use natural alignment, which equals the vendor's 8-byte packing on 64-bit machines. Each begins with its own
+size in bytes, which the caller must set.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Mapping
+from ctypes import POINTER, byref, c_char_p, c_double, c_int32, c_uint32, c_void_p, sizeof
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property, Text, error_name
+from drivers.errors import DeviceError
+
+_TEXT_BYTES = 256
+
+
+class ApiInit(ctypes.Structure):
+    """DCAMAPI_INIT."""
+
+    _fields_ = (
+        ("size", c_int32),
+        ("device_count", c_int32),
+        ("reserved", c_int32),
+        ("option_bytes", c_int32),
+        ("options", c_void_p),
+        ("guid", c_void_p),
+    )
+
+
+class DevOpen(ctypes.Structure):
+    """DCAMDEV_OPEN."""
+
+    _fields_ = (("size", c_int32), ("index", c_int32), ("camera", c_void_p))
+
+
+class DevString(ctypes.Structure):
+    """DCAMDEV_STRING."""
+
+    _fields_ = (("size", c_int32), ("which", c_int32), ("text", c_char_p), ("text_bytes", c_int32))
+
+
+class PropAttr(ctypes.Structure):
+    """DCAMPROP_ATTR."""
+
+    _fields_ = (
+        ("size", c_int32),
+        ("prop", c_int32),
+        ("option", c_int32),
+        ("reserved1", c_int32),
+        ("attribute", c_int32),
+        ("group", c_int32),
+        ("unit", c_int32),
+        ("attribute2", c_int32),
+        ("minimum", c_double),
+        ("maximum", c_double),
+        ("step", c_double),
+        ("default", c_double),
+        ("max_channel", c_int32),
+        ("reserved3", c_int32),
+        ("max_view", c_int32),
+        ("number_of_element", c_int32),
+        ("array_base", c_int32),
+        ("element_step", c_int32),
+    )
+
+
+class TimeStamp(ctypes.Structure):
+    """DCAM_TIMESTAMP, from an epoch of the camera's own: only differences mean anything."""
+
+    _fields_ = (("seconds", c_uint32), ("microseconds", c_int32))
+
+
+class TransferInfo(ctypes.Structure):
+    """DCAMCAP_TRANSFERINFO."""
+
+    _fields_ = (("size", c_int32), ("kind", c_int32), ("newest", c_int32), ("count", c_int32))
+
+
+class BufFrame(ctypes.Structure):
+    """DCAMBUF_FRAME."""
+
+    _fields_ = (
+        ("size", c_int32),
+        ("kind", c_int32),
+        ("option", c_int32),
+        ("index", c_int32),
+        ("buffer", c_void_p),
+        ("row_bytes", c_int32),
+        ("pixel_type", c_int32),
+        ("width", c_int32),
+        ("height", c_int32),
+        ("left", c_int32),
+        ("top", c_int32),
+        ("timestamp", TimeStamp),
+        ("framestamp", c_int32),
+        ("camerastamp", c_int32),
+    )
+
+
+class WaitOpen(ctypes.Structure):
+    """DCAMWAIT_OPEN."""
+
+    _fields_ = (("size", c_int32), ("supported", c_int32), ("wait", c_void_p), ("camera", c_void_p))
+
+
+class WaitStart(ctypes.Structure):
+    """DCAMWAIT_START."""
+
+    _fields_ = (("size", c_int32), ("happened", c_int32), ("mask", c_int32), ("timeout_ms", c_int32))
+
+
+_ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
+    {
+        "dcamapi_init": (POINTER(ApiInit),),
+        "dcamapi_uninit": (),
+        "dcamdev_open": (POINTER(DevOpen),),
+        "dcamdev_close": (c_void_p,),
+        "dcamdev_getstring": (c_void_p, POINTER(DevString)),
+        "dcamprop_getattr": (c_void_p, POINTER(PropAttr)),
+        "dcamprop_getvalue": (c_void_p, c_int32, POINTER(c_double)),
+        "dcamprop_setvalue": (c_void_p, c_int32, c_double),
+        "dcambuf_alloc": (c_void_p, c_int32),
+        "dcambuf_release": (c_void_p, c_int32),
+        "dcambuf_lockframe": (c_void_p, POINTER(BufFrame)),
+        "dcamcap_start": (c_void_p, c_int32),
+        "dcamcap_stop": (c_void_p,),
+        "dcamcap_status": (c_void_p, POINTER(c_int32)),
+        "dcamcap_transferinfo": (c_void_p, POINTER(TransferInfo)),
+        "dcamcap_firetrigger": (c_void_p, c_int32),
+        "dcamwait_open": (POINTER(WaitOpen),),
+        "dcamwait_close": (c_void_p,),
+        "dcamwait_start": (c_void_p, POINTER(WaitStart)),
+        "dcamwait_abort": (c_void_p,),
+    }
+)
+
+_ADVICE: Mapping[int, str] = MappingProxyType(
+    {
+        Error.NOCAMERA: "Switch the camera on and check its cable",
+        Error.NODRIVER: "Install the vendor's DCAM-API runtime and its driver",
+        Error.NOMODULE: "Install the DCAM-API module for this camera's interface (USB3 or CoaXPress)",
+        Error.NOGRABBER: "Check the frame grabber and its driver",
+        Error.FAILOPENCAMERA: "Close other programs that use the camera, then switch it off and on",
+        Error.NOCONNECTION: "Check the camera's power and cable, then connect again",
+        Error.NOMEMORY: "Give the camera's ring fewer bytes or free memory",
+        Error.LESSSYSTEMMEMORY: "Give the camera's ring fewer bytes or free memory",
+    }
+)
+
+
+class DcamError(DeviceError):
+    """A DCAM call answered with an error; `code` is one of codes.Error (or an unknown number)."""
+
+    def __init__(self, device: str, call: str, code: int) -> None:
+        self.code = code & 0xFFFFFFFF
+        reply, advice = error_name(code), _ADVICE.get(self.code, "")
+        super().__init__(device, "the camera's library reports an error", request=call, reply=reply, advice=advice)
+
+
+class Dcam:
+    """A loaded DCAM library. Handles are plain integers; every method raises DcamError where the library answers so.
+
+    Waiting calls release Python's global lock, so that another thread may end them with `wait_abort`.
+
+    Args:
+        library: path of the library; None asks the system for the installed one.
+        device: the name that errors carry.
+
+    Raises:
+        DeviceError: there is no such library, or it lacks a function.
+    """
+
+    def __init__(self, library: Path | None, device: str) -> None:
+        self._device = device
+        name = str(library or ("dcamapi.dll" if sys.platform == "win32" else "libdcamapi.so"))
+        try:
+            # RTLD_GLOBAL: the camera modules that the library loads resolve their symbols from it.
+            # winmode 0: the full Windows search path, where the vendor's runtime installs itself.
+            loaded = ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL, winmode=0)
+        except OSError as error:
+            problem = f"the camera's library {name} cannot be loaded ({error})"
+            advice = "Install the vendor's DCAM-API runtime, or give the library's path in the configuration"
+            raise DeviceError(device, problem, advice=advice, state="Nothing was changed") from error
+        missing = [call for call in _ARGUMENTS if getattr(loaded, call, None) is None]
+        if missing:
+            problem = f"{name} is not a DCAM-API version 4 library: it lacks {', '.join(missing)}"
+            raise DeviceError(
+                device, problem, advice="Check the library's path and version", state="Nothing was changed"
+            )
+        self._functions = {call: getattr(loaded, call) for call in _ARGUMENTS}
+        for call, function in self._functions.items():
+            function.argtypes, function.restype = _ARGUMENTS[call], c_int32
+
+    def _call(self, call: str, *arguments: Any, detail: str = "") -> None:
+        code = self._functions[call](*arguments)
+        if code < 0:
+            raise DcamError(self._device, f"{call} {detail}".rstrip(), code)
+
+    def api_init(self) -> int:
+        """Start the session (seconds on real hardware); the number of cameras found."""
+        init = ApiInit(size=sizeof(ApiInit))
+        self._call("dcamapi_init", byref(init))
+        return int(init.device_count)
+
+    def api_uninit(self) -> None:
+        """End the session; closes everything that is open."""
+        self._call("dcamapi_uninit")
+
+    def dev_open(self, index: int) -> int:
+        """The handle of camera `index`."""
+        opened = DevOpen(size=sizeof(DevOpen), index=index)
+        self._call("dcamdev_open", byref(opened), detail=f"index {index}")
+        return int(opened.camera)
+
+    def dev_close(self, camera: int) -> None:
+        self._call("dcamdev_close", camera)
+
+    def dev_getstring(self, camera: int, which: Text) -> str:
+        buffer = ctypes.create_string_buffer(_TEXT_BYTES)
+        string = DevString(sizeof(DevString), which, ctypes.cast(buffer, c_char_p), _TEXT_BYTES)
+        self._call("dcamdev_getstring", camera, byref(string), detail=which.name)
+        return buffer.value.decode("ascii", errors="replace")
+
+    def prop_getattr(self, camera: int, prop: Property) -> PropAttr:
+        """Range, step and access of a property in the camera's present state."""
+        attribute = PropAttr(size=sizeof(PropAttr), prop=prop)
+        self._call("dcamprop_getattr", camera, byref(attribute), detail=prop.name)
+        return attribute
+
+    def prop_getvalue(self, camera: int, prop: Property) -> float:
+        value = c_double()
+        self._call("dcamprop_getvalue", camera, prop, byref(value), detail=prop.name)
+        return value.value
+
+    def prop_setvalue(self, camera: int, prop: Property, value: float) -> None:
+        self._call("dcamprop_setvalue", camera, prop, value, detail=f"{prop.name} = {value:g}")
+
+    def buf_alloc(self, camera: int, frames: int) -> None:
+        """A ring of `frames` in the library's memory; the properties that shape frames are locked until release."""
+        self._call("dcambuf_alloc", camera, frames, detail=f"{frames} frames")
+
+    def buf_release(self, camera: int) -> None:
+        self._call("dcambuf_release", camera, 0)
+
+    def buf_lockframe(self, camera: int, slot: int) -> BufFrame:
+        """Where a slot's pixels lie, until the ring overwrites them. There is no unlock call."""
+        frame = BufFrame(size=sizeof(BufFrame), index=slot)
+        self._call("dcambuf_lockframe", camera, byref(frame), detail=f"slot {slot}")
+        return frame
+
+    def cap_start(self, camera: int, mode: CaptureMode) -> None:
+        self._call("dcamcap_start", camera, mode, detail=mode.name)
+
+    def cap_stop(self, camera: int) -> None:
+        """Legal in every state."""
+        self._call("dcamcap_stop", camera)
+
+    def cap_status(self, camera: int) -> CaptureState:
+        status = c_int32()
+        self._call("dcamcap_status", camera, byref(status))
+        return CaptureState(status.value)
+
+    def cap_transferinfo(self, camera: int) -> int:
+        """Frames put into the ring since the start; never blocks."""
+        info = TransferInfo(size=sizeof(TransferInfo))
+        self._call("dcamcap_transferinfo", camera, byref(info))
+        return int(info.count)
+
+    def cap_firetrigger(self, camera: int) -> None:
+        self._call("dcamcap_firetrigger", camera, 0)
+
+    def wait_open(self, camera: int) -> int:
+        opened = WaitOpen(size=sizeof(WaitOpen), camera=camera)
+        self._call("dcamwait_open", byref(opened))
+        return int(opened.wait)
+
+    def wait_close(self, wait: int) -> None:
+        self._call("dcamwait_close", wait)
+
+    def wait_start(self, wait: int, mask: int, timeout_ms: int) -> None:
+        """Block until an event of `mask`. Several may fold into one: it is a hint, the transfer count is the truth.
+
+        Raises:
+            DcamError: also TIMEOUT, ABORT (by wait_abort), LOSTFRAME and MISSINGFRAME_TROUBLE.
+        """
+        start = WaitStart(size=sizeof(WaitStart), mask=mask, timeout_ms=timeout_ms)
+        self._call("dcamwait_start", wait, byref(start), detail=f"for {timeout_ms} ms")
+
+    def wait_abort(self, wait: int) -> None:
+        """Wake whoever waits; nothing where nobody does."""
+        self._call("dcamwait_abort", wait)

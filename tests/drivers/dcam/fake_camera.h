@@ -1,0 +1,191 @@
+/* An ORCA-Quest for the fake library: its properties, its ring, its trigger input, and what may go wrong.
+ *
+ * Pixels say where and when they were taken: four bits of the framestamp, six of the sensor row, six of the sensor column.
+ * Row padding is 0xEE. The world outside acts through the functions named fakedcam_*. */
+#include <math.h>
+#include <pthread.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+enum { ST_BUSY = 1, ST_READY = 2, ST_STABLE = 3 };
+enum { EV_FRAMEREADY = 2, EV_STOPPED = 16 };
+
+/* Properties: access by state (S always for writable ones), value type, range, the values of a mode. */
+enum { RO = 0, S = 0x20000, SR = 0x22000, SRB = 0x23000 };
+enum { MODE = 1, LONG = 2, REAL = 3, ROUNDS = 0x800000 };
+typedef struct { int32_t id, access, type; double min, max, step, initial; int legal[4]; double value; } Property;
+enum {
+    TRIGGERSOURCE, TRIGGERACTIVE, TRIGGER_MODE, TRIGGERPOLARITY, TRIGGERTIMES, TRIGGERDELAY, GLOBALEXPOSURE, EXPOSURETIME,
+    TEMPERATURE, READOUTSPEED, SENSORMODE, BINNING, HPOS, HSIZE, VPOS, VSIZE, SUBARRAYMODE, READOUTTIME, CYCLIC, BLANKING,
+    MININTERVAL, FRAMEINTERVAL, BITS, WIDTH, HEIGHT, ROWBYTES, PIXELTYPE, FRAMEBYTES, BUNDLE, DEFECT, COEFF, OFFSET, N_PROPS
+};
+static const Property TABLE[N_PROPS] = {
+    [TRIGGERSOURCE] = {0x00100110, SRB, MODE, 1, 4, 1, 1, {1, 2, 3, 4}},
+    [TRIGGERACTIVE] = {0x00100120, SR, MODE, 1, 3, 1, 1, {1, 2, 3}},
+    [TRIGGER_MODE] = {0x00100210, SR, MODE, 1, 6, 1, 1, {1, 6}},
+    [TRIGGERPOLARITY] = {0x00100220, SRB, MODE, 1, 2, 1, 1, {1, 2}},
+    [TRIGGERTIMES] = {0x00100240, SRB, LONG, 1, 10000, 1, 1},
+    [TRIGGERDELAY] = {0x00100260, SRB, REAL, 0, 10, 1e-6, 0},
+    [GLOBALEXPOSURE] = {0x001F0300, S, MODE, 3, 5, 1, 3, {3, 5}},
+    [EXPOSURETIME] = {0x001F0110, SRB, REAL | ROUNDS, 7.2e-6, 1800, 1e-8, 8.2944e-3},
+    [TEMPERATURE] = {0x00200310, RO, REAL, -50, 100, 0.1, -20},
+    [READOUTSPEED] = {0x00400110, S, MODE, 1, 2, 1, 2, {1, 2}},
+    [SENSORMODE] = {0x00400210, S, MODE, 1, 18, 1, 1, {1, 12, 18}},
+    [BINNING] = {0x00401110, S, MODE, 1, 4, 1, 1, {1, 2, 4}},
+    [HPOS] = {0x00402110, S, LONG | ROUNDS, 0, 0, 4, 0},
+    [HSIZE] = {0x00402120, S, LONG | ROUNDS, 4, 0, 4, 0},
+    [VPOS] = {0x00402130, S, LONG | ROUNDS, 0, 0, 4, 0},
+    [VSIZE] = {0x00402140, S, LONG | ROUNDS, 4, 0, 4, 0},
+    [SUBARRAYMODE] = {0x00402150, S, MODE, 1, 2, 1, 1, {1, 2}},
+    [READOUTTIME] = {0x00403010, RO, REAL},
+    [CYCLIC] = {0x00403020, RO, REAL},
+    [BLANKING] = {0x00403030, RO, REAL},
+    [MININTERVAL] = {0x00403050, RO, REAL},
+    [FRAMEINTERVAL] = {0x00403820, RO, REAL},
+    [BITS] = {0x00420130, S, MODE, 8, 16, 4, 16, {8, 12, 16}},
+    [WIDTH] = {0x00420210, RO, LONG},
+    [HEIGHT] = {0x00420220, RO, LONG},
+    [ROWBYTES] = {0x00420230, RO, LONG},
+    [PIXELTYPE] = {0x00420270, S, MODE, 1, 2, 1, 2, {1, 2}},
+    [FRAMEBYTES] = {0x00420340, RO, LONG},
+    [BUNDLE] = {0x00421010, RO, MODE, 1, 2, 1, 1, {1, 2}},
+    [DEFECT] = {0x00470010, SRB, MODE, 1, 2, 1, 2, {1, 2}},
+    [COEFF] = {0x00FFE010, RO, REAL, 0, 1, 0, 0.107},
+    [OFFSET] = {0x00FFE020, RO, REAL, 0, 1000, 0, 200},
+};
+
+/* What the outside can do to the camera and its library. */
+static const char *const FAULTS[] = {"no_camera", "unplugged", "drop", "report_loss", "pad", "first_stamp", "start_polls",
+                                     "overrun_in_lock", "swallow_events", "refuse", "no_memory"};
+enum { NO_CAMERA, UNPLUGGED, DROP, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, NO_MEMORY, N_FAULTS };
+
+static struct {
+    Property props[N_PROPS];
+    int overridden[N_PROPS], faults[N_FAULTS];
+    double override[N_PROPS];
+    int sensor_rows, sensor_cols, devices;
+    int session, opened, waiting_open, status, mode, polls, waiters, aborted, pending;
+    int slots, count, exposed, pulses;
+    uint8_t **ring;
+    int32_t *stamps;
+    double *times, last_edge, started;
+    char camera, wait; /* their addresses are the handles */
+} fake;
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static pthread_cond_t changed = PTHREAD_COND_INITIALIZER;
+
+static double now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_REALTIME, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static double get(int p) {
+    if (fake.overridden[p]) return fake.override[p];
+    int subarray = fake.props[SUBARRAYMODE].value == 2, binning = (int)fake.props[BINNING].value;
+    int rows = subarray ? (int)fake.props[VSIZE].value : fake.sensor_rows;
+    int cols = subarray ? (int)fake.props[HSIZE].value : fake.sensor_cols;
+    double line = fake.props[READOUTSPEED].value == 1 ? 172.8e-6 : 7.2e-6, exposure = fake.props[EXPOSURETIME].value;
+    switch (p) {
+    case READOUTTIME: return rows / 2 * line;
+    case BLANKING: return (rows / 2 + 5) * line;
+    case CYCLIC: case MININTERVAL: return exposure + (rows / 2 + 5) * line;
+    case FRAMEINTERVAL: return fmax(exposure, (rows / 2 + 5) * line);
+    case WIDTH: return cols / binning;
+    case HEIGHT: return rows / binning;
+    case ROWBYTES: return cols / binning * 2 + fake.faults[PAD];
+    case FRAMEBYTES: return get(ROWBYTES) * get(HEIGHT);
+    default: return fake.props[p].value;
+    }
+}
+
+static void expose(double time) {
+    int stamp = fake.faults[FIRST_STAMP] + fake.exposed++;
+    if (fake.faults[DROP] > 0) { fake.faults[DROP]--; return; }
+    int slot = fake.count % fake.slots, rows = (int)get(HEIGHT), cols = (int)get(WIDTH), stride = (int)get(ROWBYTES);
+    int subarray = fake.props[SUBARRAYMODE].value == 2, binning = (int)fake.props[BINNING].value;
+    int row0 = subarray ? (int)fake.props[VPOS].value : 0, col0 = subarray ? (int)fake.props[HPOS].value : 0;
+    for (int r = 0; r < rows; r++) {
+        uint8_t *row = fake.ring[slot] + (size_t)r * (size_t)stride;
+        memset(row, 0xEE, (size_t)stride);
+        for (int c = 0; c < cols; c++) {
+            unsigned v = ((unsigned)stamp & 15u) << 12 | ((unsigned)(row0 + r * binning) & 63u) << 6 | ((unsigned)(col0 + c * binning) & 63u);
+            row[2 * c] = (uint8_t)(v & 255u);
+            row[2 * c + 1] = (uint8_t)(v >> 8);
+        }
+    }
+    fake.stamps[slot] = stamp;
+    fake.times[slot] = time;
+    fake.count++;
+    if (fake.faults[SWALLOW] > 0) fake.faults[SWALLOW]--;
+    else fake.pending |= EV_FRAMEREADY;
+    if (fake.mode == 0 && fake.count == fake.slots) { fake.status = ST_READY; fake.pending |= EV_STOPPED; }
+    pthread_cond_broadcast(&changed);
+}
+
+static int capturing(void) { return fake.status == ST_BUSY && fake.polls >= fake.faults[START_POLLS]; }
+
+static void free_run(void) { /* internal trigger: no clock here, each wait brings the next frame */
+    if (capturing() && fake.props[TRIGGERSOURCE].value == 1) expose(fake.started + fake.exposed * get(FRAMEINTERVAL));
+}
+
+static void release(void) {
+    for (int i = 0; i < fake.slots; i++) free(fake.ring[i]);
+    free(fake.ring); free(fake.stamps); free(fake.times);
+    fake.ring = NULL; fake.stamps = NULL; fake.times = NULL; fake.slots = 0;
+    fake.status = ST_STABLE;
+}
+
+static void stop(void) {
+    if (fake.status != ST_BUSY) return;
+    fake.status = ST_READY;
+    fake.pending |= EV_STOPPED;
+    pthread_cond_broadcast(&changed);
+}
+
+void fakedcam_reset(int devices, int rows, int cols) {
+    pthread_mutex_lock(&lock);
+    if (fake.slots) release();
+    memset(&fake, 0, sizeof fake);
+    fake.devices = devices; fake.sensor_rows = rows; fake.sensor_cols = cols; fake.status = ST_STABLE;
+    memcpy(fake.props, TABLE, sizeof TABLE);
+    for (int p = 0; p < N_PROPS; p++) fake.props[p].value = TABLE[p].initial;
+    fake.props[HPOS].max = cols - 4; fake.props[VPOS].max = rows - 4;
+    fake.props[HSIZE].max = fake.props[HSIZE].value = cols; fake.props[VSIZE].max = fake.props[VSIZE].value = rows;
+    pthread_mutex_unlock(&lock);
+}
+
+int fakedcam_fault(const char *name, int value) {
+    for (int i = 0; i < N_FAULTS; i++) if (!strcmp(name, FAULTS[i])) { fake.faults[i] = value; return 1; }
+    return 0;
+}
+
+static int find(int32_t id) {
+    for (int p = 0; p < N_PROPS; p++) if (TABLE[p].id == id) return p;
+    return -1;
+}
+
+int fakedcam_override(int32_t id, double value) { /* the property reads so from now on, whatever is set */
+    int p = find(id);
+    if (p < 0) return 0;
+    fake.overridden[p] = 1;
+    fake.override[p] = value;
+    return 1;
+}
+
+int fakedcam_pulse(double rise, double width) { /* on the trigger input; 1 if it started an exposure */
+    pthread_mutex_lock(&lock);
+    double edge = (fake.props[TRIGGERPOLARITY].value == 2 ? rise : rise + width) + fake.props[TRIGGERDELAY].value;
+    int taken = capturing() && fake.props[TRIGGERSOURCE].value == 2 && edge - fake.last_edge >= get(MININTERVAL) - 1e-12;
+    if (taken && ++fake.pulses % (int)fake.props[TRIGGERTIMES].value) taken = 0;
+    if (taken) { fake.last_edge = edge; expose(edge); }
+    pthread_mutex_unlock(&lock);
+    return taken;
+}
+
+void fakedcam_stop(void) { pthread_mutex_lock(&lock); stop(); pthread_mutex_unlock(&lock); }
+
+int fakedcam_live(void) { return fake.session + fake.opened + fake.waiting_open + (fake.slots > 0); }
+
+int fakedcam_waiters(void) { return fake.waiters; }

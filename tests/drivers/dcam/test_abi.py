@@ -1,0 +1,101 @@
+"""The ctypes layer against C: layout, names, errors."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivers.dcam import abi, codes
+from drivers.errors import DeviceError
+
+STRUCTURES = {
+    "DCAMAPI_INIT": abi.ApiInit,
+    "DCAMDEV_OPEN": abi.DevOpen,
+    "DCAMDEV_STRING": abi.DevString,
+    "DCAMPROP_ATTR": abi.PropAttr,
+    "DCAM_TIMESTAMP": abi.TimeStamp,
+    "DCAMCAP_TRANSFERINFO": abi.TransferInfo,
+    "DCAMBUF_FRAME": abi.BufFrame,
+    "DCAMWAIT_OPEN": abi.WaitOpen,
+    "DCAMWAIT_START": abi.WaitStart,
+}
+# Bytes on 64-bit machines, as the vendor's header and two independent bindings have them.
+SIZES = {
+    "DCAMAPI_INIT": 32,
+    "DCAMDEV_OPEN": 16,
+    "DCAMDEV_STRING": 24,
+    "DCAMPROP_ATTR": 88,
+    "DCAM_TIMESTAMP": 8,
+    "DCAMCAP_TRANSFERINFO": 16,
+    "DCAMBUF_FRAME": 64,
+    "DCAMWAIT_OPEN": 24,
+    "DCAMWAIT_START": 16,
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_size_is_the_published_one(name: str) -> None:
+    assert ctypes.sizeof(STRUCTURES[name]) == SIZES[name]
+
+
+def test_stamps_lie_where_the_vendor_puts_them() -> None:
+    assert (abi.BufFrame.buffer.offset, abi.BufFrame.timestamp.offset, abi.BufFrame.framestamp.offset) == (16, 48, 56)
+
+
+def test_layout_is_that_of_a_c_compiler(world) -> None:
+    c_layout = world.layout()
+    assert set(c_layout) == set(STRUCTURES)
+    for name, structure in STRUCTURES.items():
+        offsets = [getattr(structure, field).offset for field, _ in structure._fields_]
+        assert (ctypes.sizeof(structure), offsets) == c_layout[name], name
+
+
+def test_a_missing_library_is_named_with_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r"camera: .*nowhere\.so cannot be loaded .*Install the vendor's DCAM-API"):
+        abi.Dcam(tmp_path / "nowhere.so", "camera")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the installed library's name is tested on Linux")
+def test_without_a_path_the_installed_library_is_looked_for() -> None:
+    try:
+        ctypes.CDLL("libdcamapi.so")
+    except OSError:
+        with pytest.raises(DeviceError, match=r"libdcamapi\.so cannot be loaded"):
+            abi.Dcam(None, "camera")
+    else:
+        pytest.skip("the vendor's library is installed here")
+
+
+def test_a_library_of_another_kind_is_refused_with_the_missing_calls(fake_library: Path, tmp_path: Path) -> None:
+    source, library = tmp_path / "old.c", tmp_path / "libold.so"
+    source.write_text("int dcamapi_init(void *p) { return p != 0; }\n")
+    subprocess.run(["gcc", "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    with pytest.raises(DeviceError, match=r"lacks dcamapi_uninit, dcamdev_open.*Nothing was changed"):
+        abi.Dcam(library, "camera")
+
+
+@pytest.mark.parametrize("code", [0x80000106, 0x80000106 - 2**32])
+def test_errors_have_names_for_either_sign(code: int) -> None:
+    assert codes.error_name(code) == "TIMEOUT (0x80000106)"
+
+
+def test_an_unknown_error_keeps_its_number() -> None:
+    error = abi.DcamError("camera", "dcamcap_start", -1)
+    assert "error 0xFFFFFFFF" in str(error)
+    assert error.code == 0xFFFFFFFF
+
+
+def test_a_call_before_the_session_is_an_error_by_name(world) -> None:
+    with pytest.raises(abi.DcamError, match=r"'dcamdev_open index 0'.*UNLOADED \(0x80000F04\)"):
+        abi.Dcam(world.path, "camera").dev_open(0)
+
+
+def test_a_wrong_size_field_is_seen_by_the_library(world) -> None:
+    """The fake checks sizes as the real one does; that the other tests pass therefore means something."""
+    library = ctypes.CDLL(str(world.path))
+    library.dcamapi_init.restype = ctypes.c_int32
+    assert library.dcamapi_init(ctypes.byref(abi.ApiInit(size=8))) & 0xFFFFFFFF == codes.Error.INVALIDPARAM

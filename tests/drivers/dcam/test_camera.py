@@ -1,0 +1,302 @@
+"""Acquisition over the fake library: every frame once, pixels right, every loss visible, nothing left open."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.dcam.abi import DcamError
+from drivers.dcam.camera import DcamCamera
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import Camera, CameraSettings, TriggerSource
+
+EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
+FRAME_BYTES = 48 * 72 * 2
+
+
+@pytest.fixture
+def small_ring(world):
+    """A camera whose ring has 4 slots, of which 3 are safe to read while it runs."""
+    camera = DcamCamera(world.path, ring_bytes=4 * FRAME_BYTES)
+    camera.configure(EXTERNAL)
+    yield camera
+    camera.close()
+
+
+def take(camera: Camera, n: int) -> list[int]:
+    return [camera.next_frame(1.0).framestamp for _ in range(n)]
+
+
+def test_every_pulse_is_a_frame_with_its_own_pixels_and_time(camera: DcamCamera, world) -> None:
+    camera.arm(5)
+    assert world.pulses(5, period=0.25) == 5
+    frames = [camera.next_frame(1.0) for _ in range(5)]
+    assert [frame.framestamp for frame in frames] == [0, 1, 2, 3, 4]
+    for frame in frames:
+        np.testing.assert_array_equal(frame.counts, world.pattern(frame.framestamp))
+        assert frame.counts.dtype == np.uint16
+    assert np.diff([frame.time for frame in frames]) == pytest.approx(0.25, abs=2e-6)
+
+
+def test_frames_are_dated_by_the_host_clock(world) -> None:
+    """The first frame was exposed an exposure and a readout before it was there to fetch."""
+
+    class Noon:
+        def now(self) -> float:
+            return 43200.0
+
+        def sleep(self, seconds: float) -> None: ...
+
+    camera = DcamCamera(world.path, clock=Noon())
+    camera.configure(EXTERNAL)
+    camera.arm(1)
+    world.pulse()
+    assert camera.next_frame(1.0).time == pytest.approx(43200.0 - 0.001 - camera.timing.readout)
+    camera.close()
+
+
+@pytest.mark.parametrize("pad", [0, 6, 1024])
+@pytest.mark.parametrize(("roi", "binning"), [((8, 12, 32, 40), 1), ((4, 16, 40, 24), 2)])
+def test_rows_of_the_ring_may_be_padded(camera: DcamCamera, world, pad: int, roi, binning: int) -> None:
+    world.fault("pad", pad)
+    camera.configure(replace(EXTERNAL, roi=roi, binning=binning))
+    camera.arm(1)
+    world.pulse()
+    np.testing.assert_array_equal(camera.next_frame(1.0).counts, world.pattern(0, roi, binning))
+
+
+def test_a_frame_owns_its_memory(camera: DcamCamera, world) -> None:
+    camera.arm(1)
+    world.pulse()
+    frame = camera.next_frame(1.0)
+    camera.disarm()  # frees the ring
+    np.testing.assert_array_equal(frame.counts, world.pattern(0))
+    assert frame.counts.base is None and frame.counts.flags.c_contiguous
+
+
+def test_the_ring_is_reused_in_order(small_ring: DcamCamera, world) -> None:
+    small_ring.arm(100)
+    for index in range(11):
+        world.pulse()
+        frame = small_ring.next_frame(1.0)
+        assert frame.framestamp == index
+        np.testing.assert_array_equal(frame.counts, world.pattern(index))
+
+
+def test_a_whole_block_may_wait_in_a_ring_that_holds_it(camera: DcamCamera, world) -> None:
+    camera.arm(20)
+    world.pulses(20)
+    assert take(camera, 20) == list(range(20))
+    assert camera.describe()["frames_overwritten"] == 0
+
+
+def test_overwritten_frames_leave_a_gap_and_a_count(small_ring: DcamCamera, world) -> None:
+    """10 frames into 4 slots: 6 are gone and the oldest of the 4 may go at any moment."""
+    small_ring.arm(100)
+    world.pulses(10)
+    assert take(small_ring, 3) == [7, 8, 9]
+    assert small_ring.describe()["frames_overwritten"] == 7
+
+
+def test_a_frame_overwritten_while_it_is_copied_is_never_handed_out(small_ring: DcamCamera, world) -> None:
+    small_ring.arm(100)
+    world.pulse()
+    world.fault("overrun_in_lock", 5)  # five more frames arrive between finding frame 0 and copying it
+    frame = small_ring.next_frame(1.0)
+    assert frame.framestamp == 3
+    np.testing.assert_array_equal(frame.counts, world.pattern(3))
+    assert take(small_ring, 2) == [4, 5]
+
+
+def test_a_frame_lost_on_the_way_leaves_a_gap(camera: DcamCamera, world) -> None:
+    camera.arm(5)
+    world.pulses(2)
+    world.fault("drop", 1)
+    world.fault("report_loss", 1)
+    world.pulses(3)
+    assert take(camera, 4) == [0, 1, 3, 4]
+    with pytest.raises(DeviceTimeout):
+        camera.next_frame(0.01)
+    assert camera.describe()["transport_losses"] == 1
+
+
+@pytest.mark.parametrize("origin", [0, 1])
+def test_a_lost_first_frame_shows_whatever_number_the_camera_begins_with(world, origin: int) -> None:
+    world.fault("first_stamp", origin)
+    camera = DcamCamera(world.path)
+    camera.configure(EXTERNAL)
+    camera.arm(3)
+    world.fault("drop", 1)
+    world.pulses(3)
+    assert take(camera, 2) == [1, 2]
+    camera.close()
+
+
+def test_framestamps_start_at_zero_at_every_arm(camera: DcamCamera, world) -> None:
+    for _ in range(2):
+        camera.arm(2)
+        world.pulses(2)
+        assert take(camera, 2) == [0, 1]
+        camera.disarm()
+
+
+def test_pulses_that_come_too_early_give_no_frame(camera: DcamCamera, world) -> None:
+    camera.arm(3)
+    period = camera.timing.min_period
+    assert [world.pulse(), world.pulse(0.5 * period), world.pulse(0.6 * period), world.pulse(period)] == [1, 0, 1, 1]
+    assert take(camera, 3) == [0, 1, 2]
+
+
+def test_arm_returns_only_when_triggers_are_taken(camera: DcamCamera, world) -> None:
+    world.fault("start_polls", 3)
+    camera.arm(1)
+    assert world.pulse()
+    assert take(camera, 1) == [0]
+
+
+def test_an_event_that_never_comes_delays_but_does_not_lose_a_frame(camera: DcamCamera, world) -> None:
+    camera.arm(1)
+    world.fault("swallow_events", 1)
+    with ThreadPoolExecutor() as pool:
+        frame = pool.submit(camera.next_frame, 5.0)
+        while not world.waiters:
+            pass
+        world.pulse()
+        assert frame.result().framestamp == 0
+
+
+def test_no_trigger_is_a_timeout_that_leaves_it_armed(camera: DcamCamera, world) -> None:
+    camera.arm(2)
+    with pytest.raises(DeviceTimeout, match=r"no frame came within 0.01 s .*\(external\).*still armed"):
+        camera.next_frame(0.01)
+    world.pulse()
+    assert take(camera, 1) == [0]
+
+
+def test_software_triggers(camera: DcamCamera, world) -> None:
+    camera.configure(replace(EXTERNAL, trigger=TriggerSource.SOFTWARE))
+    camera.arm(2)
+    for index in range(2):
+        camera.software_trigger()
+        np.testing.assert_array_equal(camera.next_frame(1.0).counts, world.pattern(index))
+    assert not world.pulse()
+
+
+def test_software_trigger_is_refused_where_it_cannot_work(camera: DcamCamera) -> None:
+    with pytest.raises(DeviceRefused, match="not armed"):
+        camera.software_trigger()
+    camera.arm(1)
+    with pytest.raises(DeviceRefused, match="trigger external"):
+        camera.software_trigger()
+
+
+def test_free_run(camera: DcamCamera, world) -> None:
+    camera.configure(replace(EXTERNAL, trigger=TriggerSource.INTERNAL))
+    camera.arm(4)
+    frames = [camera.next_frame(1.0) for _ in range(4)]
+    assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
+    assert np.diff([frame.time for frame in frames]) == pytest.approx(camera.timing.min_period, abs=2e-6)
+
+
+def test_disarm_ends_a_wait_in_another_thread(camera: DcamCamera, world) -> None:
+    camera.arm(1)
+    with ThreadPoolExecutor() as pool:
+        frame = pool.submit(camera.next_frame, 30.0)
+        while not world.waiters:
+            pass
+        camera.disarm()
+        error = frame.exception(timeout=5.0)
+    assert isinstance(error, DeviceError) and not isinstance(error, DeviceTimeout)
+    assert "not armed" in str(error)
+
+
+def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera, world) -> None:
+    camera.arm(3)
+    world.pulses(2)
+    world.stop()
+    assert take(camera, 2) == [0, 1]
+    with pytest.raises(DeviceError, match=r"ended by itself \(state READY\)"):
+        camera.next_frame(1.0)
+
+
+def test_unplugged_in_a_scan(camera: DcamCamera, world) -> None:
+    camera.arm(2)
+    world.pulse()
+    world.fault("unplugged")
+    with pytest.raises(DcamError, match=r"NOCONNECTION \(0x80000F07\)"):
+        camera.next_frame(1.0)
+    with pytest.raises(DcamError, match="NOCONNECTION"):
+        camera.disarm()
+    camera.close()
+    camera.close()
+
+
+def test_states_that_do_not_fit(camera: DcamCamera) -> None:
+    with pytest.raises(DeviceError, match="not armed"):
+        camera.next_frame(0.01)
+    with pytest.raises(DeviceRefused, match="at least 1"):
+        camera.arm(0)
+    camera.arm(1)
+    with pytest.raises(DeviceRefused, match="armed already"):
+        camera.arm(1)
+    with pytest.raises(DeviceRefused, match="Disarm it"):
+        camera.configure(EXTERNAL)
+
+
+def test_disarm_is_legal_in_every_state(camera: DcamCamera) -> None:
+    camera.disarm()
+    camera.arm(1)
+    camera.disarm()
+    camera.disarm()
+    camera.close()
+    camera.disarm()
+
+
+def test_close_ends_everything_and_may_be_repeated(world) -> None:
+    camera = DcamCamera(world.path)
+    camera.arm(1)
+    assert world.live == 4
+    camera.close()
+    camera.close()
+    assert world.live == 0
+    with pytest.raises(DeviceError, match="is closed"):
+        camera.arm(1)
+
+
+def test_no_memory_for_the_ring_leaves_it_disarmed(camera: DcamCamera, world) -> None:
+    world.fault("no_memory")
+    with pytest.raises(DcamError, match=r"NOMEMORY.*fewer bytes"):
+        camera.arm(1)
+    world.fault("no_memory", 0)
+    camera.arm(1)
+
+
+def test_no_camera_is_said_with_what_usb_knows(world) -> None:
+    world.fault("no_camera")
+    with pytest.raises(DeviceError, match=r"finds no camera. Answered 'NOCAMERA \(0x80000206\)'.*Switch.*USB"):
+        DcamCamera(world.path)
+    assert world.live == 0
+
+
+def test_an_index_too_high_is_said(world) -> None:
+    with pytest.raises(DeviceError, match=r"no camera 1. Expected an index below 1"):
+        DcamCamera(world.path, index=1)
+    assert world.live == 0
+
+
+def test_a_camera_that_refuses_its_first_setting_is_let_go(world) -> None:
+    world.fault("refuse", 0x00100110)
+    with pytest.raises(DeviceRefused, match="refuses TRIGGERSOURCE"):
+        DcamCamera(world.path)
+    assert world.live == 0
+
+
+def test_description_names_the_camera_and_what_counts_mean(camera: DcamCamera) -> None:
+    description = camera.describe()
+    assert (description["vendor"], description["model"]) == ("Hamamatsu", "C15550-20UP")
+    assert description["cameraid"] == "S/N: 000123"
+    assert (description["electrons_per_count"], description["offset_counts"]) == (0.107, 200)
+    assert description["defect_correction"] == "off"

@@ -1,0 +1,108 @@
+"""Settings: applied, read back, refused without a trace; timing as the camera says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from drivers import orca_quest
+from drivers.dcam.abi import DcamError
+from drivers.dcam.camera import DcamCamera
+from drivers.dcam.codes import Property
+from drivers.errors import DeviceRefused
+from drivers.protocols import CameraSettings, TriggerSource
+
+EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
+
+
+def test_settings_come_back_as_the_camera_has_them(camera: DcamCamera) -> None:
+    asked = CameraSettings(0.002, TriggerSource.SOFTWARE, roi=(8, 12, 32, 40), binning=2, readout="ultra_quiet")
+    assert camera.configure(asked) == asked
+    assert camera.timing.shape == (16, 20)
+    assert camera.configure(EXTERNAL) == EXTERNAL
+    assert camera.timing.shape == (48, 72)
+
+
+def test_exposure_is_what_the_camera_rounded_it_to(camera: DcamCamera) -> None:
+    """Steps of 10 ns, upwards."""
+    accepted = camera.configure(replace(EXTERNAL, exposure=0.0010000123))
+    assert accepted.exposure == pytest.approx(0.00100002, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"exposure": 1e-6}, r"EXPOSURETIME = 1e-06 is out of range. Expected EXPOSURETIME from 7.2e-06 to 1800"),
+        ({"exposure": 100e-6, "readout": "ultra_quiet"}, r"Expected EXPOSURETIME from 0.0001728"),
+        ({"exposure": 2000.0}, "out of range"),
+        ({"binning": 3}, r"refuses BINNING = 3. Answered 'INVALIDVALUE \(0x80000821\)'"),
+        ({"roi": (0, 0, 30, 40)}, r"made SUBARRAYVSIZE = 32 of 30. Expected a multiple of 4"),
+        ({"roi": (32, 0, 32, 40)}, "INVALIDSUBARRAY"),
+        ({"roi": (0, 0, 96, 40)}, "SUBARRAYVSIZE = 96 is out of range"),
+        ({"readout": "fast"}, "no readout 'fast'. Expected one of ultra_quiet, standard"),
+    ],
+)
+def test_a_refusal_says_why_and_leaves_the_settings(camera: DcamCamera, wrong: dict, message: str) -> None:
+    before = camera.configure(CameraSettings(0.003, TriggerSource.EXTERNAL, roi=(4, 8, 20, 24), binning=2))
+    timing = camera.timing
+    with pytest.raises(DeviceRefused, match=message):
+        camera.configure(replace(EXTERNAL, **wrong))
+    assert camera.timing == timing
+    assert camera.configure(before) == before
+
+
+def test_a_value_the_camera_ignores_is_noticed(camera: DcamCamera, world) -> None:
+    world.override(Property.TRIGGERPOLARITY, 1)
+    with pytest.raises(DeviceRefused, match="made TRIGGERPOLARITY = 1 of 2"):
+        camera.configure(EXTERNAL)
+
+
+def test_bundled_frames_are_refused(camera: DcamCamera, world) -> None:
+    world.override(Property.FRAMEBUNDLE_MODE, 2)
+    with pytest.raises(DeviceRefused, match=r"bundles several frames.*larger region"):
+        camera.configure(EXTERNAL)
+
+
+def test_an_unplugged_camera_is_no_refusal(camera: DcamCamera, world) -> None:
+    world.fault("unplugged")
+    with pytest.raises(DcamError, match=r"NOCONNECTION.*power and cable"):
+        camera.configure(EXTERNAL)
+    world.fault("unplugged", 0)
+
+
+@pytest.mark.parametrize("readout", ["standard", "ultra_quiet"])
+@pytest.mark.parametrize("trigger", [TriggerSource.EXTERNAL, TriggerSource.SOFTWARE])
+def test_full_frame_timing_is_that_of_the_data_sheet(world, readout: str, trigger: TriggerSource) -> None:
+    """The fake computes times in C from the property table; the planner's figures were typed from the data sheet."""
+    world.reset(*orca_quest.SENSOR_SHAPE)
+    camera = DcamCamera(world.path)
+    settings = CameraSettings(0.02, trigger, readout=readout)
+    camera.configure(settings)
+    told, planned = camera.timing, orca_quest.timing(settings, link="coaxpress")
+    camera.close()
+    assert (told.shape, told.bits) == (planned.shape, planned.bits)
+    assert (told.min_period, told.readout) == pytest.approx((planned.min_period, planned.readout), rel=1e-9)
+    assert told.row_period == pytest.approx(planned.row_period, rel=1e-9)
+
+
+def test_rows_of_a_binned_region_start_two_line_times_apart(camera: DcamCamera) -> None:
+    """Two sensor rows in 7.2 us; four summed rows therefore follow each other in 14.4 us."""
+    camera.configure(replace(EXTERNAL, roi=(0, 0, 32, 40), binning=4))
+    assert camera.timing.row_period == pytest.approx(14.4e-6)
+
+
+@pytest.mark.parametrize(
+    "slowest",
+    [Property.TIMING_MINTRIGGERINTERVAL, Property.TIMING_CYCLICTRIGGERPERIOD, Property.TIMING_MINTRIGGERBLANKING],
+)
+def test_the_strictest_trigger_rule_sets_the_least_period(camera: DcamCamera, world, slowest: Property) -> None:
+    world.override(slowest, 0.5)
+    expected = 0.501 if slowest is Property.TIMING_MINTRIGGERBLANKING else 0.5
+    assert camera.timing.min_period == pytest.approx(expected)
+
+
+def test_free_run_overlaps_readout_and_exposure(camera: DcamCamera) -> None:
+    """Internal trigger: 1 / max(exposure, readout), not 1 / (exposure + readout)."""
+    camera.configure(replace(EXTERNAL, trigger=TriggerSource.INTERNAL, exposure=0.01))
+    assert camera.timing.min_period == pytest.approx(0.01)
