@@ -12,20 +12,21 @@ from beamline.plan import Mode, Place
 class Section(BaseModel):
     """A frozen group of keys. Unknown keys are refused, and so is `yes` where a number belongs."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     @model_validator(mode="before")
     @classmethod
     def _no_truth_for_numbers(cls, data: Any) -> Any:
         for name, field in cls.model_fields.items():
             if isinstance(data, dict) and isinstance(data.get(name), bool) and field.annotation is not bool:
-                raise ValueError(f"{name} is {data[name]} (YAML reads yes, no, on and off as true and false)")
+                value = str(data[name]).lower()
+                raise ValueError(f"{name} is {value} (YAML reads yes, no, on and off as true and false)")
         return data
 
 
 class Sample(Section):
     name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)]
-    """Ends the run folder's name: letters, digits and _ . + -"""
+    """letters, digits and _ . + - (it ends the run folder's name)"""
     description: str = ""
 
 
@@ -99,7 +100,7 @@ class Fields(Section):
 
 
 class Scan(Section):
-    mode: Mode = Mode.FLY
+    mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
     angles: Angles
     exposure_s: PositiveFloat
     period_s: PositiveFloat
@@ -108,12 +109,6 @@ class Scan(Section):
     """Wait after each move of a step scan."""
     darks: Fields = Fields()
     flats: Fields = Fields()
-
-    @model_validator(mode="after")
-    def _moves(self) -> Scan:
-        if self.mode is Mode.STATIC:
-            raise ValueError("mode is static, which only darks and flats are; legal: fly, step")
-        return self
 
 
 class PM16CStageConfig(Section):
@@ -154,6 +149,7 @@ Roi = Annotated[
 class _Orca(Section):
     """What the real and the simulated ORCA-Quest have in common."""
 
+    kind: str
     roi: Roi | None = None
     """null: the full sensor, 2304 x 4096."""
     binning: Literal[1, 2, 4] = 1
@@ -259,6 +255,8 @@ class Config(Section):
             raise ValueError(
                 f"simulated devices cannot see real ones: {unreal} simulated, {real} real; make all simulated or none"
             )
+        if any(simulated.values()) and self.simulation is None:
+            raise ValueError("simulated devices need a simulation section; `simulation: {}` takes its defaults")
         if self.simulation is not None and not any(simulated.values()):
             raise ValueError("the simulation section belongs to simulated devices and every device is real; remove it")
         return self
