@@ -68,7 +68,7 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
 
 
 def _nearest(word: Any, legal: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(word), legal, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(str(word), legal, n=1, cutoff=0.65)
     return f" (did you mean {near[0]}?)" if near else ""
 
 

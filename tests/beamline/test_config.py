@@ -142,8 +142,7 @@ def test_schema_describes_a_configuration() -> None:
 FAULTS = {
     "unknown key": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  setle_s: 1"),
-        "my.yaml:4: scan.exposur_s is not a known key (did you mean "
-        "exposure_s?); legal keys there: mode, angles, exposure_s",
+        "my.yaml:5: scan.setle_s is not a known key (did you mean settle_s?); legal keys there: mode, angles, exposure_s",
     ),
     "key of another scheme": (
         ("views: 12", "views: 12, seed: 1"),
