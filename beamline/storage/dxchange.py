@@ -91,7 +91,10 @@ class DataExchangeSource:
     def _attributes(self) -> dict[str, str | float | int]:
         said: dict[str, str | float | int] = {}
         for name, value in self._file.attrs.items():
-            said[name] = float(value) if isinstance(value, np.number) else hdf5.text(value)
+            if isinstance(value, np.number):
+                said[name] = float(value)
+            else:
+                said[name] = " ".join(hdf5.text(part) for part in np.ravel(value))
         for name, where in (("title", "exchange/title"), ("sample", "measurement/sample/name")):
             item = hdf5.dataset(self._file, where)
             if item is not None:

@@ -43,8 +43,7 @@ class NXtomoSource:
             energy = (hdf5.scalar(places.entry, f"{where}/incident_energy", hdf5.ENERGY_UNITS) for where in BEAMS)
             self.energy_kev = next((value for value in energy if value is not None), None)
             # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
-            axis = _value(self._file, "/entry/record/axis_col")
-            self.axis_col = float(axis) if np.size(axis) == 1 and np.isfinite(axis) else None
+            self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
             self.n = 0
             self._own_angles = own_angles
             self.refresh()
@@ -183,6 +182,7 @@ TEXTS = {
 NUMBERS = (
     ("exposure_s", "record/exposure", hdf5.TIME_UNITS),
     ("period_s", "record/period", hdf5.TIME_UNITS),
+    ("no_data", "record/no_data", {"": 1.0}),
     ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
 )
 

@@ -1,0 +1,73 @@
+"""describe: what a scan is, in plain values; `beamline info` prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamline.storage.angle_table import Angles
+from beamline.storage.scan_source import Quantity, ScanSource
+from beamline.storage.source import Images, open_scan
+from beamline.storage.validate import source_findings
+from drivers.frame import FrameKind
+
+
+def describe(
+    path: Path | str,
+    *,
+    angles: Angles | None = None,
+    angle_rows: str | None = None,
+    darks: Images | None = None,
+    flats: Images | None = None,
+    quantity: Quantity | None = None,
+) -> Mapping[str, Any]:
+    """Describe the scan in a file; the keywords are open_scan's. DataError where it cannot be opened."""
+    with open_scan(path, angles=angles, angle_rows=angle_rows, darks=darks, flats=flats, quantity=quantity) as source:
+        return describe_source(source)
+
+
+def describe_source(source: ScanSource) -> Mapping[str, Any]:
+    """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
+
+    Angles are in degrees. `findings` are the messages of errors and warnings, `reconstructable` whether no error
+    stands against a reconstruction.
+    """
+    kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
+    findings = source_findings(source)
+    attributes = dict(source.attributes)
+    return {
+        "path": str(source.path),
+        "format": source.format,
+        "frames": int(source.image_key.size),
+        "shape": tuple(source.shape),
+        "dtype": str(source.dtype),
+        "bytes": _size(source.path),
+        "kinds": {name: n for name, n in kinds.items() if n},
+        "quantity": source.quantity,
+        **_angles(source),
+        "pixel_size_mm": source.pixel_size_mm,
+        "energy_kev": source.energy_kev,
+        "axis_col": source.axis_col,
+        "exposure_s": attributes.pop("exposure_s", None),
+        "finished": source.finished,
+        "missing_triggers": attributes.pop("missing_triggers", None),
+        "attributes": attributes,
+        "findings": [finding.message for finding in findings if finding.severity != "info"],
+        "reconstructable": all(finding.severity != "error" for finding in findings),
+    }
+
+
+def _angles(source: ScanSource) -> dict[str, float | None]:
+    angles = np.degrees(source.angles[source.image_key == FrameKind.PROJECTION])
+    if angles.size == 0 or not np.isfinite(angles).all():
+        return {"first_angle_deg": None, "last_angle_deg": None, "step_deg": None}
+    step = float(np.median(np.diff(np.unique(angles)))) if np.unique(angles).size > 1 else None
+    return {"first_angle_deg": float(angles[0]), "last_angle_deg": float(angles[-1]), "step_deg": step}
+
+
+def _size(path: Path) -> int:
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())

@@ -1,0 +1,17 @@
+"""Finding: one thing that a rule has to say about a scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Severity = Literal["error", "warning", "info"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Severity "error": not fit for reconstruction or not a valid file; `rule`: the name of the rule that found it."""
+
+    severity: Severity
+    rule: str
+    message: str

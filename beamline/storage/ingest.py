@@ -1,0 +1,133 @@
+"""ingest: any scan, frame by frame, into one of our files with statistics of each frame; whole or not at all.
+
+Integer frames become an NXtomo. Float frames (the lab's float32 stacks) cannot: NXtomo's data are integers, and a
+rounding would lose what was measured. They keep their type, at the same paths, under the definition
+`splatline_float_projections`, so that nobody takes them for counts; open_scan reads both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from beamline.digest import digest
+from beamline.errors import DataError, ScanStopped
+from beamline.storage import nxtomo_layout as layout
+from beamline.storage.angle_table import Angles
+from beamline.storage.exchange_view import add_exchange_view
+from beamline.storage.scan_source import Quantity, ScanSource
+from beamline.storage.source import Images, open_scan
+from drivers.frame import FrameKind
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What was written: `definition` says whether it is an NXtomo; `invalid_frames`: frames without a valid pixel."""
+
+    path: Path
+    definition: str
+    frames: int
+    pixel_bytes: int
+    invalid_frames: int
+
+
+def ingest(
+    tif: Path | str,
+    out: Path | str,
+    *,
+    angles: Angles | None = None,
+    angle_rows: str | None = None,
+    darks: Images | None = None,
+    flats: Images | None = None,
+    quantity: Quantity | None = None,
+    pixel_size_mm: float | None = None,
+    energy_kev: float | None = None,
+    sample: str | None = None,
+    no_data: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Ingested:
+    """Copy a scan into the new file `out`, one frame in memory at a time.
+
+    Args:
+        tif: whatever open_scan reads: a multi-page TIFF, a folder or .zip of TIFFs, or another HDF5 scan.
+        angles, angle_rows, darks, flats, quantity: as for open_scan.
+        pixel_size_mm, energy_kev, sample: for the record, where the input does not say.
+        no_data: a value that marks pixels without a measurement; they count as invalid in the statistics.
+        progress: called with (frames written, frames in all) after each.
+        should_stop: asked before each frame.
+
+    Raises:
+        DataError: unreadable input, `out` exists, or the disk does not take it. No half file is left.
+        ScanStopped: should_stop said so. No half file is left.
+    """
+    out = Path(out)
+    if out.exists():
+        raise DataError(f"{out} exists. Nothing is ever overwritten: name a new file.")
+    part = out.with_name(out.name + ".part")
+    with open_scan(tif, angles=angles, angle_rows=angle_rows, darks=darks, flats=flats, quantity=quantity) as source:
+        views = source.image_key == FrameKind.PROJECTION
+        if not np.isfinite(source.angles[views]).all():
+            raise DataError(
+                f"{tif} does not say the angles of its {views.sum()} projections: give them. Nothing written."
+            )
+        info = layout.ScanInfo(
+            sample=sample or str(source.attributes.get("sample", Path(tif).stem)),
+            title=f"ingested from {Path(tif).name}",
+            pixel_size_mm=pixel_size_mm or source.pixel_size_mm,
+            energy_kev=energy_kev or source.energy_kev,
+            axis_col=source.axis_col,
+        )
+        try:
+            with h5py.File(part, "x", libver=layout.LIBVER) as file:
+                invalid = _copy(source, file, info, no_data, progress, should_stop)
+        except FileExistsError as error:
+            raise DataError(f"{part} exists: another ingest is at work, or one was killed. Then remove it.") from error
+        except BaseException as error:
+            part.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise DataError(f"{out} could not be written ({error}). Nothing is left of it.") from error
+            raise
+        if out.exists():
+            part.unlink()
+            raise DataError(f"{out} appeared while this ran; it is untouched, and nothing else is left.")
+        part.rename(out)
+        definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
+        frames = int(source.image_key.size)
+        size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
+        return Ingested(out, definition, frames, size, invalid)
+
+
+def _copy(
+    source: ScanSource,
+    file: h5py.File,
+    info: layout.ScanInfo,
+    no_data: float | None,
+    progress: Callable[[int, int], None] | None,
+    should_stop: Callable[[], bool] | None,
+) -> int:
+    dtype = source.dtype.newbyteorder("<")
+    layout.create(file, info, source.shape, dtype, quantity=source.quantity, preview_bin=4, start=None)
+    if no_data is not None:
+        file["/entry/record/no_data"] = float(no_data)
+    rows = layout.Rows(file)
+    saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
+    n, invalid = int(source.image_key.size), 0
+    for i in range(n):
+        if should_stop is not None and should_stop():
+            raise ScanStopped(f"Stopped after {i} of {n} frames; nothing is left of {file.filename}.")
+        image = source.read([i])[0]
+        statistics = digest(image, saturation=saturation, no_data=no_data)
+        invalid += statistics.invalid_fraction == 1.0
+        rows.write(i, image, statistics, layout.Record(FrameKind(int(source.image_key[i])), float(source.angles[i])))
+        if progress is not None:
+            progress(i + 1, n)
+    file[layout.COMMITTED][()] = n
+    file[layout.STATUS][()] = b"complete"
+    file[layout.FINISHED][()] = 1
+    add_exchange_view(file)
+    return invalid
