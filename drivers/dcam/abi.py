@@ -136,7 +136,6 @@ _ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
         "dcamwait_open": (POINTER(WaitOpen),),
         "dcamwait_close": (c_void_p,),
         "dcamwait_start": (c_void_p, POINTER(WaitStart)),
-        "dcamwait_abort": (c_void_p,),
     }
 )
 
@@ -166,7 +165,7 @@ class DcamError(DeviceError):
 class Dcam:
     """A loaded DCAM library. Handles are plain integers; every method raises DcamError where the library answers so.
 
-    Waiting calls release Python's global lock, so that another thread may end them with `wait_abort`.
+    Waiting calls release Python's global lock.
 
     Args:
         library: path of the library; None asks the system for the installed one.
@@ -275,10 +274,11 @@ class Dcam:
     def cap_firetrigger(self, camera: int) -> None:
         self._call("dcamcap_firetrigger", camera, 0)
 
-    def wait_open(self, camera: int) -> int:
+    def wait_open(self, camera: int) -> tuple[int, int]:
+        """A wait handle, and the events that this camera can signal."""
         opened = WaitOpen(size=sizeof(WaitOpen), camera=camera)
         self._call("dcamwait_open", byref(opened))
-        return int(opened.wait)
+        return int(opened.wait), int(opened.supported)
 
     def wait_close(self, wait: int) -> None:
         self._call("dcamwait_close", wait)
@@ -287,11 +287,7 @@ class Dcam:
         """Block until an event of `mask`. Several may fold into one: it is a hint, the transfer count is the truth.
 
         Raises:
-            DcamError: also TIMEOUT, ABORT (by wait_abort), LOSTFRAME and MISSINGFRAME_TROUBLE.
+            DcamError: also TIMEOUT, LOSTFRAME and MISSINGFRAME_TROUBLE.
         """
         start = WaitStart(size=sizeof(WaitStart), mask=mask, timeout_ms=timeout_ms)
         self._call("dcamwait_start", wait, byref(start), detail=f"for {timeout_ms} ms")
-
-    def wait_abort(self, wait: int) -> None:
-        """Wake whoever waits; nothing where nobody does."""
-        self._call("dcamwait_abort", wait)

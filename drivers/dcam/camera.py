@@ -78,7 +78,8 @@ class DcamCamera:
                 )
             self._camera = self._dcam.dev_open(index)
             undo.callback(self._dcam.dev_close, self._camera)
-            self._wait = self._dcam.wait_open(self._camera)
+            self._wait, supported = self._dcam.wait_open(self._camera)
+            self._events = (Event.FRAMEREADY | Event.STOPPED) & supported
             undo.callback(self._dcam.wait_close, self._wait)
             self._properties = Properties(self._dcam, self._camera, name)
             self._first_stamp = self._stamp_of_a_first_frame()
@@ -164,10 +165,9 @@ class DcamCamera:
             if self._closed or self._capture is None:
                 return
             self._capture = None
-            # Run in reverse, each even where the one before fails: an unplugged camera still has memory to free.
+            # Run in reverse, the second even where the first fails: an unplugged camera still has memory to free.
             steps.callback(self._dcam.buf_release, self._camera)
             steps.callback(self._dcam.cap_stop, self._camera)
-            steps.callback(self._dcam.wait_abort, self._wait)
 
     def describe(self) -> dict[str, str | int | float]:
         """Identity, what the camera reports of its state, and the losses of the present or last run."""
@@ -239,11 +239,11 @@ class DcamCamera:
     def _await_event(self, seconds: float) -> None:
         """Wait for a reason to look into the ring again; what there is to see, the ring itself says."""
         try:
-            self._dcam.wait_start(self._wait, Event.FRAMEREADY | Event.STOPPED, max(1, round(seconds * 1000)))
+            self._dcam.wait_start(self._wait, self._events, max(1, round(seconds * 1000)))
         except DcamError as error:
             if error.code in (Error.LOSTFRAME, Error.MISSINGFRAME_TROUBLE):
                 self._transport_losses += 1  # capture goes on; the framestamps show which frame is missing
-            elif error.code not in (Error.TIMEOUT, Error.ABORT):
+            elif error.code != Error.TIMEOUT:
                 raise
 
     def _take(self) -> CameraFrame | None:

@@ -44,6 +44,8 @@ class World:
         self._fake = ctypes.CDLL(str(library))
         self._fake.fakedcam_pulse.argtypes = (ctypes.c_double, ctypes.c_double)
         self._fake.fakedcam_override.argtypes = (ctypes.c_int32, ctypes.c_double)
+        self._fake.fakedcam_preset.argtypes = (ctypes.c_int32, ctypes.c_double)
+        self._fake.fakedcam_value.restype = ctypes.c_double
         self._time = 1000.0
         self.reset()
 
@@ -55,6 +57,12 @@ class World:
 
     def override(self, property_id: int, value: float) -> None:
         assert self._fake.fakedcam_override(property_id, value)
+
+    def preset(self, property_id: int, value: float) -> None:
+        assert self._fake.fakedcam_preset(property_id, value)
+
+    def value(self, property_id: int) -> float:
+        return self._fake.fakedcam_value(property_id)
 
     def pulse(self, after: float = 0.1, width: float = 0.001) -> bool:
         """One pulse, `after` s after the one before; whether an exposure began."""

@@ -26,8 +26,8 @@ typedef struct { int32_t size, eventhappened, eventmask, timeout; } DCAMWAIT_STA
 
 #define ERR(code) ((int32_t)(code))
 #define SUCCESS 1
+#define NONE 0 /* nothing to do: not a failure */
 #define BUSY ERR(0x80000101u)
-#define ABORT ERR(0x80000102u)
 #define NOTREADY ERR(0x80000103u)
 #define NOTSTABLE ERR(0x80000104u)
 #define TIMEOUT ERR(0x80000106u)

@@ -57,15 +57,15 @@ static const Property TABLE[N_PROPS] = {
 
 /* What the outside can do to the camera and its library. */
 static const char *const FAULTS[] = {"no_camera", "unplugged", "drop", "report_loss", "pad", "first_stamp", "start_polls",
-                                     "overrun_in_lock", "swallow_events", "refuse", "no_memory"};
-enum { NO_CAMERA, UNPLUGGED, DROP, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, NO_MEMORY, N_FAULTS };
+                                     "overrun_in_lock", "swallow_events", "refuse", "no_memory", "no_stopped_event"};
+enum { NO_CAMERA, UNPLUGGED, DROP, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, NO_MEMORY, NO_STOPPED_EVENT, N_FAULTS };
 
 static struct {
     Property props[N_PROPS];
     int overridden[N_PROPS], faults[N_FAULTS];
     double override[N_PROPS];
     int sensor_rows, sensor_cols, devices;
-    int session, opened, waiting_open, status, mode, polls, waiters, aborted, pending;
+    int session, opened, waiting_open, status, mode, polls, waiters, pending;
     int slots, count, exposed, pulses;
     uint8_t **ring;
     int32_t *stamps;
@@ -130,6 +130,8 @@ static void free_run(void) { /* internal trigger: no clock here, each wait bring
     if (capturing() && fake.props[TRIGGERSOURCE].value == 1) expose(fake.started + fake.exposed * get(FRAMEINTERVAL));
 }
 
+static int supported_events(void) { return EV_FRAMEREADY | (fake.faults[NO_STOPPED_EVENT] ? 0 : EV_STOPPED); }
+
 static void release(void) {
     for (int i = 0; i < fake.slots; i++) free(fake.ring[i]);
     free(fake.ring); free(fake.stamps); free(fake.times);
@@ -173,6 +175,15 @@ int fakedcam_override(int32_t id, double value) { /* the property reads so from 
     fake.override[p] = value;
     return 1;
 }
+
+int fakedcam_preset(int32_t id, double value) { /* as another program left it */
+    int p = find(id);
+    if (p < 0) return 0;
+    fake.props[p].value = value;
+    return 1;
+}
+
+double fakedcam_value(int32_t id) { return get(find(id)); }
 
 int fakedcam_pulse(double rise, double width) { /* on the trigger input; 1 if it started an exposure */
     pthread_mutex_lock(&lock);

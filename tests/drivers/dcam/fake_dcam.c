@@ -149,7 +149,12 @@ int32_t dcamcap_start(void *h, int32_t mode) {
     return leave(SUCCESS);
 }
 
-int32_t dcamcap_stop(void *h) { CAMERA(h); stop(); return leave(SUCCESS); }
+int32_t dcamcap_stop(void *h) {
+    CAMERA(h);
+    if (fake.status != ST_BUSY) return leave(NONE);
+    stop();
+    return leave(SUCCESS);
+}
 
 int32_t dcamcap_status(void *h, int32_t *status) {
     CAMERA(h);
@@ -179,7 +184,7 @@ int32_t dcamwait_open(DCAMWAIT_OPEN *p) {
     if (p->hdcam != &fake.camera || !fake.opened) return leave(INVALIDHANDLE);
     fake.waiting_open = 1;
     p->hwait = &fake.wait;
-    p->supportevent = EV_FRAMEREADY | EV_STOPPED;
+    p->supportevent = supported_events();
     return leave(SUCCESS);
 }
 
@@ -187,22 +192,15 @@ int32_t dcamwait_open(DCAMWAIT_OPEN *p) {
 
 int32_t dcamwait_close(void *w) { WAIT(w); fake.waiting_open = 0; return leave(SUCCESS); }
 
-int32_t dcamwait_abort(void *w) {
-    WAIT(w);
-    fake.aborted = fake.waiters;
-    pthread_cond_broadcast(&changed);
-    return leave(SUCCESS);
-}
-
 int32_t dcamwait_start(void *w, DCAMWAIT_START *p) {
     WAIT(w); SIZED(p, size);
+    if (!p->eventmask || (p->eventmask & ~supported_events())) return leave(INVALIDPARAM);
     double deadline = now() + p->timeout / 1000.0;
     int32_t answer = 0;
     fake.waiters++;
     free_run();
     while (!answer) {
         if (fake.faults[REPORT_LOSS] > 0) { fake.faults[REPORT_LOSS]--; answer = LOSTFRAME; break; }
-        if (fake.aborted) { fake.aborted--; answer = ABORT; break; }
         p->eventhappened = fake.pending & p->eventmask;
         fake.pending &= ~p->eventmask;
         if (p->eventhappened) answer = SUCCESS;

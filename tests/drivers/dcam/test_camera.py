@@ -168,6 +168,16 @@ def test_an_event_that_never_comes_delays_but_does_not_lose_a_frame(camera: Dcam
         assert frame.result().framestamp == 0
 
 
+def test_a_camera_that_cannot_signal_its_stop(world) -> None:
+    world.fault("no_stopped_event")
+    camera = DcamCamera(world.path)
+    camera.configure(EXTERNAL)
+    camera.arm(1)
+    with pytest.raises(DeviceTimeout):
+        camera.next_frame(0.01)
+    camera.close()
+
+
 def test_no_trigger_is_a_timeout_that_leaves_it_armed(camera: DcamCamera, world) -> None:
     camera.arm(2)
     with pytest.raises(DeviceTimeout, match=r"no frame came within 0.01 s .*\(external\).*still armed"):
@@ -220,6 +230,7 @@ def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera
     assert take(camera, 2) == [0, 1]
     with pytest.raises(DeviceError, match=r"ended by itself \(state READY\)"):
         camera.next_frame(1.0)
+    camera.disarm()  # the library answers "nothing to do", which is no failure
 
 
 def test_unplugged_in_a_scan(camera: DcamCamera, world) -> None:

@@ -58,6 +58,29 @@ def test_a_value_the_camera_ignores_is_noticed(camera: DcamCamera, world) -> Non
         camera.configure(EXTERNAL)
 
 
+@pytest.mark.parametrize(
+    ("prop", "left", "needed"),
+    [
+        (Property.TRIGGERPOLARITY, 1, 2),  # positive
+        (Property.TRIGGERTIMES, 3, 1),
+        (Property.TRIGGERDELAY, 0.5, 0),
+        (Property.TRIGGER_MODE, 6, 1),  # normal
+        (Property.TRIGGERACTIVE, 2, 1),  # edge
+        (Property.TRIGGER_GLOBALEXPOSURE, 5, 3),  # delayed
+        (Property.SENSORMODE, 12, 1),  # area
+        (Property.IMAGE_PIXELTYPE, 1, 2),  # MONO16
+        (Property.BITSPERCHANNEL, 12, 16),
+        (Property.DEFECTCORRECT_MODE, 2, 1),  # off
+    ],
+)
+def test_what_another_program_left_is_undone(
+    camera: DcamCamera, world, prop: Property, left: float, needed: float
+) -> None:
+    world.preset(prop, left)
+    camera.configure(EXTERNAL)
+    assert world.value(prop) == needed
+
+
 def test_bundled_frames_are_refused(camera: DcamCamera, world) -> None:
     world.override(Property.FRAMEBUNDLE_MODE, 2)
     with pytest.raises(DeviceRefused, match=r"bundles several frames.*larger region"):
