@@ -1,0 +1,45 @@
+"""StopRequest: the operator's (or an alarm's) wish to end a scan, set from any thread or signal handler."""
+
+from __future__ import annotations
+
+import threading
+
+from beamline.errors import INTERRUPTED, ScanStopped
+
+
+class ScanAborted(ScanStopped):
+    """Ended at once, or before anything was acquired; what was acquired is in the file."""
+
+    exit_code = INTERRUPTED
+
+
+class StopRequest:
+    """Two wishes that cannot be taken back: stop (finish cleanly with what there is) and abort (end at once)."""
+
+    def __init__(self) -> None:
+        self._stop, self._abort = threading.Event(), threading.Event()
+        self._reason = ""
+
+    def stop(self, reason: str = "the operator asked for it") -> None:
+        """End cleanly: frames on their way are taken, references still owed are taken, the stage goes back."""
+        self._reason = self._reason or reason
+        self._stop.set()
+
+    def abort(self, reason: str = "the operator aborted it") -> None:
+        """End at once: the stage stands, the shutter closes, nothing else is taken."""
+        self._reason = reason
+        self._abort.set()
+        self._stop.set()
+
+    @property
+    def stopping(self) -> bool:
+        """Stop or abort was asked for."""
+        return self._stop.is_set()
+
+    @property
+    def aborting(self) -> bool:
+        return self._abort.is_set()
+
+    @property
+    def reason(self) -> str:
+        return self._reason

@@ -1,0 +1,294 @@
+"""A fake instrument on a virtual clock; it writes what it was doing into its pixels: frames prove the choreography."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from beamline.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
+from beamline.timeline import work_out
+from drivers.errors import DeviceError, DeviceTimeout
+from drivers.frame import Frame
+from drivers.protocols import (
+    CameraFrame,
+    CameraSettings,
+    CameraTiming,
+    Devices,
+    StageLimits,
+    TriggerSource,
+    TriggerTrain,
+)
+from simulators.clock import VirtualClock
+from simulators.motion import TrapezoidMove
+
+COUNTS_PER_TURN = 36000
+SHAPE = (8, 12)
+COUNT = 2 * math.pi / COUNTS_PER_TURN
+HOME = 100  # counts: where the stage stands at first
+
+
+@dataclass(frozen=True)
+class Exposed:
+    time: float
+    framestamp: int
+    number: int
+    state: tuple[int, ...]
+
+
+@dataclass
+class Faults:
+    """By trigger number over the camera's life, counting every software and hardware trigger from 0."""
+
+    lost: Set[int] = frozenset()
+    ignored: Set[int] = frozenset()
+    extra_after: Set[int] = frozenset()  # hardware triggers after which a spurious one follows half a period on
+    errors: dict[int, int] = field(default_factory=dict)  # frame number: how often taking it raises DeviceError
+    stuck_shutter: bool = False
+    stall_at: int | None = None  # count
+
+
+class Instrument:
+    """Stage, camera, shutter and sample mover in one; `devices` is how acquisition sees it.
+
+    Pixels of row 0: [stage count at the trigger, shutter open, sample in, trigger number]; the rest is noise.
+    `log` holds what the devices were told; `on_frame(number)` is called when a frame is taken.
+    """
+
+    def __init__(self, faults: Faults | None = None, on_frame: Callable[[int], None] = lambda number: None) -> None:
+        self.faults, self.on_frame = faults or Faults(), on_frame
+        self.clock = VirtualClock()
+        self.period = 1.0
+        self.log: list[str] = []
+        self.is_open, self.is_in = False, True
+        self.stage, self.camera = Stage(self), Camera(self)
+        self.devices = Devices(self.stage, self.camera, Shutter(self), Sample(self))
+
+    def timeline(
+        self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
+    ) -> Timeline:
+        """Work out `n` views over half a turn at `speed` (degrees/s, one pass) with 3 darks and 2 flats."""
+        self.period = 180 * passes / n / speed
+        angles = np.linspace(0, np.pi, n, endpoint=False)
+        angles = np.concatenate([angles[i::passes] for i in range(passes)])
+        plan = ScanPlan(angles, mode, 0.02, self.period, 0.05, FieldPlan(3, at, 0.02), FieldPlan(2, at, 0.03), "fixed")
+        timeline = work_out(plan, self.stage.limits, self.stage.to_counts, self.camera.timing)
+        assert timeline.violations == ()
+        return timeline
+
+
+class Stage:
+    name = "stage"
+    limits = StageLimits(
+        COUNTS_PER_TURN, math.radians(60), math.radians(200), math.radians(-90), math.radians(270), True
+    )
+
+    def __init__(self, bench: Instrument) -> None:
+        self.bench = bench
+        self.move = TrapezoidMove(bench.clock.now(), HOME, HOME, ())
+        self.target = HOME
+        self.train: TriggerTrain | None = None
+        self.pulses: list[tuple[float, int]] = []
+
+    def to_counts(self, angle: float) -> int:
+        return round(angle / COUNT)
+
+    def to_angle(self, counts: int) -> float:
+        return counts * COUNT
+
+    def count(self, time: float) -> float:
+        return self.move.position(time)
+
+    def position(self) -> float:
+        return self.count(self.bench.clock.now()) * COUNT
+
+    def start_move(self, angle: float, speed: float) -> None:
+        assert not self.moving()
+        now = self.bench.clock.now()
+        self.bench.log.append(f"move {self.to_counts(angle)}")
+        self.target = self.to_counts(angle)
+        move = TrapezoidMove.between(
+            self.count(now), self.target, speed / COUNT, self.limits.acceleration / COUNT, begin=now
+        )
+        stall = self.bench.faults.stall_at
+        if stall is not None and min(move.start, move.target) < stall < max(move.start, move.target):
+            move = move.halted(stall)
+        self.move = move
+        if self.train is not None:
+            points = range(self.train.start, self.train.end + self.train.interval, self.train.interval)
+            low, high = sorted((move.start, move.target))
+            self.pulses = [(move.time_at(p), p) for p in points if low <= p <= high]
+            self.train = None
+
+    def moving(self) -> bool:
+        return self.bench.clock.now() < self.move.end
+
+    def wait(self, timeout: float) -> float:
+        now = self.bench.clock.now()
+        self.bench.clock.sleep(min(timeout, self.move.end - now))
+        if self.moving():
+            raise DeviceTimeout(self.name, "still moving")
+        if self.count(self.bench.clock.now()) != self.target:
+            raise DeviceError(self.name, "stopped short")
+        return self.position()
+
+    def arm(self, train: TriggerTrain) -> None:
+        assert not self.moving()
+        assert (train.start - self.count(self.bench.clock.now())) * train.interval > 0
+        self.bench.log.append("arm stage")
+        self.train = train
+
+    def disarm(self) -> None:
+        assert not self.moving()
+        self.train = None
+        self.pulses = []
+
+    def stop(self) -> None:
+        self.bench.log.append("stop stage")
+        self._cut(self.move.braked(self.bench.clock.now(), self.limits.acceleration / COUNT))
+
+    def abort(self) -> None:
+        self.bench.log.append("abort stage")
+        self._cut(self.move.halted(self.count(self.bench.clock.now())))
+
+    def _cut(self, move: TrapezoidMove) -> None:
+        if self.moving():
+            self.move = move
+            low, high = sorted((move.start, move.target))
+            self.pulses = [(time, p) for time, p in self.pulses if low <= p <= high and time <= move.end]
+
+    def describe(self) -> dict[str, str | int | float]:
+        return {"model": "fake stage"}
+
+    def close(self) -> None:
+        self.bench.log.append("close stage")
+
+
+class Camera:
+    name = "camera"
+
+    def __init__(self, bench: Instrument) -> None:
+        self.bench = bench
+        self.rng = np.random.default_rng(1)
+        self.settings = CameraSettings(0.02, TriggerSource.INTERNAL)
+        self.armed = False
+        self.ring: list[Exposed] = []
+        self.framestamp = self.number = 0
+        self.seen = self.spurious = 0.0
+
+    @property
+    def timing(self) -> CameraTiming:
+        return CameraTiming(SHAPE, self.settings.exposure + 0.002, 0.001, 0.0, 16)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        assert not self.armed
+        self.settings = settings
+        return settings
+
+    def arm(self, n_frames: int) -> None:
+        assert not self.armed
+        assert n_frames >= 1
+        self.bench.log.append(f"arm camera {n_frames}")
+        self.armed, self.framestamp, self.ring, self.seen = True, 0, [], self.bench.clock.now()
+
+    def software_trigger(self) -> None:
+        assert self.armed
+        assert self.settings.trigger is TriggerSource.SOFTWARE
+        now = self.bench.clock.now()
+        self._trigger(now, round(self.bench.stage.count(now)))
+
+    def _trigger(self, time: float, count: int) -> None:
+        number, self.number = self.number, self.number + 1
+        if number in self.bench.faults.ignored:
+            return
+        self._expose(time, number, count)
+
+    def _expose(self, time: float, number: int, count: int) -> None:
+        if number not in self.bench.faults.lost:
+            state = (count, self.bench.is_open, self.bench.is_in, max(number, 0))
+            self.ring.append(Exposed(time, self.framestamp, number, state))
+        self.framestamp += 1
+
+    def _catch_up(self, now: float) -> None:
+        assert self.settings.trigger in (TriggerSource.SOFTWARE, TriggerSource.EXTERNAL)
+        if self.settings.trigger is not TriggerSource.EXTERNAL:
+            return
+        for time, count in self.bench.stage.pulses:
+            if self.seen < time <= now:
+                number = self.number
+                self.seen = time
+                self._trigger(time, count)
+                if number in self.bench.faults.extra_after:
+                    self._expose(time + self.bench.period / 2, -1, count)
+
+    def next_frame(self, timeout: float) -> CameraFrame:
+        assert self.armed
+        clock = self.bench.clock
+        deadline = clock.now() + timeout
+        delay = self.settings.exposure + 0.001
+        while True:
+            now = clock.now()
+            self._catch_up(now)
+            if self.ring and self.ring[0].time + delay <= now:
+                return self._take(self.ring[0])
+            if now >= deadline:
+                raise DeviceTimeout(self.name, f"no frame within {timeout} s")
+            clock.sleep(min(deadline - now, 0.01))
+
+    def _take(self, frame: Exposed) -> CameraFrame:
+        if self.bench.faults.errors.get(frame.number, 0) > 0:
+            self.bench.faults.errors[frame.number] -= 1
+            raise DeviceError(self.name, "ring overrun")
+        self.ring.pop(0)
+        counts = self.rng.integers(100, 200, SHAPE).astype(np.uint16)
+        counts[0, :4] = np.array(frame.state).astype(np.uint16)
+        self.bench.on_frame(frame.number)
+        return CameraFrame(counts, frame.framestamp, frame.time)
+
+    def disarm(self) -> None:
+        self.armed = False
+        self.ring = []
+
+    def describe(self) -> dict[str, str | int | float]:
+        return {"model": "fake camera"}
+
+    def close(self) -> None:
+        self.bench.log.append("close camera")
+
+
+class Shutter:
+    name = "shutter"
+
+    def __init__(self, bench: Instrument) -> None:
+        self.bench = bench
+
+    def open(self) -> None:
+        self.bench.is_open = not self.bench.faults.stuck_shutter
+
+    def close(self) -> None:
+        self.bench.log.append("close shutter")
+        self.bench.is_open = False
+
+    def is_open(self) -> bool:
+        return self.bench.is_open
+
+
+class Sample:
+    name = "sample"
+
+    def __init__(self, bench: Instrument) -> None:
+        self.bench = bench
+
+    def out(self) -> None:
+        self.bench.is_in = False
+
+    def back(self) -> None:
+        self.bench.is_in = True
+
+
+def seen(frame: Frame) -> tuple[int, bool, bool, int]:
+    """What the instrument was doing: stage count (signed), shutter open, sample in, trigger number."""
+    count, is_open, is_in, number = (int(v) for v in frame.counts[0, :4])
+    return int(np.uint16(count).astype(np.int16)), bool(is_open), bool(is_in), number
