@@ -1,0 +1,322 @@
+"""PM16C-04XD driver: the shared conformance suite over the simulated wire, and what is this controller's own."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import RotationStage, TriggerTrain
+from drivers.stages.pm16c import PM16CStage, achievable_acceleration
+from drivers.stages.pm16c_channel import RATES, steepest_code
+from simulators.clock import VirtualClock
+from simulators.serial_url import register
+from simulators.trigger_line import TriggerLine
+from simulators.wires.pm16c import PM16CController
+from tests.drivers.stage_conformance import LONG, SPEED, StageBench, StageConformance
+
+NAMES = (f"pm16c-test-{number}" for number in itertools.count())
+COUNTS = 90_000
+QUERIES_TO_OPEN = 7
+"""VER? STS? STS? SETCH? SETCH? RTE? SETLS?: the faults below count queries from power-on."""
+
+
+class Rig:
+    """A simulated controller (sample on channel 11, hex B) on a virtual clock, and the driver's settings for it."""
+
+    def __init__(self, **faults: Any) -> None:
+        self.clock = VirtualClock()
+        self.line = TriggerLine(self.clock)
+        self.controller = PM16CController(self.clock, self.line, channel=11, counts_per_turn=COUNTS, **faults)
+        self.url = register(next(NAMES), self.controller)
+
+    def open(self, **settings: Any) -> PM16CStage:
+        usual: dict[str, Any] = {
+            "channel": 11,
+            "counts_per_turn": COUNTS,
+            "clock": self.clock,
+            "max_speed": math.radians(30),
+            "acceleration": math.radians(60),
+            "low": math.radians(-5),
+            "high": math.radians(100),
+        }
+        return PM16CStage(self.url, **(usual | settings))
+
+    def bench(self) -> StageBench:
+        return StageBench(self.open(), self.clock, self.line)
+
+    def say(self, *commands: str) -> str:
+        """Another program, or a person at the panel; the reply to the last command."""
+        reply = b""
+        for command in commands:
+            self.controller.receive(command.encode() + b"\r\n")
+            reply = self.controller.transmit()
+        return reply.decode().strip()
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+class TestConformance(StageConformance):
+    @pytest.fixture
+    def bench(self, rig: Rig) -> Iterator[StageBench]:
+        bench = rig.bench()
+        yield bench
+        bench.stage.close()
+
+
+# opening and closing
+
+
+def test_it_is_a_rotation_stage_and_says_what_it_found(rig: Rig) -> None:
+    stage: RotationStage = rig.open()
+    described = stage.describe()
+    assert (described["firmware"], described["channel"]) == ("1.50 17-04-01 PM16C-04XDL-SIMULATED", 11)
+
+
+def test_opening_takes_remote_and_position_controller_a_and_closing_gives_the_panel_back(rig: Rig) -> None:
+    stage = rig.open()
+    assert rig.say("STS?").startswith("RB123/SSSS/")
+    stage.close()
+    assert rig.say("STQ?") == "L4"
+
+
+def test_a_controller_found_in_remote_is_left_there(rig: Rig) -> None:
+    rig.say("REM")
+    rig.open().close()
+    assert rig.say("STQ?") == "R4"
+
+
+def test_opening_a_moving_stage_is_refused_and_lets_it_move(rig: Rig) -> None:
+    rig.say("REM", "ABSB+50000")
+    with pytest.raises(DeviceRefused, match="opening is not possible while it moves"):
+        rig.open()
+    assert rig.say("STSB?")[2] == "P"
+
+
+def test_remote_that_is_not_granted_is_named(rig: Rig) -> None:
+    """Another axis moves, and the panel was switched to LOCAL after it started: the controller ignores REM."""
+    rig.say("REM", "ABS3+50000")
+    rig.controller.box.remote = False
+    with pytest.raises(DeviceRefused, match="in LOCAL"):
+        rig.open()
+
+
+def test_another_controller_on_the_port_is_named() -> None:
+    rig = Rig(garbled={0})
+    with pytest.raises(DeviceError, match=r"'VER\?'.*PM16C-04XD"):
+        rig.open()
+    rig.open().close()
+
+
+@pytest.mark.parametrize("channel", [-1, 16])
+def test_a_channel_that_does_not_exist_is_refused(rig: Rig, channel: int) -> None:
+    with pytest.raises(DeviceRefused, match="0 to 15"):
+        rig.open(channel=channel)
+
+
+def test_limits_in_the_controller_that_leave_no_room_are_respected(rig: Rig) -> None:
+    rig.say("REM", "FLB+20000", "BLB-2000", "SETLSB10000000")
+    with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
+        rig.open()
+    rig.open(high=math.radians(80)).close()
+    assert (rig.say("FL?B"), rig.say("SETLS?B")) == ("+0020000", "10000000")
+
+
+def test_two_drivers_cannot_hold_one_port(rig: Rig) -> None:
+    stage = rig.open()
+    with pytest.raises(DeviceError, match="does not open"):
+        rig.open()
+    stage.close()
+    rig.open().close()
+
+
+# acceleration
+
+
+def test_acceleration_codes_are_the_published_ones() -> None:
+    published = {0: 1000, 1: 910, 23: 110, 24: 100, 36: 33, 48: 10, 72: 1.0, 95: 0.11, 96: 0.10, 114: 0.018, 115: 0.016}
+    assert len(RATES) == 116
+    assert {code: RATES[code] for code in published} == pytest.approx(published)
+
+
+@pytest.mark.parametrize("code", [1, 17, 60, 115])
+def test_the_steepest_code_not_above_an_acceleration(code: int) -> None:
+    acceleration = 1e6 / RATES[code]
+    assert [steepest_code(acceleration * factor) for factor in (0.999, 1.0, 1.001)] == [code - 1, code, code]
+
+
+def test_the_acceleration_that_the_stage_names_is_the_one_that_it_has(rig: Rig) -> None:
+    stage = rig.open()
+    assert stage.limits.acceleration == achievable_acceleration(COUNTS, math.radians(60)) <= math.radians(60)
+    stage.start_move(math.radians(60), math.radians(30))
+    begun = rig.clock.now()
+    rig.clock.sleep(0.25)
+    assert rig.line.angle_at(begun + 0.25) == pytest.approx(0.5 * stage.limits.acceleration * 0.25**2, rel=1e-5)
+
+
+def test_an_acceleration_gentler_than_any_is_refused(rig: Rig) -> None:
+    with pytest.raises(DeviceRefused, match="Nothing was sent"):
+        rig.open(acceleration=1e-6)
+
+
+# triggers of this controller
+
+
+def test_pulses_are_the_widest_that_the_interval_allows(rig: Rig) -> None:
+    """At 30 deg/s = 7500 pulses/s an interval of 15 lasts 2 ms, room for 1 ms pulses; 14 does not."""
+    stage = rig.open()
+    for interval, mode in ((15, "5"), (14, "4"), (1, "3")):
+        stage.arm(TriggerTrain(100, interval, 3))
+        assert rig.say("TMGM?B") == mode
+
+
+def test_after_a_stop_on_the_way_going_on_gives_the_rest_and_going_back_gives_none(rig: Rig) -> None:
+    bench = rig.bench()
+    train = bench.train(1.0, 1.0, 30)
+    bench.stage.arm(train)
+    bench.stage.start_move(math.radians(40), SPEED)
+    rig.clock.sleep(1.6)
+    bench.stage.stop()
+    before = len(bench.pulses())
+    bench.go(2.0)
+    assert len(bench.pulses()) == before
+    bench.go(40.0)
+    assert 10 < before < 20
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [
+        train.start + 250 * k for k in range(30)
+    ]
+
+
+def test_a_train_half_emitted_is_ended_by_disarming(rig: Rig) -> None:
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 1.0, 30))
+    bench.go(10.5)
+    bench.stage.disarm()
+    bench.go(40.0)
+    assert len(bench.pulses()) == 10
+
+
+def test_lost_pulses_are_missing_and_no_others() -> None:
+    rig = Rig(lost={0, 7})
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 0.5, 10))
+    bench.go(10.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [250 + 125 * k for k in range(10) if k not in {0, 7}]
+
+
+def test_a_setting_that_another_program_took_back_is_noticed(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("LOC")
+    with pytest.raises(DeviceRefused, match="in LOCAL"):
+        stage.arm(TriggerTrain(100, 10, 3))
+    with pytest.raises(DeviceRefused, match="in LOCAL"):
+        stage.start_move(0.1, SPEED)
+    assert not stage.moving()
+
+
+# what stops a move
+
+
+def test_a_move_that_stops_short_says_where_and_why() -> None:
+    rig = Rig(stall_at=2500)
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(DeviceError, match=r"stopped short of 30\.0000 deg.*emergency stop") as error:
+        stage.wait(LONG)
+    assert "stands at 10.0000 deg, 2500 counts" in str(error.value)
+    assert not isinstance(error.value, DeviceTimeout)
+
+
+def test_a_limit_set_later_in_the_controller_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("FLB+5000", "SETLSB10000000")
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(DeviceError, match=r"stopped short.*\(limit\)"):
+        stage.wait(LONG)
+    with pytest.raises(DeviceError, match=r"did not start \(limit\)"):
+        stage.start_move(math.radians(30), SPEED)
+
+
+def test_a_stop_button_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.say("ASSTP")
+    with pytest.raises(DeviceError, match="stop command"):
+        stage.wait(LONG)
+
+
+def test_a_fifth_motor_cannot_start_and_the_controllers_words_are_given(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("ABS0+90000", "ABS1+90000", "ABS2+90000", "ABS3+90000")
+    with pytest.raises(DeviceError, match="MCC06 BUSY ERROR"):
+        stage.start_move(math.radians(30), SPEED)
+    assert stage.position() == 0.0
+
+
+def test_a_stop_from_another_thread_ends_the_wait_with_an_error(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(90), math.radians(1))
+    rig.clock.sleep(5.0)
+    stopper = threading.Thread(target=stage.stop)
+    stopper.start()
+    with pytest.raises(DeviceError, match="stopped short"):
+        stage.wait(1e4)
+    stopper.join()
+    assert not stage.moving()
+
+
+# a disturbed line
+
+
+def test_no_reply_is_a_timeout_and_the_next_request_is_in_step_again() -> None:
+    rig = Rig(silent={QUERIES_TO_OPEN})
+    stage = rig.open()
+    before = rig.clock.now()
+    with pytest.raises(DeviceTimeout, match=r"no whole reply within 1 s. Asked 'PS\?B'"):
+        stage.position()
+    assert rig.clock.now() - before == pytest.approx(1.0, abs=0.1)
+    assert stage.position() == 0.0
+
+
+def test_garbage_is_named_and_the_next_request_is_in_step_again() -> None:
+    rig = Rig(garbled={QUERIES_TO_OPEN})
+    stage = rig.open()
+    with pytest.raises(DeviceError, match=r"does not have the form.*signed position in pulses"):
+        stage.position()
+    assert stage.position() == 0.0
+
+
+def test_a_timeout_during_a_move_says_that_the_stage_may_be_turning_and_a_stop_still_works() -> None:
+    silent = set(range(QUERIES_TO_OPEN + 4, 10_000))
+    rig = Rig(silent=silent)
+    stage = rig.open()
+    stage.start_move(math.radians(60), math.radians(1))
+    with pytest.raises(DeviceTimeout, match="may be turning"):
+        stage.wait(LONG)
+    rig.clock.sleep(1.0)
+    with pytest.raises(DeviceTimeout):
+        stage.stop()
+    silent.clear()
+    assert rig.say("STSB?")[2] == "S"
+    stage.close()
+
+
+def test_a_dead_line_does_not_keep_the_port() -> None:
+    silent: set[int] = set()
+    rig = Rig(silent=silent)
+    stage = rig.open()
+    silent.update(range(10_000))
+    stage.close()
+    silent.clear()
+    rig.open().close()
