@@ -8,9 +8,10 @@ import os
 # (a scan and its live reconstruction) slow each other down twentyfold.
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
-import torch  # noqa: E402, F401 - before any numba kernel runs: the other order makes torch's operators 20x slower
+import torch  # noqa: F401 - before any numba kernel runs: the other order makes torch's operators 20x slower
 
-from recon.geometry import Geometry  # noqa: E402
-from recon.volume import Grid, Volume  # noqa: E402
+from recon.geometry import Geometry
+from recon.reconstruct import Reconstruction, reconstruct
+from recon.volume import Grid, Volume
 
-__all__ = ["Geometry", "Grid", "Volume"]
+__all__ = ["Geometry", "Grid", "Reconstruction", "Volume", "reconstruct"]

@@ -45,7 +45,7 @@ def footprints(
     cut: float,
     table: F32,
 ) -> None:
-    """Fill table [n, 8]: centre (col, row), inverse covariance (3, 1/px²), weight W = ρμ (mm * density), half widths (px).
+    """Fill table [n, 8]: centre (col, row), inverse covariance (1/px², three), weight W = ρμ, half widths in px (two).
 
     A footprint ends where it falls below `faint` (in units of the image) and at the latest after `cut` standard
     deviations; half widths are negative where nothing of it is above `faint`.
@@ -73,14 +73,14 @@ def footprints(
 
 
 @njit(inline="always", fastmath=True)
-def _box(table, i, rows, cols):  # type: ignore[no-untyped-def]  # noqa: ANN001
+def _box(table, i, rows, cols):  # type: ignore[no-untyped-def]
     """Pixel box of footprint i, clipped to the image: (row0, row1, col0, col1), ends excluded; empty if it misses."""
     hu, hv = table[i, _HU], table[i, _HV]
     u, v = table[i, _U], table[i, _V]
     if not (hu >= 0 and u + hu >= 0 and u - hu <= cols - 1 and v + hv >= 0 and v - hv <= rows - 1):
         return 0, 0, 0, 0
-    row0, row1 = max(0, int(math.ceil(v - hv))), min(rows, int(math.floor(v + hv)) + 1)
-    col0, col1 = max(0, int(math.ceil(u - hu))), min(cols, int(math.floor(u + hu)) + 1)
+    row0, row1 = max(0, math.ceil(v - hv)), min(rows, math.floor(v + hv) + 1)
+    col0, col1 = max(0, math.ceil(u - hu)), min(cols, math.floor(u + hu) + 1)
     return row0, row1, col0, col1
 
 
@@ -174,7 +174,7 @@ def footprints_backward(
     d_densities: F32,
     d_centres: F32,
 ) -> None:
-    """Add to the gradients on means (1/mm), log scales, rotations and densities; d_centres [n, 2] gets ∂/∂(col, row)."""
+    """Add to the gradients on means, log scales, rotations and densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
     c, s, per = _f(cos), _f(sin), _f(per_mm)
     for i in prange(densities.shape[0]):
         if table[i, _HU] < 0:

@@ -54,8 +54,8 @@ def _boxes(
             if not (centre + half >= 0 and centre - half <= size - 1):
                 hit = False
                 break
-            boxes[i, 2 * axis] = max(0, int(math.ceil(centre - half)))
-            boxes[i, 2 * axis + 1] = min(size, int(math.floor(centre + half)) + 1)
+            boxes[i, 2 * axis] = max(0, math.ceil(centre - half))
+            boxes[i, 2 * axis + 1] = min(size, math.floor(centre + half) + 1)
         if not hit:
             boxes[i, 4] = boxes[i, 5] = 0
             continue
@@ -73,7 +73,7 @@ def _boxes(
 
 
 @njit(inline="always", fastmath=True)
-def _exponents(table, i, z, y):  # type: ignore[no-untyped-def]  # noqa: ANN001
+def _exponents(table, i, z, y):  # type: ignore[no-untyped-def]
     """Row (z, y) of Gaussian i: exponent = a dx² + b dx + c."""
     dy, dz = _f(y) - table[i, 1], _f(z) - table[i, 2]
     b = -(table[i, 4] * dy + table[i, 5] * dz)

@@ -1,0 +1,148 @@
+"""Gaussians: a density field as a sum of anisotropic Gaussians, held as raw parameters that may be any real number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ   (Zha et al. 2024, eq. 1).
+
+    Attributes:
+        means: [n, 3] mm, (x, y, z).
+        log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
+        quaternions: [n, 4] (w, x, y, z), of any non-zero length.
+        raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
+        density_unit: 1/mm; the size of a typical density, which makes the raw values (and the learning rates that act
+            on them) independent of the units of the data.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quaternions: Tensor
+    raw_densities: Tensor
+    density_unit: float = 1.0
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        shapes = {
+            "means": (self.means.shape, (n, 3)),
+            "log_scales": (self.log_scales.shape, (n, 3)),
+            "quaternions": (self.quaternions.shape, (n, 4)),
+            "raw_densities": (self.raw_densities.shape, (n,)),
+        }
+        for name, (found, expected) in shapes.items():
+            if tuple(found) != expected:
+                raise ValueError(f"{name} has shape {tuple(found)}, expected {expected}")
+        if not self.density_unit > 0:
+            raise ValueError(f"density_unit must be positive, got {self.density_unit}")
+
+    @classmethod
+    def from_physical(
+        cls,
+        means: NDArray[np.floating],
+        scales: NDArray[np.floating],
+        densities: NDArray[np.floating],
+        quaternions: NDArray[np.floating] | None = None,
+        density_unit: float | None = None,
+    ) -> Gaussians:
+        """From positions [n, 3] mm, standard deviations [n, 3] or [n] mm and densities [n] 1/mm, all positive.
+
+        Raises:
+            ValueError: where a scale or a density is not positive and finite.
+        """
+        means = np.atleast_2d(np.asarray(means, np.float64))
+        n = means.shape[0]
+        scales = np.asarray(scales, np.float64)
+        scales = np.broadcast_to(scales[:, None] if scales.ndim == 1 else scales, (n, 3))
+        densities = np.broadcast_to(np.asarray(densities, np.float64), (n,))
+        for name, values in (("scales", scales), ("densities", densities)):
+            if not (np.isfinite(values).all() and (values > 0).all()):
+                raise ValueError(
+                    f"{name} must be positive and finite, got values from {values.min()} to {values.max()}"
+                )
+        unit = float(densities.max()) if density_unit is None else density_unit
+        if quaternions is None:
+            quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+        return cls(
+            _tensor(means),
+            _tensor(np.log(scales)),
+            _tensor(quaternions),
+            _tensor(inverse_softplus(densities / unit)),
+            unit,
+        )
+
+    @property
+    def n(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations [n, 3] in mm."""
+        return self.log_scales.exp()
+
+    @property
+    def densities(self) -> Tensor:
+        """ρ [n] in 1/mm."""
+        return self.density_unit * torch.nn.functional.softplus(self.raw_densities)
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at `index` (a mask or positions), as copies."""
+        return Gaussians(
+            self.means[index],
+            self.log_scales[index],
+            self.quaternions[index],
+            self.raw_densities[index],
+            self.density_unit,
+        )
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """The parameters as plain arrays, for a checkpoint; `from_arrays` reads them back."""
+        return {
+            "means": self.means.detach().numpy(),
+            "log_scales": self.log_scales.detach().numpy(),
+            "quaternions": self.quaternions.detach().numpy(),
+            "raw_densities": self.raw_densities.detach().numpy(),
+            "density_unit": np.asarray(self.density_unit),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.floating]]) -> Gaussians:
+        """The inverse of `arrays`."""
+        names = ("means", "log_scales", "quaternions", "raw_densities")
+        missing = [name for name in (*names, "density_unit") if name not in arrays]
+        if missing:
+            raise ValueError(f"a checkpoint of Gaussians needs {names} and density_unit; {missing} are missing")
+        return cls(*(_tensor(np.asarray(arrays[name])) for name in names), float(arrays["density_unit"]))
+
+
+def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Both sets as one, in the density unit of `first`."""
+    raw = second.raw_densities
+    if second.density_unit != first.density_unit:
+        densities = second.densities.double().numpy() / first.density_unit
+        raw = _tensor(inverse_softplus(densities))
+    return Gaussians(
+        torch.cat((first.means, second.means)),
+        torch.cat((first.log_scales, second.log_scales)),
+        torch.cat((first.quaternions, second.quaternions)),
+        torch.cat((first.raw_densities, raw)),
+        first.density_unit,
+    )
+
+
+def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:
+    """x with log(1 + eˣ) = value, for value > 0: value + log(1 - e^-value), which keeps its digits at both ends."""
+    value = np.asarray(value, np.float64)
+    return value + np.log(-np.expm1(-value))
+
+
+def _tensor(values: NDArray[np.floating]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32).copy())

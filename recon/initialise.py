@@ -1,0 +1,105 @@
+"""A volume to Gaussians: where there is matter, and most where it changes (Zha et al. 2024, sec. 4.2.1, refined)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
+from scipy.spatial import cKDTree
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.splat import project
+from recon.volume import Volume
+
+# Voxels below this fraction of the density unit hold no matter worth a Gaussian (Zha et al. 2024: τ = 0.05).
+MATTER = 0.05
+
+
+def density_unit(volume: Volume) -> float:
+    """A typical high density of the volume: the 99.5th percentile of its positive part, 1/mm."""
+    positive = volume.data[volume.data > 0]
+    return float(np.percentile(positive, 99.5)) if positive.size else 0.0
+
+
+def sample_gaussians(
+    volume: Volume, n: int, rng: np.random.Generator, *, field_radius: float, smooth: float = 1.0
+) -> Gaussians:
+    """At most n isotropic Gaussians drawn from a volume.
+
+    The volume is smoothed first (streaks of few views would attract Gaussians; Lin et al. 2025 measure +0.4 dB), then
+    voxels above 5 % of the density unit are drawn without replacement, with a probability that is half density and
+    half gradient. A Gaussian's size is the distance to its neighbours, its density the voxel's.
+
+    Args:
+        volume: an FBP or iterative reconstruction.
+        n: how many; fewer come where fewer voxels hold matter.
+        field_radius: mm around the rotation axis that the detector saw; nothing is placed outside.
+        smooth: voxels of Gaussian smoothing.
+
+    Raises:
+        ValueError: where the volume holds no matter inside the field.
+    """
+    data = gaussian_filter(np.maximum(volume.data, 0), smooth) if smooth > 0 else np.maximum(volume.data, 0)
+    z, y, x = volume.grid.coordinates()
+    inside = (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
+    data = np.where(inside[None], data, 0).astype(np.float32)
+    unit = density_unit(Volume(data, volume.grid))
+    candidates = np.flatnonzero(data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
+    if candidates.size < 4:
+        raise ValueError(
+            f"the initial volume holds no matter: {candidates.size} voxels above {MATTER:.0%} of {unit:.3g} 1/mm; "
+            "are the projections line integrals (-log of the transmission), and is the axis right?"
+        )
+    slope = gaussian_gradient_magnitude(data, 1.0).ravel()[candidates]
+    value = data.ravel()[candidates]
+    weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
+    # Exponential keys give a weighted draw without replacement in one pass (Efraimidis & Spirakis 2006).
+    keys = rng.exponential(size=candidates.size) / weight
+    chosen = candidates if candidates.size <= n else candidates[np.argpartition(keys, n)[:n]]
+    k, j, i = np.unravel_index(chosen, data.shape)
+    jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.voxel_size
+    means = np.stack((x[i], y[j], z[k]), 1) + jitter
+    scales = neighbour_distance(means)
+    scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))
+    return Gaussians.from_physical(means, scales, data.ravel()[chosen], density_unit=unit)
+
+
+def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean square distance [n] of each point to its three nearest neighbours."""
+    near = min(4, means.shape[0])
+    distances = np.asarray(cKDTree(means).query(means, k=near)[0])
+    return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
+
+
+def scale_to_data(
+    gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, views: int = 12
+) -> Gaussians:
+    """The same Gaussians with all densities times k, k = <Aρ, P> / <Aρ, Aρ> over a few views.
+
+    Projection is linear in density, so this is the exact least-squares factor; it replaces the published constant 0.15
+    and makes the start independent of units and of the number of Gaussians.
+    """
+    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))
+    rendered = project(gaussians, geometry, chosen.tolist()).numpy()
+    measured = np.asarray(projections[chosen], np.float64)
+    power = float((rendered.astype(np.float64) ** 2).sum())
+    factor = float((rendered * measured).sum()) / power if power > 0 else 0.0
+    if not factor > 0:
+        raise ValueError(
+            f"the data do not look like line integrals: the best density factor is {factor:.3g}, it must be positive"
+        )
+    return Gaussians.from_physical(
+        gaussians.means.numpy(), gaussians.scales.numpy(), gaussians.densities.double().numpy() * factor,
+        gaussians.quaternions.numpy(), gaussians.density_unit,
+    )  # fmt: skip
+
+
+def morton_order(means: NDArray[np.float32], cell: float) -> NDArray[np.int64]:
+    """Order [n] along a Z-curve of cells of the given edge, so that neighbours in space are neighbours in memory."""
+    cells = np.clip(((means - means.min(axis=0)) / cell).astype(np.int64), 0, 1023)
+    code = np.zeros(means.shape[0], np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")

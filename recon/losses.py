@@ -1,0 +1,39 @@
+"""Losses in plain torch: the readable twins of the fused ones, differentiable, for any image or volume."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from recon.kernels.losses_cpu import gaussian_window
+
+
+def ssim(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2) -> Tensor:
+    """Mean structural similarity of two images [row, col] (Wang et al. 2004): 11 x 11 Gaussian window, zeros outside.
+
+    c1 and c2 are (0.01 L)² and (0.03 L)² for a data range L; the fit works on data scaled so that L is about 1.
+    """
+    taps = torch.from_numpy(gaussian_window()).to(image.dtype)
+
+    def blur(x: Tensor) -> Tensor:
+        padded = x[None, None]
+        across = torch.nn.functional.conv2d(padded, taps[None, None, None, :], padding=(0, 5))
+        return torch.nn.functional.conv2d(across, taps[None, None, :, None], padding=(5, 0))[0, 0]
+
+    mean_x, mean_y = blur(image), blur(target)
+    var_x, var_y = blur(image * image) - mean_x**2, blur(target * target) - mean_y**2
+    covariance = blur(image * target) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    structure = (2 * covariance + c2) / (var_x + var_y + c2)
+    return (luminance * structure).mean()
+
+
+def projection_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """mean |image - target| + ssim_weight (1 - SSIM)   (Zha et al. 2024, eq. 8)."""
+    return (image - target).abs().mean() + ssim_weight * (1 - ssim(image, target))
+
+
+def total_variation(volume: Tensor) -> Tensor:
+    """Mean absolute difference of neighbours over the three axes of [z, y, x] (Zha et al. 2024, eq. 9)."""
+    steps = [volume.diff(dim=axis).abs() for axis in range(3)]
+    return torch.stack([step.sum() for step in steps]).sum() / sum(step.numel() for step in steps)

@@ -1,0 +1,203 @@
+"""project and voxelize: Gaussians to line integrals and to voxels, differentiable, by the kernel that fits the data.
+
+Float32 tensors go to the threaded CPU kernels; float64 tensors (or `kernel="reference"`) to the readable twin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.kernels import reference
+from recon.kernels.activation import F32, activate, activation_backward
+from recon.kernels.project_cpu import footprint_table, footprints, footprints_backward, moments, render
+from recon.kernels.voxelize_cpu import Layout
+from recon.volume import Grid
+
+Kernel = Literal["auto", "cpu", "reference"]
+
+
+@dataclass(frozen=True)
+class Truncation:
+    """Where a Gaussian ends.
+
+    Attributes:
+        sigmas: at the latest after so many standard deviations (3.5 leaves 0.2 % of a projected one outside).
+        faint: and where it has fallen below this fraction of the density unit (times the field for a projection).
+    """
+
+    sigmas: float = 3.5
+    faint: float = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Active:
+    """Physical parameters of Gaussians as float32 arrays, and room for the gradients on them."""
+
+    means: F32
+    scales: F32
+    rotations: F32
+    densities: F32
+
+    @classmethod
+    def of(cls, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> Active:
+        n = raw.shape[0]
+        scales, rotations = np.empty((n, 3), np.float32), np.empty((n, 9), np.float32)
+        densities = np.empty(n, np.float32)
+        activate(log_scales, quaternions, raw, unit, scales, rotations, densities)
+        return cls(means, scales, rotations, densities)
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Gradients on the physical parameters, added to by each projection or box of voxels."""
+
+    means: F32
+    log_scales: F32
+    rotations: F32
+    densities: F32
+
+    @classmethod
+    def zeros(cls, n: int) -> Gradients:
+        shapes: list[tuple[int, ...]] = [(n, 3), (n, 3), (n, 9), (n,)]
+        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
+
+    def to_raw(self, quaternions: F32, raw: F32, unit: float) -> tuple[F32, F32, F32, F32]:
+        """Gradients on means, log scales, quaternions and raw densities."""
+        d_quaternions, d_raw = np.empty_like(quaternions), np.empty_like(raw)
+        activation_backward(quaternions, raw, unit, self.rotations, self.densities, d_quaternions, d_raw)
+        return self.means, self.log_scales, d_quaternions, d_raw
+
+
+def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
+    """Footprints of all Gaussians in one view; `faint` in units of the image."""
+    table = footprint_table(active.densities.shape[0])
+    angle = float(geometry.angles[view])
+    footprints(
+        active.means, active.scales, active.rotations, active.densities, math.cos(angle), math.sin(angle),
+        1 / geometry.pixel_pitch, geometry.axis_col, (geometry.detector_shape[0] - 1) / 2, faint, sigmas, table,
+    )  # fmt: skip
+    return table
+
+
+def view_backward(
+    active: Active, geometry: Geometry, view: int, table: F32, gradient: F32, into: Gradients, centres: F32
+) -> None:
+    """Add one view's image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
+    angle = float(geometry.angles[view])
+    footprints_backward(
+        table, moments(table, gradient), active.scales, active.rotations, active.densities,
+        math.cos(angle), math.sin(angle), 1 / geometry.pixel_pitch,
+        into.means, into.log_scales, into.rotations, into.densities, centres,
+    )  # fmt: skip
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+        unit: float, geometry: Geometry, truncation: Truncation,
+    ) -> Tensor:  # fmt: skip
+        arrays = [t.detach().contiguous().numpy() for t in (means, log_scales, quaternions, raw)]
+        active = Active.of(*arrays, unit)
+        faint = truncation.faint * unit * geometry.pixel_pitch * geometry.detector_shape[1]
+        images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
+        tables = []
+        for view in range(geometry.n_views):
+            tables.append(view_table(active, geometry, view, faint, truncation.sigmas))
+            render(tables[-1], images[view])
+        ctx.state = (arrays, active, unit, geometry, tables)
+        return torch.from_numpy(images)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+        arrays, active, unit, geometry, tables = ctx.state
+        into = Gradients.zeros(len(active.densities))
+        centres = np.empty((len(active.densities), 2), np.float32)
+        images = gradient.contiguous().numpy()
+        for view, table in enumerate(tables):
+            view_backward(active, geometry, view, table, images[view], into, centres)
+        return (*(torch.from_numpy(a) for a in into.to_raw(arrays[2], arrays[3], unit)), None, None, None)
+
+
+class _Voxelize(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+        unit: float, grid: Grid, truncation: Truncation,
+    ) -> Tensor:  # fmt: skip
+        arrays = [t.detach().contiguous().numpy() for t in (means, log_scales, quaternions, raw)]
+        layout = grid_layout(Active.of(*arrays, unit), grid, truncation.faint * unit, truncation.sigmas)
+        ctx.state = (arrays, layout, unit)
+        return torch.from_numpy(np.ascontiguousarray(layout.fill()))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+        arrays, layout, unit = ctx.state
+        into = Gradients.zeros(len(arrays[3]))
+        layout.backward(gradient.contiguous().numpy(), into.means, into.log_scales, into.rotations, into.densities)
+        return (*(torch.from_numpy(a) for a in into.to_raw(arrays[2], arrays[3], unit)), None, None, None)
+
+
+def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
+    """Where Gaussians fall on a grid; `faint` is a density."""
+    z, y, x = (float(axis[0]) for axis in grid.coordinates())
+    parameters = (active.means, active.scales, active.rotations, active.densities)
+    return Layout(*parameters, (x, y, z), grid.voxel_size, grid.shape, faint, sigmas)
+
+
+def project(
+    gaussians: Gaussians,
+    geometry: Geometry,
+    views: Sequence[int] | slice | None = None,
+    *,
+    truncation: Truncation | None = None,
+    kernel: Kernel = "auto",
+) -> Tensor:
+    """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
+
+    Differentiable in all four parameter tensors. The reference kernel truncates nothing.
+    """
+    chosen = geometry if views is None else geometry.select(views)
+    g = gaussians
+    if _use_reference(g, kernel):
+        images = [
+            reference.project_view(
+                g.means, g.scales, g.quaternions, g.densities,
+                float(angle), chosen.detector_shape, chosen.pixel_pitch, chosen.axis_col,
+            )
+            for angle in chosen.angles
+        ]  # fmt: skip
+        return torch.stack(images)
+    cut = truncation or Truncation()
+    return _Project.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, chosen, cut)
+
+
+def voxelize(
+    gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, kernel: Kernel = "auto"
+) -> Tensor:
+    """Density [z, y, x] (1/mm) of the Gaussians at the grid's voxel centres; any box, any voxel size."""
+    g = gaussians
+    if _use_reference(g, kernel):
+        z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
+        return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x))
+    cut = truncation or Truncation()
+    return _Voxelize.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, grid, cut)
+
+
+def _use_reference(gaussians: Gaussians, kernel: Kernel) -> bool:
+    if kernel == "reference":
+        return True
+    if gaussians.means.dtype != torch.float32:
+        if kernel == "cpu":
+            raise ValueError(f"the cpu kernel works in float32, the Gaussians are {gaussians.means.dtype}")
+        return True
+    return False

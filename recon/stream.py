@@ -1,0 +1,228 @@
+"""StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
+
+The first Gaussians come from an FBP of the first well-spread views. Whenever the number of views has grown by half, the
+model is compared with all of them: what it does not explain is back-projected (the FBP of the residual), new Gaussians
+are placed where that is positive, and the learning rates start again, since there is something new to learn. Between
+arrivals the model keeps fitting: every third step takes one of the newest views, the others replay all of them evenly
+(the rule of on-the-fly mapping: new views must be learnt, old ones not forgotten; Meuleman et al. 2025).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from recon import fit
+from recon.fbp import fbp
+from recon.gaussians import Gaussians, concatenate
+from recon.geometry import Geometry
+from recon.initialise import density_unit, sample_gaussians, scale_to_data
+from recon.kernels.activation import F32
+from recon.splat import project
+from recon.volume import Grid, Volume
+
+_NEWEST = 0.2  # this share of the views counts as the newest
+_GROWTH = 1.5  # a new round begins when the views have multiplied by this
+_ROUND = 400.0  # steps over which the rates decay within a round
+
+
+class StreamingFit:
+    """An R²-Gaussian fit whose views arrive in time.
+
+    Args:
+        template: geometry of the views to come; its angles are ignored.
+        grid: of the snapshots; None matches the detector.
+        seed: of every random choice.
+        gaussians: how many at the first placement; None derives it from the volume (see `default_count`).
+        settings: of the fit. Density control is off by default: the residual rounds add Gaussians.
+        first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
+        now: a clock in s.
+    """
+
+    def __init__(
+        self,
+        template: Geometry,
+        grid: Grid | None = None,
+        seed: int = 0,
+        *,
+        gaussians: int | None = None,
+        settings: fit.FitSettings | None = None,
+        first_views: int = 8,
+        first_span: float = np.pi / 6,
+        now: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._template, self._grid = template, grid or Grid.matching(template)
+        self._rng = np.random.default_rng(seed)
+        self._count = gaussians or default_count(self._grid)
+        self._settings = settings or fit.FitSettings(policy=None)
+        self._first_views, self._first_span = first_views, first_span
+        self._now, self._start = now, now()
+        self._data: list[F32] = []
+        self._angles: list[float] = []
+        self._problem: fit.Problem | None = None
+        self._state: fit.FitState | None = None
+        self._round_views, self._round_step = 0, 0
+
+    @property
+    def n_views(self) -> int:
+        return len(self._angles)
+
+    @property
+    def started(self) -> bool:
+        """There is a model; before, there are not enough views for one."""
+        return self._state is not None
+
+    def add_views(self, data: F32, angles: ArrayLike) -> None:
+        """Line integrals [k, row, col] at angles [k] in radians; they count from the next step on.
+
+        Raises:
+            ValueError: where shapes disagree with the template or values are not finite; nothing is added.
+        """
+        theta = np.atleast_1d(np.asarray(angles, np.float64))
+        expected = (theta.size, *self._template.detector_shape)
+        if np.shape(data) != expected:
+            raise ValueError(f"{theta.size} angles need projections of shape {expected}, got {np.shape(data)}")
+        if not (np.isfinite(data).all() and np.isfinite(theta).all()):
+            raise ValueError("new views hold values or angles that are not finite; nothing was added")
+        self._data.extend(np.ascontiguousarray(image, np.float32) for image in data)
+        self._angles.extend(theta.tolist())
+        if self._problem is not None:
+            self._problem = fit.extend(self._problem, np.asarray(data, np.float32), theta)
+
+    def advance(self, seconds: float) -> fit.Progress:
+        """Fit for about `seconds` s (at least one step once there is a model) and say where it stands."""
+        return self._advance(seconds, finishing=False)
+
+    def finish(self, seconds: float, on_progress: Callable[[fit.Progress], bool] | None = None) -> fit.Progress:
+        """The scan has ended: a last round over all views with the rates decaying to the end, in about `seconds` s.
+
+        `on_progress` is called about ten times a second and ends the fit by returning True.
+
+        Raises:
+            ValueError: where no view has come, or where the views hold no matter.
+        """
+        if not self._angles:
+            raise ValueError("no view has arrived, there is nothing to finish")
+        if self._state is None or self._round_views < self.n_views:
+            self._begin_round(force=True)
+        return self._advance(seconds, finishing=True, on_progress=on_progress)
+
+    def snapshot(self) -> Volume:
+        """The volume as it stands, 1/mm; all zero before the first model."""
+        if self._state is None:
+            return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
+        return fit.volume_of(self._state, self._grid, self._settings)
+
+    @property
+    def gaussians(self) -> Gaussians | None:
+        """A copy of the model, None before the first one."""
+        return None if self._state is None else fit.gaussians_of(self._state)
+
+    def progress(self) -> fit.Progress:
+        """Where the fit stands."""
+        seconds, state = self._now() - self._start, self._state
+        if state is None:
+            return fit.Progress(0, 0, seconds, float("nan"), float("nan"), 0, self.n_views)
+        return fit.Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.n_views)
+
+    def _advance(
+        self, seconds: float, finishing: bool, on_progress: Callable[[fit.Progress], bool] | None = None
+    ) -> fit.Progress:
+        begin = self._now()
+        if not finishing and self.n_views >= _GROWTH * self._round_views:
+            self._begin_round()
+        if self._state is None or self._problem is None:
+            return self.progress()
+        said = begin
+        while True:
+            spent = self._now() - begin
+            fraction = min(1.0, spent / seconds) if finishing and seconds > 0 else self._round_fraction()
+            fit.step(self._state, self._problem, self._settings, fraction, self._choose(finishing))
+            if on_progress is not None and self._now() - said > 0.1:
+                said = self._now()
+                if on_progress(self.progress()):
+                    break
+            if self._now() - begin >= seconds:
+                break
+        return self.progress()
+
+    def _round_fraction(self) -> float:
+        # While views still come the rates go down half way only: the next round starts them again.
+        assert self._state is not None
+        return 0.5 * min(1.0, (self._state.step - self._round_step) / _ROUND)
+
+    def _choose(self, finishing: bool) -> int | None:
+        n = self.n_views
+        newest = max(1, int(n * _NEWEST))
+        if finishing or newest >= n or self._rng.random() >= 1 / 3:
+            return None
+        return int(self._rng.integers(n - newest, n))
+
+    def _begin_round(self, force: bool = False) -> None:
+        theta = np.asarray(self._angles)
+        if self._state is None:
+            if not force and (theta.size < self._first_views or _span(theta) < self._first_span):
+                return
+            self._place_first()
+        else:
+            self._place_more()
+        assert self._state is not None
+        self._round_views, self._round_step = self.n_views, self._state.step
+        self._state.drawn = []  # draw from all views from now on
+
+    def _all(self) -> tuple[F32, Geometry]:
+        angles = np.asarray(self._angles)
+        angles.setflags(write=False)
+        return np.stack(self._data), replace(self._template, angles=angles)
+
+    def _field(self) -> float:
+        cols, axis = self._template.detector_shape[1], self._template.axis_col
+        return max(axis + 0.5, cols - axis - 0.5) * self._template.pixel_pitch
+
+    def _place_first(self) -> None:
+        data, geometry = self._all()
+        volume = Volume(fbp(data, geometry, self._grid, "hann"), self._grid)
+        placed = sample_gaussians(volume, self._count, self._rng, field_radius=self._field())
+        placed = scale_to_data(placed, data, geometry)
+        self._problem = fit.make_problem(data, geometry, self._grid, placed.density_unit, self._settings)
+        self._state = fit.init(placed, self._rng)
+
+    def _place_more(self) -> None:
+        """New Gaussians where the back-projected residual is positive; at most a tenth of the first count a round."""
+        assert self._state is not None
+        data, geometry = self._all()
+        model = fit.gaussians_of(self._state)
+        residual = data - project(model, geometry, truncation=self._settings.truncation).numpy()
+        volume = Volume(fbp(residual, geometry, self._grid, "hann"), self._grid)
+        if density_unit(volume) < 0.02 * model.density_unit:
+            return
+        try:
+            placed = sample_gaussians(volume, self._count // 10, self._rng, field_radius=self._field())
+        except ValueError:
+            return  # nothing unexplained anywhere
+        # A new Gaussian overlaps its neighbours; half the residual each keeps the sum from overshooting.
+        placed = Gaussians.from_physical(
+            placed.means.numpy(), placed.scales.numpy(), 0.5 * placed.densities.double().numpy(),
+            density_unit=model.density_unit,
+        )  # fmt: skip
+        alive = model.densities > 1e-4 * model.density_unit
+        step, drawn = self._state.step, self._state.rng
+        self._state = fit.init(concatenate(model.select(torch.nonzero(alive)[:, 0]), placed), drawn)
+        self._state.step = self._state.restart = step
+
+
+def default_count(grid: Grid) -> int:
+    """How many Gaussians a grid is worth: one for 100 voxels of the cylinder in it, 2000 to 200 000."""
+    nz, ny, nx = grid.shape
+    return int(np.clip(np.pi / 4 * nz * ny * nx / 100, 2000, 200_000))
+
+
+def _span(theta: NDArray[np.float64]) -> float:
+    """The angle that views cover, modulo π: π less the widest gap."""
+    ordered = np.sort(np.mod(theta, np.pi))
+    return float(np.pi - np.diff(ordered, append=ordered[0] + np.pi).max())

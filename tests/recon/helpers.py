@@ -1,0 +1,36 @@
+"""Gaussians as leaves of a graph, for gradient comparisons."""
+
+from __future__ import annotations
+
+import torch
+
+from recon.gaussians import Gaussians
+
+
+def in_double(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians as float64 leaves, so that the readable twin runs and collects gradients."""
+    leaves = [
+        tensor.detach().double().requires_grad_()
+        for tensor in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.raw_densities)
+    ]
+    return Gaussians(*leaves, density_unit=gaussians.density_unit)
+
+
+def as_leaves(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians as float32 leaves that collect gradients."""
+    leaves = [
+        tensor.detach().clone().requires_grad_()
+        for tensor in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.raw_densities)
+    ]
+    return Gaussians(*leaves, density_unit=gaussians.density_unit)
+
+
+def gradients(gaussians: Gaussians) -> dict[str, torch.Tensor]:
+    """Gradients by parameter name, in float64."""
+    named = {
+        "means": gaussians.means,
+        "log_scales": gaussians.log_scales,
+        "quaternions": gaussians.quaternions,
+        "raw_densities": gaussians.raw_densities,
+    }
+    return {name: tensor.grad.double() for name, tensor in named.items() if tensor.grad is not None}

@@ -1,0 +1,70 @@
+"""Fused losses against their torch twins, and the twin's SSIM against scikit-image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from recon.kernels.losses_cpu import ProjectionLoss, total_variation
+from recon.losses import projection_loss, ssim
+from recon.losses import total_variation as twin_total_variation
+
+
+def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tuple[np.ndarray, np.ndarray]:
+    target = rng.random(shape).astype(np.float32)
+    return (target + 0.2 * rng.normal(size=shape)).astype(np.float32), target
+
+
+def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator) -> None:
+    image, target = _images(rng)
+    loss = ProjectionLoss(image.shape, 0.25)
+    gradient = np.empty_like(image)
+    value = loss(image, target, loss.target_maps(target), gradient)
+    x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
+    expected = projection_loss(x, torch.from_numpy(target.astype(np.float64)), 0.25)
+    expected.backward()
+    assert value == pytest.approx(expected.item(), rel=1e-5)
+    assert x.grad is not None
+    np.testing.assert_allclose(gradient, x.grad.numpy(), atol=2e-5 * float(x.grad.abs().max()))
+
+
+def test_ssim_equals_scikit_image_in_the_interior(rng: np.random.Generator) -> None:
+    # The borders differ by choice (zeros there, reflection here), so only the inside is compared.
+    image, target = (a.astype(np.float64) for a in _images(rng, (60, 60)))
+    _, full = structural_similarity(
+        image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
+    )
+    grown = ssim(torch.from_numpy(image), torch.from_numpy(target)).item()
+    assert grown == pytest.approx(float(full.mean()), abs=0.02)
+    # Zero frames around both images make the two border rules agree.
+    padded = [np.pad(a, 10) for a in (image, target)]
+    _, full = structural_similarity(
+        *padded, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
+    )
+    assert ssim(*(torch.from_numpy(a) for a in padded)).item() == pytest.approx(float(full.mean()), abs=1e-6)
+
+
+def test_equal_images_cost_nothing(rng: np.random.Generator) -> None:
+    image = rng.random((20, 24)).astype(np.float32)
+    loss = ProjectionLoss(image.shape, 0.25)
+    gradient = np.empty_like(image)
+    assert loss(image, image, loss.target_maps(image), gradient) == pytest.approx(0, abs=1e-6)
+    assert np.abs(gradient).max() < 1e-5
+
+
+@pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 4), (1, 1, 3), (1, 1, 1)])
+def test_total_variation_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int, int]) -> None:
+    volume = rng.normal(size=shape).astype(np.float32)
+    gradient = np.empty_like(volume)
+    value = total_variation(volume, gradient, 0.3)
+    if volume.size == 1:
+        assert value == 0 and gradient[0, 0, 0] == 0
+        return
+    x = torch.from_numpy(volume.astype(np.float64)).requires_grad_()
+    expected = 0.3 * twin_total_variation(x)
+    expected.backward()
+    assert value == pytest.approx(expected.item(), rel=1e-6)
+    assert x.grad is not None
+    np.testing.assert_allclose(gradient, x.grad.numpy(), atol=1e-7)

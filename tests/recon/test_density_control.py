@@ -1,0 +1,79 @@
+"""Clone, split and prune: what they keep, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.density_control import Change, DensityPolicy, control
+from recon.gaussians import Gaussians
+from recon.kernels.reference import covariances, rotation_matrices
+from tests.recon.conftest import Make
+
+FIELD = 20.0
+
+
+def _control(g: Gaussians, statistic: np.ndarray, policy: DensityPolicy, limit: int = 1000) -> Change:
+    rotations = rotation_matrices(g.quaternions).reshape(-1, 9).numpy()
+    return control(
+        g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy(), statistic.astype(np.float32),
+        policy, FIELD, limit, (FIELD / 2,) * 3, np.random.default_rng(1),
+    )  # fmt: skip
+
+
+def _masses(log_scales: np.ndarray, raw: np.ndarray) -> np.ndarray:
+    return np.logaddexp(0, raw.astype(np.float64)) * np.exp(log_scales.astype(np.float64).sum(1))
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 1000), large=st.sampled_from([1e-6, 0.05, 1e6]))
+def test_growing_conserves_mass_and_centre_of_mass(seed: int, large: float) -> None:
+    rng = np.random.default_rng(seed)
+    n = 25
+    g = Gaussians.from_physical(
+        rng.uniform(-5, 5, (n, 3)), rng.uniform(0.3, 2, (n, 3)), rng.uniform(0.1, 2, n), rng.normal(size=(n, 4))
+    )
+    change = _control(g, rng.uniform(0, 1e-4, n), DensityPolicy(large=large))
+    before, after = _masses(g.log_scales.numpy(), g.raw_densities.numpy()), _masses(change.log_scales, change.raw)
+    assert change.parents.size > 0 and after.size == n + change.parents.size
+    assert after.sum() == pytest.approx(before.sum(), rel=1e-5)
+    np.testing.assert_allclose(after @ change.means, before @ g.means.numpy(), rtol=1e-4, atol=1e-3)
+
+
+def test_a_split_keeps_the_covariance(random_gaussians: Make) -> None:
+    # Mixture of two: covariance of the parts plus that of their centres.
+    g = random_gaussians(1)
+    change = _control(g, np.ones(1), DensityPolicy(large=0.0))
+    assert change.means.shape == (2, 3)
+    centre = change.means.mean(0)
+    parts = covariances(torch.from_numpy(np.exp(change.log_scales)), g.quaternions.repeat(2, 1)).numpy().mean(0)
+    spread = np.einsum("ni,nj->ij", change.means - centre, change.means - centre) / 2
+    np.testing.assert_allclose(parts + spread, covariances(g.scales, g.quaternions)[0].numpy(), rtol=1e-4, atol=1e-5)
+
+
+def test_pruning_takes_the_faint_and_the_lost() -> None:
+    g = Gaussians.from_physical([[0, 0, 0], [1, 0, 0], [30, 0, 0]], [1.0] * 3, [1.0, 1e-6, 1.0], density_unit=1.0)
+    change = _control(g, np.zeros(3), DensityPolicy())
+    assert change.keep.tolist() == [0]
+    assert change.parents.size == 0
+
+
+def test_the_limit_keeps_the_most_wanted(random_gaussians: Make) -> None:
+    g = random_gaussians(20)
+    statistic = np.arange(20) * 1e-4 + 1e-4
+    change = _control(g, statistic, DensityPolicy(), limit=23)
+    assert change.parents.tolist() == [17, 18, 19]
+    assert change.means.shape[0] == 23
+
+
+def test_clones_do_not_coincide(random_gaussians: Make) -> None:
+    g = random_gaussians(1)
+    change = _control(g, np.ones(1), DensityPolicy(large=1e6))
+    apart = np.linalg.norm(change.means[0] - change.means[1])
+    assert apart == pytest.approx(0.5 * float(g.scales.max()), rel=1e-4)
+    assert math.isclose(*np.logaddexp(0, change.raw), rel_tol=1e-6)

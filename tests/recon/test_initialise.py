@@ -1,0 +1,70 @@
+"""From a volume to Gaussians: they sit in the matter, explain the data's scale, and refuse what is not a volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.initialise import morton_order, sample_gaussians, scale_to_data
+from recon.splat import project
+from recon.volume import Grid, Volume
+from tests.recon.conftest import Make
+
+
+def _ball(radius: float = 6.0) -> Volume:
+    grid = Grid((20, 24, 24), 0.5, centre=(1.0, 0.0, 0.0))
+    z, y, x = grid.coordinates()
+    inside = (x[None, None] - 1) ** 2 + y[None, :, None] ** 2 + (z[:, None, None] - 1) ** 2 < (radius / 2) ** 2
+    return Volume(inside.astype(np.float32), grid)
+
+
+def test_gaussians_sit_in_the_matter(rng: np.random.Generator) -> None:
+    placed = sample_gaussians(_ball(), 400, rng, field_radius=6.0, smooth=0.5)
+    assert placed.n == 400
+    away = np.linalg.norm(placed.means.numpy() - [1.0, 0.0, 1.0], axis=1)
+    assert away.max() < 3.0 + 2 * 0.5
+    np.testing.assert_allclose(placed.means.numpy().mean(0), [1.0, 0.0, 1.0], atol=0.3)
+
+
+def test_nothing_is_placed_outside_the_field(rng: np.random.Generator) -> None:
+    placed = sample_gaussians(_ball(), 400, rng, field_radius=2.0)
+    assert np.hypot(*placed.means.numpy()[:, :2].T).max() < 2.0 + 0.5
+
+
+def test_fewer_voxels_give_fewer_gaussians(rng: np.random.Generator) -> None:
+    assert sample_gaussians(_ball(2.0), 10**6, rng, field_radius=6.0, smooth=0).n < 40
+
+
+def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="no matter"):
+        sample_gaussians(Volume(np.zeros((4, 4, 4), np.float32), Grid((4, 4, 4))), 10, rng, field_radius=5)
+
+
+@pytest.mark.parametrize("factor", [0.01, 1.0, 250.0])
+def test_the_density_scale_is_the_least_squares_factor(random_gaussians: Make, factor: float) -> None:
+    g = random_gaussians()
+    views = Geometry.parallel(np.linspace(0, 3, 7), (20, 24), pixel_pitch=0.6)
+    data = factor * project(g, views).numpy()
+    np.testing.assert_allclose(scale_to_data(g, data, views).densities, factor * g.densities, rtol=1e-3)
+
+
+def test_negative_data_are_refused(random_gaussians: Make) -> None:
+    g = random_gaussians()
+    views = Geometry.parallel([0.0, 1.0], (20, 24), pixel_pitch=0.6)
+    with pytest.raises(ValueError, match="line integrals"):
+        scale_to_data(g, -project(g, views).numpy(), views)
+
+
+def test_morton_order_is_a_permutation_that_keeps_neighbours(rng: np.random.Generator) -> None:
+    means = rng.uniform(0, 16, (2000, 3)).astype(np.float32)
+    order = morton_order(means, 1.0)
+    assert sorted(order.tolist()) == list(range(2000))
+    walk = np.linalg.norm(np.diff(means[order], axis=0), axis=1).mean()
+    assert walk < 0.35 * np.linalg.norm(np.diff(means, axis=0), axis=1).mean()
+
+
+def test_one_gaussian_has_an_order() -> None:
+    one = Gaussians.from_physical([[1.0, 2.0, 3.0]], [1.0], [1.0])
+    assert morton_order(one.means.numpy(), 1.0).tolist() == [0]
