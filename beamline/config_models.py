@@ -154,8 +154,6 @@ class _Orca(Section):
     """null: the full sensor, 2304 x 4096."""
     binning: Literal[1, 2, 4] = 1
     readout: Literal["standard", "ultra_quiet"] = "standard"
-    link: Literal["usb3", "coaxpress"] = "usb3"
-    """USB3 carries 17.7 full frames a second, CoaXPress 120."""
 
 
 class SimulatedOrca(_Orca):
@@ -168,6 +166,8 @@ class DcamOrca(_Orca):
     """Path of the DCAM-API library; null: the installed one."""
     index: Annotated[int, Field(ge=0)] = 0
     """Which camera, where DCAM finds several."""
+    link: Literal["usb3", "coaxpress"] = "usb3"
+    """USB3 carries 17.7 full frames a second, CoaXPress 120."""
 
 
 class Simple(Section):

@@ -1,0 +1,216 @@
+"""Devices: the composition root, where a configuration becomes a stage, a camera, a shutter and a sample mover.
+
+The only module of `beamline` that names a simulator; it imports the ones it needs where it needs them, so that an
+instrument loads no simulator and a simulation no vendor library.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+from uuid import uuid4
+
+import click
+
+from beamline.config import Config, scene_mapping
+from beamline.config_models import DcamOrca, PM16CStageConfig, Simulation, Speed
+from beamline.errors import ConfigError
+from drivers import orca_quest
+from drivers.clock import Clock, SystemClock
+from drivers.errors import DeviceError
+from drivers.manual import Ask, ManualSampleMover, ManualShutter
+from drivers.protocols import CameraSettings, CameraTiming, Devices, StageLimits, TriggerSource
+from drivers.stages.pm16c import PM16CStage, achievable_acceleration
+
+if TYPE_CHECKING:
+    from recon.volume import Grid, Volume
+    from simulators.camera import SimulatedOrcaQuest
+    from simulators.scene import Scene
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Connected devices and what goes with them; leaving a `with` block closes them.
+
+    Attributes:
+        clock: what every wait of the run goes by.
+        truth: the simulated sample's attenuation on a grid whose z is measured, as reconstructions do it, from the
+            middle of the camera's rows; None at a real instrument.
+        close: frees ports and camera; a second time does nothing.
+    """
+
+    devices: Devices
+    clock: Clock
+    truth: Callable[[Grid], Volume] | None
+    close: Callable[[], None]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def connect(config: Config, clock: Clock | None = None, ask: Ask | None = None) -> Bench:
+    """Open every device that the configuration names. Nothing moves.
+
+    Args:
+        clock: takes the place of the configured one.
+        ask: puts a request to the operator (manual shutter and sample mover); the terminal unless given.
+
+    Raises:
+        DeviceError: a device does not answer; those opened before it are closed again.
+        ConfigError: the simulated scene is wrong.
+    """
+    with ExitStack() as opened:
+        if config.simulation is None:
+            clock, truth = clock or SystemClock(), None
+            devices = _instrument(config, clock, ask or ask_operator, opened)
+        else:
+            clock = clock or _clock(config.simulation.clock)
+            devices, truth = _simulated(config, config.simulation, clock, opened)
+        return Bench(devices, clock, truth, opened.pop_all().close)
+
+
+def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:
+    """What the devices will say once connected, from the configuration and the data sheet alone: for dry runs.
+
+    A simulated scene is read too, so that what is wrong with it is said now.
+
+    Returns:
+        the stage's limits, the camera's timing with the views' exposure, and the stage's radians to whole counts.
+
+    Raises:
+        ConfigError: settings that a device would refuse, or a scene that is wrong.
+    """
+    stage = config.devices.stage
+    if config.simulation is not None:
+        _scene(config)
+    try:
+        acceleration = achievable_acceleration(stage.counts_per_turn, math.radians(stage.acceleration_deg_s2))
+    except ValueError as error:
+        raise ConfigError(f"devices.stage.acceleration_deg_s2: {error}. Nothing was started.") from None
+    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
+    link = config.devices.camera.link if isinstance(config.devices.camera, DcamOrca) else "usb3"
+    try:
+        timing = orca_quest.timing(settings, link)
+    except ValueError as error:
+        raise ConfigError(f"devices.camera: {error}. Nothing was started.") from None
+    limits = StageLimits(
+        counts_per_turn=stage.counts_per_turn,
+        max_speed=math.radians(stage.max_speed_deg_s),
+        acceleration=acceleration,
+        low=math.radians(stage.low_deg),
+        high=math.radians(stage.high_deg),
+        trigger_output=True,
+    )
+    return limits, timing, lambda angle: round(angle * stage.counts_per_turn / (2 * math.pi))
+
+
+def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
+    """The configured region, binning and readout with an exposure (s) and a trigger source."""
+    camera = config.devices.camera
+    return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
+
+
+def ask_operator(request: str) -> None:
+    """Put a request to whoever sits at the terminal, and wait for Enter.
+
+    Raises:
+        DeviceError: nobody sits there.
+    """
+    if not sys.stdin.isatty():
+        raise DeviceError(
+            "operator",
+            "there is no terminal to ask at",
+            request=request,
+            advice="Run it in a terminal, or configure a shutter and a sample mover that need no hand",
+            state="What was acquired so far is in the file",
+        )
+    click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ", err=True)
+
+
+def _instrument(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Devices:
+    from drivers.dcam.camera import DcamCamera
+
+    settings = config.devices.camera
+    if not isinstance(settings, DcamOrca):
+        raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
+    stage = _stage(config.devices.stage, config.devices.stage.port, clock)
+    opened.callback(stage.close)
+    camera = DcamCamera(Path(settings.library) if settings.library else None, settings.index, clock=clock)
+    opened.callback(camera.close)
+    return Devices(stage, camera, ManualShutter(ask), ManualSampleMover(ask))
+
+
+def _simulated(
+    config: Config, simulation: Simulation, clock: Clock, opened: ExitStack
+) -> tuple[Devices, Callable[[Grid], Volume]]:
+    from simulators.camera import SimulatedOrcaQuest
+    from simulators.serial_url import register
+    from simulators.shutter import SimulatedSampleMover, SimulatedShutter
+    from simulators.trigger_line import TriggerLine
+    from simulators.wires.pm16c import PM16CController
+
+    scene = _scene(config)
+    line = TriggerLine(clock)
+    settings = config.devices.stage
+    box = PM16CController(clock, line, channel=settings.channel, counts_per_turn=settings.counts_per_turn)
+    # A name of its own for every bench: two in one process must not share a controller.
+    stage = _stage(settings, register(f"pm16c-{uuid4().hex}", box), clock)
+    opened.callback(stage.close)
+    shutter, sample = SimulatedShutter(), SimulatedSampleMover()
+    pitch = config.optics.pixel_size_um * 1e-3
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, shutter, sample, pixel_pitch=pitch)
+    opened.callback(camera.close)
+    return Devices(stage, camera, shutter, sample), _truth(scene, camera)
+
+
+def _scene(config: Config) -> Scene:
+    from simulators.mapping import SceneError
+    from simulators.scene import load_scene
+
+    try:
+        return load_scene(scene_mapping(config))
+    except SceneError as error:
+        raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
+
+
+def _stage(config: PM16CStageConfig, url: str, clock: Clock) -> PM16CStage:
+    return PM16CStage(
+        url,
+        channel=config.channel,
+        counts_per_turn=config.counts_per_turn,
+        clock=clock,
+        max_speed=math.radians(config.max_speed_deg_s),
+        acceleration=math.radians(config.acceleration_deg_s2),
+        low=math.radians(config.low_deg),
+        high=math.radians(config.high_deg),
+    )
+
+
+def _clock(kind: str | Speed) -> Clock:
+    from simulators.clock import ScaledClock, VirtualClock
+
+    if isinstance(kind, Speed):
+        return ScaledClock(SystemClock(), kind.speed)
+    return VirtualClock() if kind == "virtual" else SystemClock()
+
+
+def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
+    from recon.volume import Volume
+
+    def truth(grid: Grid) -> Volume:
+        # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
+        detector = camera.detector
+        up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
+        z, y, x = grid.centre
+        return Volume(scene.phantom.attenuation(replace(grid, centre=(z + up, y, x))), grid)
+
+    return truth

@@ -1,0 +1,87 @@
+"""Dry run: a configuration worked out to its timeline and its limits, without a word to any device."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beamline import config, devices, timeline
+from beamline.config import Config
+from beamline.errors import ConfigError
+from beamline.monitor.flag import Context
+from beamline.monitor.scan import start as start_monitor
+from beamline.plan import ScanPlan, Timeline
+from drivers.frame import FrameKind
+from drivers.protocols import CameraTiming, StageLimits
+
+
+@dataclass(frozen=True, eq=False)
+class DryRun:
+    """A scan as it would be: plan, timeline, what the devices can do, and the room on the disk in bytes."""
+
+    plan: ScanPlan
+    timeline: Timeline
+    stage: StageLimits
+    camera: CameraTiming
+    free_bytes: int
+
+    def lines(self) -> list[str]:
+        """For a human; the violations come last."""
+        return timeline.describe(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
+
+    def data(self) -> Mapping[str, Any]:
+        """For a program: the numbers behind the lines, in s, rad, bytes and pixels."""
+        worked = self.timeline
+        views = next(block for block in worked.blocks if block.kind is FrameKind.PROJECTION)
+        return {
+            "remarks": worked.remarks,
+            "duration": worked.duration,
+            "n_frames": worked.n_frames,
+            "total_bytes": worked.total_bytes,
+            "free_bytes": self.free_bytes,
+            "step_counts": worked.step_counts,
+            "step": worked.step,
+            "speed": views.speed,
+            "taxi": views.taxi,
+            "blur_px": worked.blur_px,
+            "skew_px": worked.skew_px,
+            "min_period": self.camera.min_period,
+            "blocks": [
+                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": b.first_row, "n": b.n} for b in worked.blocks
+            ],
+        }
+
+    def refuse_violations(self) -> None:
+        """Raises ConfigError with every broken limit, where there is one."""
+        broken = self.timeline.violations
+        if len(broken) == 1:
+            raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
+        if broken:
+            raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
+
+
+def dry_run(settings: Config) -> DryRun:
+    """Work a configuration out.
+
+    Raises:
+        ConfigError: angles, a scene, monitor thresholds or device settings that cannot be. Broken limits are no error
+            here: they are the timeline's violations.
+    """
+    plan = config.plan_of(settings)
+    stage, camera, to_counts = devices.describe(settings)
+    start_monitor(Context(2**camera.bits - 1, math.prod(camera.shape)), settings.monitor.thresholds)
+    free = free_bytes(Path(settings.storage.folder))
+    worked = timeline.work_out(plan, stage, to_counts, camera, axis_col=settings.optics.axis_col, free_bytes=free)
+    return DryRun(plan, worked, stage, camera, free)
+
+
+def free_bytes(folder: Path) -> int:
+    """Room on the disk that holds `folder`, or will hold it once it is made."""
+    folder = folder.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
