@@ -43,10 +43,11 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
     problems = []
-    # Without a lock: a follower must not stop the writer from adding the /exchange view at the end.
-    for swmr in (True, False) if follow else (False, True):
+    # Without a lock: a follower must not stop the writer from adding the /exchange view at the end. A writer in this
+    # same process shares its file with us, and then HDF5 wants the same locking of both.
+    for swmr, locking in ((follow, False), (not follow, False), (True, None)):
         try:
-            return h5py.File(path, "r", swmr=swmr, locking=False)
+            return h5py.File(path, "r", swmr=swmr, locking=locking)
         except (OSError, ValueError) as error:
             problems.append(str(error))
     if follow:

@@ -139,10 +139,9 @@ def time_order(places: Places) -> Iterator[Finding]:
     times = _column(places, "frame_log/time")
     back = np.flatnonzero(np.diff(times) < 0)
     if back.size:
+        step = times[back[0] + 1] - times[back[0]]
         yield Finding(
-            "error",
-            "time-order",
-            f"Time goes back {back.size} times (first: frame {back[0] + 1}, {_back(times, back)} s).",
+            "error", "time-order", f"Time goes back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s)."
         )
 
 

@@ -100,6 +100,9 @@ class NXtomoSource:
             number = hdf5.scalar(entry, where, units)
             if number is not None:
                 said[name] = number
+        exposures = self._seconds(self._places.detector, "count_time")
+        if "exposure_s" not in said and np.isfinite(exposures).any():
+            said["exposure_s"] = float(np.nanmedian(exposures))
         position = hdf5.dataset(self._places.detector, "x_rotation_axis_pixel_position")
         if position is not None:
             said["x_rotation_axis_pixel_position"] = f"{position[()]} (not used: its origin is not defined)"

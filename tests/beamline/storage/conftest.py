@@ -1,0 +1,89 @@
+"""Small scans to write, read and break."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.digest import digest
+from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
+from drivers.frame import Frame, FrameKind
+
+SHAPE = (12, 16)
+EPOCH = 1.8e9  # s; a day in January 2027
+
+
+@dataclass
+class StandingClock:
+    """A clock that the test sets."""
+
+    time: float = EPOCH
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += seconds
+
+
+@pytest.fixture
+def clock() -> StandingClock:
+    return StandingClock()
+
+
+INFO = ScanInfo(
+    sample="battery",
+    title="a test",
+    pixel_size_mm=0.0046,
+    energy_kev=25.0,
+    distance_mm=100.0,
+    exposure=0.05,
+    period=0.12,
+    axis_col=7.25,
+    plan='{"views": 9}',
+    config="sample: {name: battery}\n",
+    devices={"stage": {"model": "PM16C", "counts_per_turn": 360000, "speed": 1.5}},
+)
+
+
+def scan_frames(rng: np.random.Generator, n_darks: int = 2, n_flats: int = 3, n_views: int = 9) -> list[Frame]:
+    """Darks near 100, flats near 1000 and projections below that over half a turn, as a camera would give them."""
+    kinds = [FrameKind.DARK] * n_darks + [FrameKind.FLAT] * n_flats + [FrameKind.PROJECTION] * n_views
+    frames = []
+    for i, kind in enumerate(kinds):
+        trigger = i if kind is FrameKind.DARK else i - n_darks if kind is FrameKind.FLAT else i - n_darks - n_flats
+        frames.append(
+            Frame(
+                counts=rng.poisson({0: 600, 1: 1000, 2: 100}[int(kind)], SHAPE).astype(np.uint16),
+                kind=kind,
+                index=i,
+                trigger=trigger,
+                framestamp=trigger,
+                angle=np.pi * trigger / max(n_views - 1, 1) if kind is FrameKind.PROJECTION else np.nan,
+                time=EPOCH + 0.12 * i,
+                exposure=0.05,
+            )
+        )
+    return frames
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> list[Frame]:
+    return scan_frames(rng)
+
+
+@pytest.fixture
+def write(tmp_path: Path, clock: StandingClock) -> Callable[[list[Frame]], Path]:
+    """Write frames to a new, complete scan and give its path."""
+
+    def write(frames: list[Frame], name: str = "scan.h5") -> Path:
+        with NXtomoWriter(tmp_path / name, INFO, SHAPE, clock=clock) as writer:
+            for frame in frames:
+                writer.append(frame, digest(frame.counts))
+        return tmp_path / name
+
+    return write

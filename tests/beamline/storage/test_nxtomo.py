@@ -1,0 +1,334 @@
+"""The writer: what it writes, what it refuses, and what is left when its process is killed."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.digest import digest
+from beamline.errors import DataError
+from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.nxtomo_layout import COLUMNS
+from beamline.storage.source import open_scan
+from drivers.clock import SystemClock
+from drivers.frame import Frame, FrameKind
+
+from .conftest import EPOCH, INFO, SHAPE, StandingClock, scan_frames
+
+Write = Callable[[list[Frame]], Path]
+
+
+def test_paths_types_and_units_of_nxtomo(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        entry = file["entry"]
+        assert entry["definition"][()] == b"NXtomo"
+        assert entry["title"][()] == b"a test"
+        data = entry["instrument/detector/data"]
+        assert data.dtype == np.dtype("<u2")
+        assert data.chunks == (1, *SHAPE)
+        np.testing.assert_array_equal(data[()], [frame.counts for frame in frames])
+        np.testing.assert_array_equal(entry["instrument/detector/image_key"][()], [2, 2, 1, 1, 1, *[0] * 9])
+        angle = entry["sample/rotation_angle"]
+        assert angle.attrs["units"] == b"degree"
+        np.testing.assert_allclose(angle[5:], np.linspace(0, 180, 9))
+        assert np.isnan(angle[:5]).all()
+        for path, value, unit in (
+            ("instrument/detector/x_pixel_size", 0.0046, b"mm"),
+            ("instrument/detector/y_pixel_size", 0.0046, b"mm"),
+            ("instrument/detector/distance", 100.0, b"mm"),
+            ("instrument/beam/incident_energy", 25.0, b"keV"),
+            ("record/axis_col", 7.25, b"pixel"),
+        ):
+            assert (entry[path][()], entry[path].attrs["units"]) == (value, unit)
+        classes = {name: item.attrs["NX_class"] for name, item in entry.items() if isinstance(item, h5py.Group)}
+        assert classes["instrument"] == b"NXinstrument"
+        assert classes["sample"] == b"NXsample"
+        assert classes["data"] == b"NXdata"
+        assert entry["instrument/devices/stage/counts_per_turn"][()] == 360000
+        assert entry["record/plan"][()] == b'{"views": 9}'
+
+
+def test_nxdata_holds_hard_links_that_name_their_target(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        nxdata = file["entry/data"]
+        assert nxdata.attrs["signal"] == b"data"
+        assert list(nxdata.attrs["axes"]) == [b"rotation_angle", b"y", b"x"]
+        for name in ("data", "rotation_angle", "image_key"):
+            assert isinstance(nxdata.get(name, getlink=True), h5py.HardLink)
+            assert file[nxdata[name].attrs["target"]] == nxdata[name]
+        np.testing.assert_allclose(nxdata["x"][()], np.arange(SHAPE[1]) * 0.0046)
+        assert nxdata["y"].shape == (SHAPE[0],)
+
+
+def test_times_are_iso_8601(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        for name in ("start_time", "end_time"):
+            said = datetime.fromisoformat(file["entry"][name][()].decode())
+            assert said == datetime.fromtimestamp(EPOCH, UTC)
+
+
+def test_no_string_is_of_variable_length(write: Write, frames: list[Frame]) -> None:
+    """A reader of a growing file fails on them (h5py issue 1273)."""
+    found: list[str] = []
+
+    def look(name: str, item: h5py.HLObject) -> None:
+        attributes = [item.attrs.get_id(key).dtype for key in item.attrs]
+        if any(dtype.kind == "O" for dtype in (*attributes, getattr(item, "dtype", np.dtype(int)))):
+            found.append(name)
+
+    with h5py.File(write(frames)) as file:
+        file.visititems(look)
+    assert not found
+
+
+def test_digest_and_preview_are_stored_beside_the_frame(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        for i, frame in enumerate(frames):
+            expected = digest(frame.counts)
+            np.testing.assert_array_equal(file["entry/digest/preview"][i], expected.preview)
+            for name in ("minimum", "maximum", "mean", "variance", "sum_abs", "entropy", "checksum"):
+                assert file[f"entry/digest/{name}"][i] == getattr(expected, name)
+
+
+def test_exchange_view_shows_the_same_frames_and_moves_with_the_file(
+    write: Write, frames: list[Frame], tmp_path: Path
+) -> None:
+    frames = [*frames, replace(frames[2], index=14, trigger=0, framestamp=0)]  # a flat at the end: two runs of flats
+    path = write(frames)
+    (tmp_path / "elsewhere").mkdir()
+    path = path.rename(tmp_path / "elsewhere" / "moved.h5")
+    with h5py.File(path) as file:
+        for name, kind in (
+            ("data", FrameKind.PROJECTION),
+            ("data_white", FrameKind.FLAT),
+            ("data_dark", FrameKind.DARK),
+        ):
+            assert file["exchange"][name].is_virtual
+            expected = [frame.counts for frame in frames if frame.kind is kind]
+            np.testing.assert_array_equal(file["exchange"][name][()], expected)
+        np.testing.assert_allclose(file["exchange/theta"][()], np.linspace(0, 180, 9))
+        assert file["exchange/theta"].attrs["units"] == b"deg"
+        assert file["implements"][()] == b"exchange"
+
+
+def test_a_stopped_scan_has_a_view_of_the_rows_that_exist(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    for frame in frames[:7]:
+        writer.append(frame, digest(frame.counts))
+    clock.sleep(10)
+    writer.close("stopped", missing=[7, 9])
+    writer.close("complete")  # the second close changes nothing
+    assert writer.remarks == []
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert file["exchange/data"].shape == (2, *SHAPE)
+        assert file["entry/progress/status"][()] == b"stopped"
+        assert file["entry/progress/missing_triggers"][()].tolist() == [7, 9]
+        assert file["entry/progress/frames_committed"][()] == 7
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.attributes["status"], source.attributes["missing_triggers"]) == ("stopped", 2)
+
+
+def test_an_empty_scan_is_still_a_file(tmp_path: Path, clock: StandingClock) -> None:
+    NXtomoWriter(tmp_path / "s.h5", ScanInfo("nothing"), SHAPE, clock=clock).close("failed")
+    with open_scan(tmp_path / "s.h5") as source:
+        assert source.refresh() == 0
+        assert source.read(slice(None)).shape == (0, *SHAPE)
+        assert source.pixel_size_mm is None
+
+
+def test_an_alignment_frame_is_a_projection_to_those_who_do_not_know_it(write: Write, frames: list[Frame]) -> None:
+    path = write([*frames, replace(frames[-1], index=14, kind=FrameKind.ALIGNMENT)])
+    with h5py.File(path) as file:
+        assert file["entry/instrument/detector/image_key"][14] == 0
+        assert file["entry/instrument/detector/image_key_control"][14] == -1
+        assert file["exchange/data"].shape[0] == 9
+    with open_scan(path) as source:
+        assert source.image_key[14] == FrameKind.ALIGNMENT
+
+
+def test_an_exception_inside_leaves_a_failed_but_readable_file(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    with (
+        pytest.raises(RuntimeError, match="camera"),
+        NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer,
+    ):
+        writer.append(frames[0], digest(frames[0].counts))
+        raise RuntimeError("camera unplugged")
+    with open_scan(tmp_path / "s.h5") as source:
+        assert source.attributes["status"] == "failed"
+        np.testing.assert_array_equal(source.read([0])[0], frames[0].counts)
+
+
+def test_never_overwrites(tmp_path: Path, clock: StandingClock) -> None:
+    path = tmp_path / "s.h5"
+    path.write_bytes(b"precious")
+    with pytest.raises(DataError, match="never overwrites"):
+        NXtomoWriter(path, INFO, SHAPE, clock=clock)
+    assert path.read_bytes() == b"precious"
+    with pytest.raises(DataError, match="cannot be created"):
+        NXtomoWriter(tmp_path / "no" / "folder.h5", INFO, SHAPE, clock=clock)
+
+
+def test_wrong_frames_are_refused_and_nothing_is_written(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+    good = frames[1]
+    for bad, said in (
+        (replace(good, counts=good.counts[:-1]), r"uint16 \(11, 16\), expected uint16 \(12, 16\)"),
+        (replace(good, counts=good.counts.astype(np.float32)), "float32"),
+        (replace(good, counts=good.counts.astype(np.int16)), "int16"),
+        (replace(good, index=2), "index is 2, expected 1"),
+        (replace(good, index=0), "index is 0, expected 1"),
+    ):
+        with pytest.raises(DataError, match=said):
+            writer.append(bad, digest(good.counts))
+    with pytest.raises(DataError, match="preview"):
+        writer.append(good, digest(good.counts, preview_bin=2))
+    with pytest.raises(DataError, match="32-bit"):
+        writer.append(good, digest(good.counts), flags=-1)
+    with pytest.raises(ValueError, match="Status"):
+        writer.close("splendid")
+    assert (writer.rows, writer.committed) == (1, 1)
+    writer.close()
+    with pytest.raises(DataError, match="closed"):
+        writer.append(good, digest(good.counts))
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert {file[path].shape[0] for path in COLUMNS} == {1}
+        assert file["entry/instrument/detector/data"].shape[0] == 1
+
+
+def test_a_disk_that_takes_no_more_is_named_and_the_rows_before_stay(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer._table, "write", full)
+        with pytest.raises(DataError, match=r"No space left.*GB are free.*first 1 frames"):
+            writer.append(frames[1], digest(frames[1].counts))
+    with pytest.raises(DataError, match="earlier write failed"):
+        writer.append(frames[1], digest(frames[1].counts))
+    writer.close()
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.attributes["status"]) == (1, "failed")
+
+
+def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=3)
+    with open_scan(tmp_path / "s.h5", follow=True) as source:
+        seen = []
+        for frame in frames[:8]:
+            writer.append(frame, digest(frame.counts))
+            seen.append(source.refresh())
+        assert seen == [0, 0, 3, 3, 3, 6, 6, 6]
+        assert writer.committed == 6
+        assert not source.finished
+        with pytest.raises(IndexError, match=r"only 0\.\.5"):
+            source.read([6])
+        np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames[:6]])
+        np.testing.assert_array_equal(source.image_key, [2, 2, 1, 1, 1, 0])
+    writer.close()
+
+
+def follow_to_the_end(path: Path, opened: Event, result: multiprocessing.SimpleQueue[list[int]]) -> None:
+    """In another process: read what comes until the writer has finished."""
+    seen: list[int] = []
+    sums: list[int] = []
+    with open_scan(path, follow=True) as source:
+        opened.set()
+        while True:
+            finished = source.finished  # asked first: whatever is committed then is all there will be
+            n = source.refresh()
+            sums += [int(source.read([i]).sum()) for i in range(len(sums), n)]
+            seen.append(n)
+            if finished:
+                result.put([*sums, len(sums)])
+                return
+
+
+def test_a_follower_in_another_process_gets_every_frame(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    opened, result = spawn.Event(), spawn.SimpleQueue()
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    follower = spawn.Process(target=follow_to_the_end, args=(tmp_path / "s.h5", opened, result))
+    follower.start()
+    assert opened.wait(60)
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    writer.close()
+    assert writer.remarks == []  # the follower holds no lock: the /exchange view could be added
+    assert result.get() == [*(int(frame.counts.sum()) for frame in frames), len(frames)]
+    follower.join(60)
+    assert follower.exitcode == 0
+
+
+def write_and_wait(path: Path, written: Event) -> None:
+    """In another process: seven frames, the last two not flushed, then wait to be killed."""
+    writer = NXtomoWriter(path, INFO, SHAPE, clock=SystemClock(), flush_every=5)
+    for frame in scan_frames(np.random.default_rng(5))[:7]:
+        writer.append(frame, digest(frame.counts))
+    written.set()
+    multiprocessing.get_context("spawn").Event().wait()
+
+
+def test_a_killed_writer_leaves_the_flushed_frames(tmp_path: Path) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    written = spawn.Event()
+    writer = spawn.Process(target=write_and_wait, args=(tmp_path / "s.h5", written))
+    writer.start()
+    assert written.wait(60)
+    writer.kill()
+    writer.join(60)
+    expected = scan_frames(np.random.default_rng(5))[:5]
+    for follow in (True, False):
+        with open_scan(tmp_path / "s.h5", follow=follow) as source:
+            assert source.refresh() == 5
+            assert not source.finished
+            for found, frame in zip(source.frames(), expected, strict=True):
+                np.testing.assert_array_equal(found.counts, frame.counts)
+                assert (found.kind, found.trigger, found.time) == (frame.kind, frame.trigger, frame.time)
+
+
+def hold_open(path: Path, opened: Event, released: Event) -> None:
+    """In another process: a viewer that keeps the file open, with HDF5's own lock."""
+    with h5py.File(path, "r", swmr=True):
+        opened.set()
+        released.wait()
+
+
+def test_another_programs_lock_costs_the_view_and_nothing_else(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    opened, released = spawn.Event(), spawn.Event()
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+    viewer = spawn.Process(target=hold_open, args=(tmp_path / "s.h5", opened, released))
+    viewer.start()
+    assert opened.wait(60)
+    writer.close()
+    released.set()
+    viewer.join(60)
+    assert len(writer.remarks) == 1
+    assert "no /exchange view" in writer.remarks[0]
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "complete")
