@@ -1,0 +1,327 @@
+"""Serial line: framing, timeouts and finding the step again, on a wire that misbehaves; and over real port types."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+import serial
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.clock import SystemClock
+from drivers.errors import DeviceError, DeviceTimeout
+from drivers.serial_line import TRANSCRIPT_LINES, Probe, SerialLine
+from drivers.stages.pm16c import PM16CStage
+from simulators.clock import VirtualClock
+from simulators.serial_url import register
+from simulators.trigger_line import TriggerLine
+from simulators.wires.pm16c import PM16CController
+
+NAMES = (f"line-test-{number}" for number in itertools.count())
+NUMBER = r"-?\d+"
+
+
+class Echo:
+    """A device that answers "N?n" with n and "ID?" with "ECHO"; a test says what it sends instead, and when.
+
+    `spoil` maps the number of a request (from 0) to pieces (s after the request, bytes).
+    """
+
+    def __init__(self, spoil: dict[int, list[tuple[float, bytes]]] | None = None) -> None:
+        self.clock = VirtualClock(start=0.0)
+        self.heard: list[str] = []
+        self._spoil = spoil or {}
+        self._coming: list[tuple[float, bytes]] = []
+
+    def receive(self, data: bytes) -> None:
+        for line in data.decode().split("\r\n")[:-1]:
+            usual = {"ID?": "ECHO"}.get(line, line.removeprefix("N?")) if "?" in line else None
+            pieces = [(0.0, f"{usual}\r\n".encode())] if usual is not None else []
+            for delay, piece in self._spoil.get(len(self.heard), pieces):
+                self._coming.append((self.clock.now() + delay, piece))
+            self.heard.append(line)
+
+    def transmit(self) -> bytes:
+        due = [piece for time, piece in self._coming if time <= self.clock.now()]
+        self._coming = [(time, piece) for time, piece in self._coming if time > self.clock.now()]
+        return b"".join(due)
+
+
+def connect(echo: Echo, timeout: float = 1.0) -> SerialLine:
+    return SerialLine(
+        register(next(NAMES), echo),
+        device="echo",
+        probe=Probe("ID?", "ECHO"),
+        clock=echo.clock,
+        timeout=timeout,
+        baudrate=9600,
+        unsolicited="STOP[0-9A-F]",
+    )
+
+
+def ask(line: SerialLine, n: int) -> int:
+    return int(line.query(f"N?{n}", NUMBER, "a number", "Nothing has moved")[0])
+
+
+# in step
+
+
+@given(st.lists(st.integers(), max_size=10))
+def test_each_request_gets_its_own_reply(numbers: list[int]) -> None:
+    line = connect(Echo())
+    assert [ask(line, n) for n in numbers] == numbers
+
+
+def test_commands_without_a_reply_go_out_and_leave_the_line_in_step() -> None:
+    echo = Echo()
+    line = connect(echo)
+    line.send("GO")
+    assert ask(line, 5) == 5
+    assert echo.heard == ["GO", "N?5"]
+
+
+@given(st.lists(st.integers(1, 4), max_size=6))
+def test_a_reply_in_pieces_is_one_reply(sizes: list[int]) -> None:
+    whole, pieces = b"-12345\r\n", []
+    for k, size in enumerate(sizes):
+        pieces.append((0.1 * k, whole[:size]))
+        whole = whole[size:]
+    pieces.append((0.1 * len(sizes), whole))
+    assert ask(connect(Echo({0: pieces})), 0) == -12345
+
+
+def test_notes_that_nobody_asked_for_are_passed_over() -> None:
+    line = connect(Echo({0: [(0.0, b"STOPB\r\n7"), (0.1, b"7\r\nSTOP0\r\n")]}))
+    assert ask(line, 0) == 77
+    assert ask(line, 1) == 1
+
+
+def test_threads_do_not_take_each_others_replies() -> None:
+    line = connect(Echo())
+    wrong: list[int] = []
+
+    def many(first: int) -> None:
+        wrong.extend(n for n in range(first, first + 200) if ask(line, n) != n)
+
+    threads = [threading.Thread(target=many, args=(1000 * k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+# out of step
+
+
+def test_silence_is_a_timeout_that_says_all_there_is_to_know() -> None:
+    line = connect(Echo({0: []}), timeout=0.5)
+    with pytest.raises(DeviceTimeout) as error:
+        ask(line, 3)
+    assert (error.value.device, error.value.request, error.value.expected) == ("echo", "N?3", "a number")
+    assert "within 0.5 s" in str(error.value)
+    assert "Nothing has moved" in str(error.value)
+
+
+def test_the_timeout_is_for_the_whole_reply_however_it_trickles() -> None:
+    echo = Echo({0: [(0.3 * k, b"1") for k in range(100)]})
+    with pytest.raises(DeviceTimeout, match="Answered '1111'"):
+        ask(connect(echo, timeout=1.0), 3)
+    assert echo.clock.now() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_late_reply_is_not_taken_for_the_next_ones() -> None:
+    line = connect(Echo({0: [(1.3, b"111\r\n")]}))
+    with pytest.raises(DeviceTimeout):
+        ask(line, 111)
+    assert ask(line, 222) == 222
+    assert ask(line, 333) == 333
+
+
+def test_a_reply_so_late_that_it_comes_between_probe_and_answer_is_passed_over() -> None:
+    line = connect(Echo({0: [(1.2, b"111\r\n")], 1: [(0.4, b"ECHO\r\n")]}))
+    with pytest.raises(DeviceTimeout):
+        ask(line, 111)
+    assert ask(line, 222) == 222
+
+
+def test_a_late_answer_to_an_earlier_probe_is_not_left_behind() -> None:
+    """The probe itself timed out once: two answers to it come, the second must not meet the next request."""
+    line = connect(Echo({0: [], 1: [(1.04, b"ECHO\r\n")], 2: [(0.03, b"ECHO\r\n")]}))
+    for _ in range(2):
+        with pytest.raises(DeviceTimeout):
+            ask(line, 1)
+    assert ask(line, 2) == 2
+
+
+@pytest.mark.parametrize("reply", [b"\xff\x80garbage\r\n", b"\r\n", b"1 2\r\n", b"12\n\r\n", b"ECHO\r\n"])
+def test_a_reply_of_another_form_is_named_and_not_believed(reply: bytes) -> None:
+    echo = Echo({0: [(0.0, reply)]})
+    line = connect(echo)
+    with pytest.raises(DeviceError, match="does not have the form") as error:
+        ask(line, 1)
+    assert not isinstance(error.value, DeviceTimeout)
+    assert ask(line, 2) == 2
+    assert echo.heard == ["N?1", "ID?", "N?2"]
+
+
+def test_an_endless_line_is_given_up() -> None:
+    line = connect(Echo({0: [(0.0, b"x" * 5000)]}))
+    with pytest.raises(DeviceTimeout, match="no whole reply"):
+        ask(line, 1)
+    assert ask(line, 2) == 2
+
+
+def test_a_device_that_never_stops_sending_is_named() -> None:
+    line = connect(Echo({0: [(0.01 * k, b"x\r\n") for k in range(400)]}))
+    with pytest.raises(DeviceError):
+        ask(line, 1)
+    with pytest.raises(DeviceTimeout, match="without pause"):
+        ask(line, 2)
+
+
+def test_a_dead_device_is_named_again_at_each_request_until_it_answers() -> None:
+    line = connect(Echo({0: [], 1: [], 2: []}))
+    with pytest.raises(DeviceTimeout, match="no whole reply"):
+        ask(line, 1)
+    for _ in range(2):
+        with pytest.raises(DeviceTimeout, match="still no answer after an earlier failure"):
+            ask(line, 1)
+    assert ask(line, 4) == 4
+
+
+def test_a_command_without_reply_goes_out_at_once_even_out_of_step() -> None:
+    echo = Echo({0: []})
+    line = connect(echo)
+    with pytest.raises(DeviceTimeout):
+        ask(line, 1)
+    before = echo.clock.now()
+    line.send("STOP NOW")
+    assert (echo.heard[-1], echo.clock.now()) == ("STOP NOW", before)
+
+
+# the transcript
+
+
+def test_the_transcript_keeps_the_last_lines_with_their_times() -> None:
+    echo = Echo({0: [(0.25, b"5\r\n")]})
+    line = connect(echo)
+    ask(line, 5)
+    assert [(entry.mark, entry.text) for entry in line.transcript] == [(">", "N?5"), ("<", "5")]
+    assert line.transcript[1].time - line.transcript[0].time == pytest.approx(0.25, abs=0.06)
+    for n in range(TRANSCRIPT_LINES):
+        ask(line, n)
+    assert len(line.transcript) == TRANSCRIPT_LINES
+    assert line.transcript[-1].text == str(TRANSCRIPT_LINES - 1)
+
+
+# the port
+
+
+@pytest.mark.parametrize("url", ["sim://nobody", "nonsense://x", "/no/such/port", "socket://127.0.0.1:1"])
+def test_a_port_that_does_not_open_is_named(url: str) -> None:
+    with pytest.raises(DeviceError, match="does not open") as error:
+        SerialLine(url, device="d", probe=Probe("ID?", ""), clock=SystemClock(), timeout=0.1, baudrate=9600)
+    assert url in str(error.value)
+    assert "Nothing was sent" in str(error.value)
+
+
+def test_a_port_that_vanishes_is_named_on_reading_and_on_writing() -> None:
+    class Unplugged(Echo):
+        gone = False
+
+        def receive(self, data: bytes) -> None:
+            if self.gone:
+                raise serial.SerialException("device disconnected")
+            super().receive(data)
+            self.gone = True
+
+        def transmit(self) -> bytes:
+            if self.gone:
+                raise serial.SerialException("device disconnected")
+            return b""
+
+    line = connect(Unplugged())
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="port failed: device disconnected"):
+            ask(line, 1)
+    with pytest.raises(DeviceError, match="port failed: device disconnected"):
+        line.send("GO")
+
+
+def test_a_port_that_takes_no_bytes_is_a_timeout() -> None:
+    class Stuck(Echo):
+        def receive(self, data: bytes) -> None:
+            raise serial.SerialTimeoutException("write timeout")
+
+    with pytest.raises(DeviceTimeout, match="took no bytes"):
+        connect(Stuck()).send("GO")
+
+
+def serve(read: Callable[[], bytes], write: Callable[[bytes], object]) -> threading.Thread:
+    """A controller on real time behind any pair of byte functions, until reading gives nothing or fails."""
+    clock = SystemClock()
+    controller = PM16CController(clock, TriggerLine(clock))
+
+    def run() -> None:
+        with contextlib.suppress(OSError):
+            while data := read():
+                controller.receive(data)
+                write(controller.transmit())
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+@pytest.fixture
+def tcp() -> Iterator[str]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threads: list[threading.Thread] = []
+
+        def accept() -> None:
+            with server.accept()[0] as connection:
+                threads.append(serve(lambda: connection.recv(100), connection.sendall))
+                threads[0].join()
+
+        accepting = threading.Thread(target=accept, daemon=True)
+        accepting.start()
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+        accepting.join(5.0)
+
+
+@pytest.fixture
+def pty() -> Iterator[str]:
+    if sys.platform == "win32":
+        pytest.skip("Windows has no pseudo-terminals that pyserial opens")
+    import tty
+
+    master, slave = os.openpty()
+    tty.setraw(master)
+    serve(lambda: os.read(master, 100), lambda data: os.write(master, data))
+    yield os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "pty"])
+def test_the_same_driver_runs_over_a_socket_and_a_terminal(kind: str, request: pytest.FixtureRequest) -> None:
+    stage = PM16CStage(
+        request.getfixturevalue(kind),
+        counts_per_turn=360_000,
+        clock=SystemClock(),
+        max_speed=0.5,
+        acceleration=1.0,
+        low=-1.0,
+        high=1.0,
+    )
+    stage.start_move(stage.to_angle(100), 0.1)
+    assert stage.wait(5.0) == stage.to_angle(100)
+    stage.close()
