@@ -125,7 +125,7 @@ def _rounding(facts: Facts) -> Iterator[str]:
     count = 2 * math.pi / stage.counts_per_turn
     yield (
         f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; triggers fall on whole counts, so "
-        f"it becomes {flight.interval} counts = {degrees(flight.interval * count)}, which moves views by up to "
+        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, which moves views by up to "
         f"{degrees(flight.drift)}; the file holds the angles that were triggered"
     )
 

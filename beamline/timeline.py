@@ -78,12 +78,12 @@ def work_out(
     )
 
 
-def taxi_angle(speed: float, acceleration: float, interval: float) -> float:
-    """Run-up in radians: whole pulse intervals, at least half a one more than it takes to reach `speed`.
+def taxi_angle(speed: float, acceleration: float, step: float) -> float:
+    """Run-up in radians: whole angular steps, at least half a one more than it takes to reach `speed`.
 
-    ceil(accel distance / interval + 0.5) intervals, as tomoscan plans it; so the speed is steady at the first pulse.
+    ceil(accel distance / step + 0.5) steps, as tomoscan plans it; so the speed is steady at the first pulse.
     """
-    return math.ceil(speed**2 / (2 * acceleration) / interval + 0.5) * interval
+    return math.ceil(speed**2 / (2 * acceleration) / step + 0.5) * step
 
 
 def move_seconds(distance: float, speed: float, acceleration: float) -> float:
@@ -153,9 +153,8 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     angles = scale.angles(counts)
     if flight is None:
         return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period)
-    interval = flight.interval * abs(scale.per_count)
-    speed = interval / plan.period
-    taxi = taxi_angle(speed, stage.acceleration, interval)
+    speed = flight.interval * abs(scale.per_count) / plan.period
+    taxi = taxi_angle(speed, stage.acceleration, flight.step * abs(scale.per_count))
     return Block(
         FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, plan.period, flight.trains, speed=speed, taxi=taxi
     )
@@ -200,7 +199,7 @@ def describe(
     rows, cols = camera.shape
     facts = [("views", f"{views.n}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:
-        passes = f", {len(views.trains)} passes" if len(views.trains) > 1 else ""
+        passes = f" in each of {len(views.trains)} passes" if len(views.trains) > 1 else ""
         facts += [
             ("step", f"{degrees(timeline.step)} = {timeline.step_counts} counts of {degrees(_count(stage))}{passes}"),
             ("speed", f"{degrees(views.speed)}/s (the stage's most {degrees(stage.max_speed)}/s)"),

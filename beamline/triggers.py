@@ -37,12 +37,14 @@ class Flight:
     Attributes:
         trains: one a pass, in the order of the views.
         interval: whole counts between neighbouring pulses of a pass (positive).
-        exact: what the interval would be without rounding.
+        step: whole counts between neighbouring angles of all passes together.
+        exact: what the step would be without rounding.
         drift: radians by which the rounding moves the view that it moves most.
     """
 
     trains: tuple[TriggerTrain, ...]
     interval: int
+    step: int
     exact: float
     drift: float
 
@@ -81,9 +83,8 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
             "the views do not come in passes of equal steps, so a turning stage cannot trigger them in this order; "
             "use scan.mode: step, or a fixed, sector or interlaced plan"
         )
-    interval = spacing.pop()
     drift = float(np.abs(scale.angles(counts) - angles).max())
-    return Flight(tuple(runs), interval, exact * interval / whole, drift)
+    return Flight(tuple(runs), spacing.pop(), whole, exact, drift)
 
 
 def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int64], float]:

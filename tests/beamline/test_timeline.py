@@ -133,7 +133,8 @@ def test_rows_are_contiguous_and_every_view_has_its_pulse(
     assert [train.end for train in block.trains][-1] == pulses[-1]
     # Between pulses of a pass exactly one period goes by; the run-up suffices to reach that speed before the first.
     assert block.speed * period == pytest.approx(timeline.step)
-    assert block.taxi >= block.speed**2 / (2 * STAGE.acceleration) + timeline.step / 2 - 1e-12
+    lattice = timeline.step / len(block.trains)
+    assert block.taxi >= block.speed**2 / (2 * STAGE.acceleration) + lattice / 2 - 1e-12
     assert timeline.step == pytest.approx(timeline.step_counts * math.pi / 180_000)
 
 

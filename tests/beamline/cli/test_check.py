@@ -1,0 +1,93 @@
+"""`beamline check`: the verdict, the figures, and exit code 2 with nothing moved or written."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline import config
+from beamline.cli.main import main
+
+DEMO = str(config.config_folder() / "demo.yaml")
+REPOSITORY = Path(__file__).parents[3]
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["check", *arguments])
+
+
+def test_a_good_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run(DEMO)
+    assert (result.exit_code, result.stderr) == (0, "")
+    for part in ("20-199", "1° = 1000 counts of 0.001°", "10°/s", "taxi", "blur", "skew", "0:00:2", "free", "is good"):
+        assert part in result.stdout
+    assert list(tmp_path.iterdir()) == []  # no run folder, nothing
+
+
+def test_json_is_one_event() -> None:
+    result = run(DEMO, "--json")
+    assert result.exit_code == 0
+    (line,) = result.stdout.splitlines()
+    event = json.loads(line)
+    assert event["event"] == "done"
+    assert (event["n_frames"], event["step_counts"]) == (210, 1000)
+    assert event["total_bytes"] == 210 * 144 * 160 * 2
+    assert sum(block["n"] for block in event["blocks"]) == 210
+    assert event["free_bytes"] > 0
+
+
+def test_violations() -> None:
+    broken = ("--set", "scan.period_s=0.02", "--set", "scan.angles.start_deg=190")
+    result = run(DEMO, *broken)
+    assert result.exit_code == 2
+    assert "is good" not in result.stdout
+    assert "VIOLATION period_s 0.02 is below the camera's least" in result.stdout
+    assert "limits are violated, nothing was started" in result.stderr
+    result = run(DEMO, "--json", *broken)
+    assert result.exit_code == 2
+    (line,) = result.stdout.splitlines()
+    event = json.loads(line)
+    assert (event["event"], event["exit_code"]) == ("failed", 2)
+    assert "period_s 0.02" in event["message"]
+
+
+def test_one_violation_is_one_sentence() -> None:
+    result = run(DEMO, "--set", "scan.flats.count=0")
+    assert result.exit_code == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "a limit is violated, nothing was started: no flats" in result.stderr
+
+
+def test_configuration_faults(tmp_path: Path) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text(Path(DEMO).read_text(encoding="utf-8").replace("period_s", "perod_s"), encoding="utf-8")
+    result = run(str(path))
+    assert result.exit_code == 2
+    assert f"{path}:7: scan.perod_s is not a known key (did you mean period_s?)" in result.stderr
+    assert result.stdout == ""
+    event = json.loads(run(str(path), "--json").stdout)
+    assert (event["event"], event["exit_code"]) == ("failed", 2)
+
+
+def test_usage() -> None:
+    assert run().exit_code == 2
+    assert run("absent.yaml").exit_code == 2
+
+
+def test_as_a_process_without_devices() -> None:
+    """The instrument's configuration is checked where there is neither a port nor a camera."""
+    path = config.config_folder() / "instrument.yaml"
+    command = [sys.executable, "-m", "beamline.cli.main", "check", str(path), "--set", "scan.exposure_s=-1"]
+    done = subprocess.run(
+        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60, env={**os.environ, "PYTHONUTF8": "1"}
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("beamline: --set scan.exposure_s=-1: scan.exposure_s is -1; expected a number > 0")
+    assert "Traceback" not in done.stderr

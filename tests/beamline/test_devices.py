@@ -1,0 +1,311 @@
+"""Composition root: a configuration becomes devices that scan, on a virtual clock, from trigger to the right angle."""
+
+from __future__ import annotations
+
+import io
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline import config, devices
+from beamline.config_models import Config
+from beamline.dry_run import dry_run, free_bytes
+from beamline.errors import ConfigError
+from beamline.plan import Block
+from beamline.timeline import pass_ends
+from drivers.clock import SystemClock
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.frame import FrameKind
+from drivers.manual import ManualSampleMover, ManualShutter
+from drivers.protocols import TriggerSource
+from recon.geometry import Geometry
+from recon.volume import Grid
+from simulators.clock import ScaledClock, VirtualClock
+from simulators.phantom import Detector
+from simulators.scene import load_scene
+
+REPOSITORY = Path(__file__).parents[2]
+# A ball off the axis and no effects: every frame is Beer-Lambert, so that its angle can be read off the picture.
+BALL = {
+    "phantom": {
+        "kind": "solids",
+        "solids": [
+            {"kind": "ellipsoid", "semi_axes": [0.02, 0.02, 0.02], "attenuation": 30.0, "centre": [0.06, 0, 0.01]}
+        ],
+    },
+    "beam": {"photons_per_s": 1.0e5},
+}
+
+
+def shipped(name: str, *overrides: str) -> Config:
+    return config.load(config.config_folder() / f"{name}.yaml", overrides, {})
+
+
+def small(*overrides: str) -> Config:
+    loaded = shipped("simulated", "devices.camera.roi=[1136, 2028, 32, 40]", "simulation.clock=virtual", *overrides)
+    simulation = loaded.simulation.model_copy(update={"scene": BALL})  # type: ignore[union-attr]
+    return loaded.model_copy(update={"simulation": simulation})
+
+
+def fly(bench: devices.Bench, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:
+    """The block's passes by hand, as acquisition does it: framestamps and counts [frame, row, col]."""
+    stage, camera = bench.devices.stage, bench.devices.camera
+    camera.configure(devices.camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))
+    stamps, images = [], []
+    camera.arm(block.n)
+    for train, (start, stop) in zip(block.trains, pass_ends(block), strict=True):
+        stage.start_move(start, stage.limits.max_speed)
+        stage.wait(60.0)
+        stage.arm(train)
+        stage.start_move(stop, block.speed)
+        for _ in range(train.n):
+            frame = camera.next_frame(10.0)
+            stamps.append(frame.framestamp)
+            images.append(frame.counts)
+        stage.wait(60.0)
+    camera.disarm()
+    return stamps, np.array(images)
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        "{scheme: fixed, views: 24}",
+        "{scheme: fixed, views: 12, start_deg: 180, span_deg: -180}",
+        "{scheme: interlaced, views: 24, passes: 4}",
+        "{scheme: sector, views: 13, first_deg: 30, last_deg: 150}",
+    ],
+)
+def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
+    settings = small(f"scan.angles={angles}", "scan.period_s=2", "devices.stage.low_deg=-20")
+    worked = dry_run(settings)
+    assert worked.timeline.violations == ()
+    block = next(b for b in worked.timeline.blocks if b.kind is FrameKind.PROJECTION)
+    with devices.connect(settings) as bench:
+        assert isinstance(bench.clock, VirtualClock)
+        bench.devices.shutter.open()
+        stamps, images = fly(bench, block, settings)
+    assert stamps == list(range(block.n))
+    # The ball's shadow stands at u = x cos(angle) on a detector of 4.6 um pixels whose middle is the axis.
+    u = (np.arange(40) - 19.5) * 4.6e-3
+    depth = -np.log(np.maximum(images, 1) / (1e5 * 0.05 / 0.107))
+    centre = (depth.clip(0.05) - 0.05).sum(axis=1) @ u / (depth.clip(0.05) - 0.05).sum(axis=(1, 2))
+    np.testing.assert_allclose(centre, 0.06 * np.cos(block.angles), atol=2e-4)
+    # And each picture is the scene's at that angle, to the rounding of a count; a tenth of a step would show.
+    scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
+    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.line_integrals(a, detector)) for a in block.angles])
+    assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
+
+
+def test_step_darks_and_flats() -> None:
+    settings = small()
+    with devices.connect(settings) as bench:
+        stage, camera, shutter, sample = (
+            getattr(bench.devices, name) for name in ("stage", "camera", "shutter", "sample")
+        )
+        camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
+        camera.arm(3)
+
+        def shot() -> np.ndarray:
+            bench.clock.sleep(camera.timing.min_period)
+            camera.software_trigger()
+            return camera.next_frame(1.0).counts
+
+        stage.start_move(math.pi / 2, stage.limits.max_speed)
+        assert stage.wait(60.0) == pytest.approx(math.pi / 2, abs=1e-5)
+        dark = shot()
+        shutter.open()
+        view = shot()
+        sample.out()
+        flat = shot()
+    assert dark.max() == 0
+    assert flat.min() == flat.max() == round(1e5 * 0.05 / 0.107)
+    assert view.min() < 0.5 * flat.min()
+
+
+@pytest.mark.parametrize("name", ["simulated", "demo"])
+def test_dry_run_figures_are_what_the_devices_say(name: str) -> None:
+    """`describe` asks nobody, yet must agree with the stage and the camera once they are there."""
+    settings = shipped(name, "simulation.clock=virtual", "devices.stage.acceleration_deg_s2=55")
+    limits, timing, to_counts = devices.describe(settings)
+    with devices.connect(settings) as bench:
+        stage, camera = bench.devices.stage, bench.devices.camera
+        camera.configure(devices.camera_settings(settings, settings.scan.exposure_s, TriggerSource.EXTERNAL))
+        assert stage.limits == limits
+        assert camera.timing == timing
+        assert [to_counts(a) for a in (-0.1, 0, 1, 6.3)] == [stage.to_counts(a) for a in (-0.1, 0, 1, 6.3)]
+    assert math.degrees(limits.acceleration) <= 55  # the controller has only certain accelerations
+
+
+@pytest.mark.parametrize("name", ["simulated", "instrument", "demo"])
+def test_shipped_scans_may_start(name: str) -> None:
+    worked = dry_run(shipped(name, f"storage.folder={REPOSITORY.as_posix()}"))
+    assert [v for v in worked.timeline.violations if "disk" not in v] == []
+    assert worked.timeline.blur_px < 1
+    if name == "demo":
+        views = next(b for b in worked.timeline.blocks if b.kind is FrameKind.PROJECTION)
+        assert views.n == 180
+        assert worked.timeline.duration < 25
+        assert settings_clock(shipped(name)) is SystemClock
+
+
+def settings_clock(settings: Config) -> type:
+    with devices.connect(settings) as bench:
+        return type(bench.clock)
+
+
+def test_clocks() -> None:
+    assert settings_clock(shipped("demo", "simulation.clock=virtual")) is VirtualClock
+    assert settings_clock(shipped("demo", "simulation.clock={speed: 4}")) is ScaledClock
+    given = VirtualClock(5.0)
+    with devices.connect(shipped("demo"), given) as bench:
+        assert bench.clock is given
+
+
+def test_benches_do_not_share_a_controller() -> None:
+    settings = small()
+    with devices.connect(settings) as one, devices.connect(settings) as two:
+        one.devices.stage.start_move(1.0, one.devices.stage.limits.max_speed)
+        one.devices.stage.wait(60.0)
+        assert one.devices.stage.position() == pytest.approx(1.0, abs=1e-4)
+        assert two.devices.stage.position() == 0.0
+
+
+def test_close_frees_everything_twice() -> None:
+    bench = devices.connect(small())
+    bench.close()
+    bench.close()
+    with pytest.raises(DeviceError):
+        bench.devices.stage.position()
+    with pytest.raises(DeviceError):
+        bench.devices.camera.arm(1)
+
+
+def test_truth_lies_where_a_reconstruction_puts_it() -> None:
+    """A region off the sensor's middle: z counts from the middle of the rows that were read."""
+    settings = small("devices.camera.roi=[1136, 2020, 40, 56]")  # its rows' middle is 4 rows above the sensor's
+    with devices.connect(settings) as bench:
+        bench.devices.camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
+        assert bench.truth is not None
+        volume = bench.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), 4.6e-3)))
+    z, y, x = (
+        float((volume.data.sum(axis=axes) * at).sum() / volume.data.sum())
+        for axes, at in zip(((1, 2), (0, 2), (0, 1)), volume.grid.coordinates(), strict=True)
+    )
+    assert (x, y) == (pytest.approx(0.06, abs=1e-4), pytest.approx(0, abs=1e-4))
+    # Rows 1136 ... 1175 have their middle at 1155.5, the sensor at 1151.5: z of the ball falls by 4 pixels.
+    assert z == pytest.approx(0.01 - 4 * 4.6e-3, abs=1e-4)
+    # A ball of 0.02 mm radius and 30 / mm.
+    assert volume.data.sum() * 4.6e-3**3 == pytest.approx(30 * 4 / 3 * math.pi * 0.02**3, rel=0.01)
+
+
+def test_settings_that_a_device_would_refuse() -> None:
+    for change, message in (
+        ("devices.camera.roi=[0, 0, 30, 40]", "devices.camera: roi .* must be in steps of 4"),
+        ("scan.exposure_s=1e-7", "devices.camera: exposure 1e-07 s lies outside"),
+        ("devices.stage.acceleration_deg_s2=0.001", "devices.stage.acceleration_deg_s2: .*gentl"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            devices.describe(small(change))
+    wrong = small().model_copy(
+        update={
+            "simulation": config.load(  # a scene that is none
+                config.config_folder() / "simulated.yaml", ("simulation.scene={phantom: 7}",), {}
+            ).simulation
+        }
+    )
+    for call in (devices.describe, devices.connect):
+        with pytest.raises(ConfigError, match=r"simulation\.scene: "):
+            call(wrong)
+    with pytest.raises(ConfigError, match=r"monitor\.thresholds names a check 'beem'"):
+        dry_run(small("monitor.thresholds={beem: {warn: 1}}"))
+
+
+class _Stage:
+    """Stands in for a stage on a port that this computer has not."""
+
+    name = "stage"
+
+    def __init__(self) -> None:
+        self.closed = 0
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stage is freed where the camera does not open; shutter and sample are the operator's."""
+    stage, made = _Stage(), []
+    monkeypatch.setattr(devices, "_stage", lambda *args: stage)
+    with pytest.raises(DeviceError, match="camera"):
+        devices.connect(shipped("instrument", "devices.camera.library=/nowhere/libdcamapi.so"))
+    assert stage.closed == 1
+
+    class Camera(_Stage):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__()
+            made.append((args, kwargs))
+
+    monkeypatch.setattr("drivers.dcam.camera.DcamCamera", Camera)
+    asked: list[str] = []
+    bench = devices.connect(shipped("instrument", "devices.camera.index=1"), ask=asked.append)
+    assert made[0][0] == (None, 1)
+    assert isinstance(bench.devices.shutter, ManualShutter)
+    assert isinstance(bench.devices.sample, ManualSampleMover)
+    assert bench.truth is None
+    bench.devices.shutter.open()
+    assert asked == ["Open the beam shutter."]
+    bench.close()
+    assert stage.closed == 2
+
+
+def test_a_port_that_is_not_there() -> None:
+    with pytest.raises(DeviceError, match="COM_NONE"):
+        devices.connect(shipped("instrument", "devices.stage.port=COM_NONE"))
+
+
+def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    with pytest.raises(DeviceError, match="no terminal to ask at"):
+        devices.ask_operator("Open the beam shutter.")
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stdin", Terminal("\n"))
+    devices.ask_operator("Open the beam shutter.")
+    captured = capsys.readouterr()
+    assert captured.out.strip() == ""  # stdout is for results
+
+
+def test_limits_hold() -> None:
+    with devices.connect(small("devices.stage.high_deg=90")) as bench, pytest.raises(DeviceRefused):
+        bench.devices.stage.start_move(math.pi, 0.1)
+
+
+def test_instrument_loads_no_simulator_and_a_dry_run_no_vendor_library() -> None:
+    code = (
+        "import sys; from beamline import config; from beamline.dry_run import dry_run;"
+        "d = dry_run(config.load(config.config_folder() / 'instrument.yaml', (), {})); assert d.lines();"
+        "bad = [m for m in sys.modules if m.startswith(('simulators', 'drivers.dcam', 'torch'))]; assert not bad, bad"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+def test_room_on_a_disk_for_a_folder_that_is_not_there_yet(tmp_path: Path) -> None:
+    assert free_bytes(tmp_path / "a" / "b") > 0
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_coarse_stage_is_planned_on_its_counts() -> None:
+    settings = small("devices.stage.counts_per_turn=36000", "scan.angles={scheme: fixed, views: 70}")
+    worked = dry_run(settings)
+    assert worked.timeline.step_counts == 257  # of 257.14
+    assert any("257.143 counts" in remark for remark in worked.timeline.remarks)
