@@ -43,9 +43,10 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
     problems = []
-    # Without a lock: a follower must not stop the writer from adding the /exchange view at the end. A writer in this
-    # same process shares its file with us, and then HDF5 wants the same locking of both.
-    for swmr, locking in ((follow, False), (not follow, False), (True, None)):
+    # A follower takes no lock, so as not to stop the writer from adding the /exchange view at the end; but a writer in
+    # this same process shares its file with us, and then HDF5 wants the same locking of both.
+    growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
+    for swmr, locking in (growing, whole, shared) if follow else (whole, growing, shared):
         try:
             return h5py.File(path, "r", swmr=swmr, locking=locking)
         except (OSError, ValueError) as error:

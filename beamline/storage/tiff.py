@@ -8,8 +8,10 @@ listing. Pages and files are read one at a time, so that memory does not grow wi
 from __future__ import annotations
 
 import io
+import logging
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -25,7 +27,24 @@ from drivers.frame import Frame, FrameKind
 SUFFIXES = (".tif", ".tiff")
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
-UNREADABLE = (tifffile.TiffFileError, OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile)
+UNREADABLE = (tifffile.TiffFileError, OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+class _Complaints(logging.Handler):
+    """What tifffile says about a damaged file: it logs that, and goes on with the pages that it finds."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.said: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.said.append(record.getMessage())
+
+    def __enter__(self) -> None:
+        logging.getLogger("tifffile").addHandler(self)
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("tifffile").removeHandler(self)
 
 
 class TiffStack:
@@ -40,32 +59,41 @@ class TiffStack:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            self._tif = tifffile.TiffFile(path)
-        except UNREADABLE as error:
-            raise DataError(f"{path} cannot be read as TIFF ({error}).") from error
-        try:
-            series = self._tif.series[0]
-            if len(series.shape) not in (2, 3) or len(self._tif.series) != 1:
-                raise DataError(
-                    f"{path} holds {', '.join(str(part.shape) for part in self._tif.series)}; "
-                    "expected one stack of grey images [page, row, col]."
-                )
-            n = 1 if len(series.shape) == 2 else int(series.shape[0])
-            self.shape = (int(series.shape[-2]), int(series.shape[-1]))
-            self.dtype: np.dtype[Any] = np.dtype(series.dtype)
-            # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
-            self._offset = series.dataoffset
-            self._stored = self.dtype.newbyteorder(self._tif.byteorder)
-        except BaseException:
+        complaints = _Complaints()
+        with complaints:
+            try:
+                self._tif = tifffile.TiffFile(path)
+            except UNREADABLE as error:
+                raise DataError(f"{path} cannot be read as TIFF ({error}).") from error
+            try:
+                n = self._look()
+            except UNREADABLE as error:
+                complaints.said.append(str(error))
+            except BaseException:
+                self._tif.close()
+                raise
+        if complaints.said:
             self._tif.close()
-            raise
+            raise DataError(f"{path} cannot be read whole: it is cut or damaged ({complaints.said[0]}).")
         self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
         self.angles = np.full(n, np.nan)
         self.attributes: dict[str, str | float | int] = {
             "pages": len(self._tif.pages),
             "bigtiff": "yes" if self._tif.is_bigtiff else "no",
         }
+
+    def _look(self) -> int:
+        """Shape, type and place of the frames, and how many there are."""
+        series = self._tif.series[0]
+        if len(series.shape) not in (2, 3) or len(self._tif.series) != 1:
+            shapes = ", ".join(str(part.shape) for part in self._tif.series)
+            raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
+        self.shape = (int(series.shape[-2]), int(series.shape[-1]))
+        self.dtype: np.dtype[Any] = np.dtype(series.dtype)
+        # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
+        self._offset = series.dataoffset
+        self._stored = self.dtype.newbyteorder(self._tif.byteorder)
+        return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the pages asked for, in that order."""
