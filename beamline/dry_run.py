@@ -55,14 +55,6 @@ class DryRun:
             ],
         }
 
-    def refuse_violations(self) -> None:
-        """Raises ConfigError with every broken limit, where there is one."""
-        broken = self.timeline.violations
-        if len(broken) == 1:
-            raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
-        if broken:
-            raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
-
 
 def dry_run(settings: Config) -> DryRun:
     """Work a configuration out.
@@ -77,6 +69,15 @@ def dry_run(settings: Config) -> DryRun:
     free = free_bytes(Path(settings.storage.folder))
     worked = timeline.work_out(plan, stage, to_counts, camera, axis_col=settings.optics.axis_col, free_bytes=free)
     return DryRun(plan, worked, stage, camera, free)
+
+
+def refuse_violations(worked: Timeline) -> None:
+    """Raises ConfigError with every broken limit, where there is one."""
+    broken = worked.violations
+    if len(broken) == 1:
+        raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
+    if broken:
+        raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
 
 
 def free_bytes(folder: Path) -> int:

@@ -55,9 +55,15 @@ def remarks(facts: Facts) -> Iterator[str]:
     """One sentence for each thing worth knowing."""
     plan, camera = facts.plan, facts.camera
     yield from _rounding(facts)
-    if plan.mode is Mode.FLY and camera.min_period <= plan.period < MARGIN * camera.min_period:
+    period = facts.views.period
+    if facts.flight and abs(period - plan.period) > 1e-3 * plan.period:
         yield (
-            f"a trigger every {plan.period:.6g} s leaves less than 1 % over the camera's least "
+            f"period_s {plan.period:g} would be {facts.flight.interval / plan.period:.6g} counts/s of the stage; it "
+            f"turns at {facts.flight.interval / period:.6g}, so that views come every {period:.6g} s"
+        )
+    if plan.mode is Mode.FLY and camera.min_period <= period < MARGIN * camera.min_period:
+        yield (
+            f"a trigger every {period:.6g} s leaves less than 1 % over the camera's least "
             f"{camera.min_period:.6g} s; a pulse that comes early is ignored without a word"
         )
     if facts.blur_px > 1:
@@ -82,22 +88,28 @@ def remarks(facts: Facts) -> Iterator[str]:
 
 
 def _timing(facts: Facts) -> Iterator[str]:
-    plan, camera = facts.plan, facts.camera
-    if plan.exposure > plan.period:
+    plan, camera, period = facts.plan, facts.camera, facts.views.period
+    if plan.exposure > period:
         yield (
-            f"exposure_s {plan.exposure:g} is longer than period_s {plan.period:g}; "
+            f"exposure_s {plan.exposure:g} is longer than period_s {period:.4g}; "
             "shorten the exposure or lengthen the period"
         )
-    if plan.period < camera.min_period:
+    if period < camera.min_period:
         rows, cols = camera.shape
         yield (
-            f"period_s {plan.period:g} is below the camera's least {camera.min_period:.6g} s between triggers "
+            f"period_s {period:.4g} is below the camera's least {camera.min_period:.6g} s between triggers "
             f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= "
             f"{_up(camera.min_period * MARGIN):g}, expose shorter or read fewer pixels"
         )
 
 
 def _speed(facts: Facts) -> Iterator[str]:
+    if facts.flight and facts.flight.interval / facts.plan.period < 0.5:
+        slowest = facts.flight.interval
+        yield (
+            f"a view every {facts.plan.period:g} s is less than a count a second of the stage; "
+            f"set scan.period_s <= {slowest:g}, take fewer views, or use scan.mode: step"
+        )
     if facts.views.speed > facts.stage.max_speed * (1 + 1e-9):
         period = facts.plan.period * facts.views.speed / facts.stage.max_speed
         yield (

@@ -28,10 +28,11 @@ def work_out(
 ) -> Timeline:
     """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
 
-    Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, starts far
-    enough before the first pulse to reach that speed (`taxi_angle`) and goes as far beyond the last; several passes
-    all go the same way, with a return at full speed between them. The duration counts from the moment the stage
-    stands at its zero to its return to the first view, without shutter and sample moves.
+    Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, rounded to whole
+    counts a second (the views' block has the period that comes of it); it starts far enough before the first pulse to
+    reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return
+    at full speed between them. The duration counts from the moment the stage stands at its zero to its return to the
+    first view, without shutter and sample moves.
 
     Args:
         to_counts: the stage's conversion of radians to whole counts.
@@ -153,10 +154,12 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     angles = scale.angles(counts)
     if flight is None:
         return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period)
-    speed = flight.interval * abs(scale.per_count) / plan.period
+    # A pulse generator's speed is a whole number of counts a second, so the period becomes one that this gives.
+    rate = max(1, round(flight.interval / plan.period))
+    speed, period = rate * abs(scale.per_count), flight.interval / rate
     taxi = taxi_angle(speed, stage.acceleration, flight.step * abs(scale.per_count))
     return Block(
-        FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, plan.period, flight.trains, speed=speed, taxi=taxi
+        FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, period, flight.trains, speed=speed, taxi=taxi
     )
 
 

@@ -11,7 +11,7 @@ import click
 
 from beamline.cli.config import OVERRIDE_HELP
 from beamline.config import load
-from beamline.dry_run import dry_run
+from beamline.dry_run import dry_run, refuse_violations
 from beamline.errors import ConfigError
 from beamline.events import Event, JsonLines
 from drivers.clock import SystemClock
@@ -31,7 +31,7 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
         worked = dry_run(load(file, overrides))
         if not as_json:
             click.echo("\n".join(worked.lines()))
-        worked.refuse_violations()
+        refuse_violations(worked.timeline)
     except ConfigError as error:
         if as_json:
             _tell("failed", {"message": str(error), "exit_code": error.exit_code})

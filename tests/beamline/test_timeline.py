@@ -131,8 +131,12 @@ def test_rows_are_contiguous_and_every_view_has_its_pulse(
     np.testing.assert_allclose(block.angles, np.array(pulses) * math.pi / 180_000, atol=1e-9)
     assert np.abs(block.angles - theta).max() <= (views + 1) * math.pi / 360_000 + 1e-9
     assert [train.end for train in block.trains][-1] == pulses[-1]
-    # Between pulses of a pass exactly one period goes by; the run-up suffices to reach that speed before the first.
-    assert block.speed * period == pytest.approx(timeline.step)
+    # Between pulses of a pass exactly one period goes by, and the speed is a whole number of counts a second, the
+    # nearest one; the run-up suffices to reach that speed before the first pulse.
+    assert block.speed * block.period == pytest.approx(timeline.step)
+    rate = block.speed / (math.pi / 180_000)
+    assert rate == pytest.approx(round(rate))
+    assert abs(rate - timeline.step_counts / period) <= 0.5 + 1e-6
     lattice = timeline.step / len(block.trains)
     assert block.taxi >= block.speed**2 / (2 * STAGE.acceleration) + lattice / 2 - 1e-12
     assert timeline.step == pytest.approx(timeline.step_counts * math.pi / 180_000)
@@ -174,8 +178,9 @@ def test_no_violation_means_that_nothing_is_broken(
     first, last = block.angles[0], block.angles[-1]
     half_count = math.pi / 360_000
     broken = [
-        exposure > period,
-        period < camera.min_period,
+        exposure > block.period,
+        block.period < camera.min_period,
+        timeline.step_counts / period < 0.5,
         block.speed > STAGE.max_speed,
         first - block.taxi < STAGE.low - half_count or last + block.taxi > STAGE.high + half_count,
         timeline.total_bytes * 1.1 > free,
@@ -192,6 +197,7 @@ VIOLATIONS = {
     ),
     "start": ({"angles": angles.fixed(360, -5 * DEG)}, "go from -5.5° to 175° (with 0.5° of taxi at each end)"),
     "end": ({"angles": angles.fixed(360, 186 * DEG)}, "limits are -5° ... 365°"),
+    "slow": ({"period": 2000.0}, "less than a count a second of the stage; set scan.period_s <= 500"),
     "step beyond": ({"angles": np.array([0.0, 7.0]), "mode": Mode.STEP}, "go from 0° to 401.07°, its limits"),
     "unequal": ({"angles": angles.golden(100)}, "not equally spaced"),
     "one view": ({"angles": np.zeros(1)}, "at least 2 views"),
@@ -231,6 +237,10 @@ REMARKS = {
         {"angles": angles.fixed(181), "period": 0.2},
         "the step of 0.994475° is 994.475 counts; triggers fall on whole counts, so it becomes 994 counts = 0.994°, "
         "which moves views by up to 0.0855",
+    ),
+    "whole counts a second": (
+        {"angles": angles.fixed(36_000), "period": 0.6},
+        "period_s 0.6 would be 8.33333 counts/s of the stage; it turns at 8, so that views come every 0.625 s",
     ),
     "margin": ({"period": 0.0512}, "less than 1 % over the camera's least 0.051 s"),
     "few views": ({"angles": angles.fixed(180)}, "180 views are fewer than pi/2 x 252 columns = 396"),
