@@ -125,6 +125,7 @@ _ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
         "dcamprop_getattr": (c_void_p, POINTER(PropAttr)),
         "dcamprop_getvalue": (c_void_p, c_int32, POINTER(c_double)),
         "dcamprop_setvalue": (c_void_p, c_int32, c_double),
+        "dcamprop_queryvalue": (c_void_p, c_int32, POINTER(c_double), c_int32),
         "dcambuf_alloc": (c_void_p, c_int32),
         "dcambuf_release": (c_void_p, c_int32),
         "dcambuf_lockframe": (c_void_p, POINTER(BufFrame)),
@@ -239,6 +240,12 @@ class Dcam:
 
     def prop_setvalue(self, camera: int, prop: Property, value: float) -> None:
         self._call("dcamprop_setvalue", camera, prop, value, detail=f"{prop.name} = {value:g}")
+
+    def prop_queryvalue(self, camera: int, prop: Property, value: float, option: int) -> float:
+        """The legal value that stands to `value` as `option` says; an error where there is none."""
+        answer = c_double(value)
+        self._call("dcamprop_queryvalue", camera, prop, byref(answer), option, detail=prop.name)
+        return answer.value
 
     def buf_alloc(self, camera: int, frames: int) -> None:
         """A ring of `frames` in the library's memory; the properties that shape frames are locked until release."""

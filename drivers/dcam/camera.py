@@ -94,7 +94,7 @@ class DcamCamera:
         """
         self._require_open()
         if self._capture is not None:
-            raise DeviceRefused(self.name, "it is armed", advice="Disarm it before changing settings")
+            raise DeviceRefused(self.name, "it is armed and takes no settings", advice="disarm() it first")
         try:
             self._properties.apply(settings)
         except DeviceRefused:
@@ -116,9 +116,9 @@ class DcamCamera:
         """
         self._require_open()
         if self._capture is not None:
-            raise DeviceRefused(self.name, "it is armed already", advice="Disarm it first")
+            raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
         if n_frames < 1:
-            raise DeviceRefused(self.name, f"it cannot be armed for {n_frames} frames", expected="at least 1")
+            raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
         # One slot more than frames: the oldest slot of a full ring may be half overwritten at any moment.
         fitting = self._ring_bytes // round(self._properties.get(Property.BUFFER_FRAMEBYTES))
         slots = max(2, min(max(n_frames + 1, _LEAST_SLOTS), fitting))
@@ -140,7 +140,8 @@ class DcamCamera:
 
         Raises:
             DeviceTimeout: none came within `timeout` s.
-            DeviceError: not armed, disarmed while waiting, unplugged, or the capture ended by itself.
+            DeviceRefused: not armed, or disarmed while waiting.
+            DeviceError: unplugged, or the capture ended by itself.
         """
         deadline = self._clock.now() + timeout
         while True:
@@ -180,8 +181,8 @@ class DcamCamera:
             "readout": self._settings.readout,
             "binning": self._settings.binning,
             "sensor_temperature_c": get(Property.SENSORTEMPERATURE),
-            "electrons_per_count": get(Property.CONVERSIONFACTOR_COEFF),
-            "offset_counts": get(Property.CONVERSIONFACTOR_OFFSET),
+            "conversion_factor": get(Property.CONVERSIONFACTOR_COEFF),
+            "conversion_offset": get(Property.CONVERSIONFACTOR_OFFSET),
             "defect_correction": "on" if get(Property.DEFECTCORRECT_MODE) == codes.ON else "off",
             "frames_overwritten": self._overwritten,
             "transport_losses": self._transport_losses,
@@ -251,7 +252,7 @@ class DcamCamera:
         with self._ring_lock:
             capture = self._capture
             if capture is None:
-                raise DeviceError(self.name, "it is not armed, so no frame will come", advice="Arm it first")
+                raise DeviceRefused(self.name, "it is not armed, so no frame will come", advice="arm() it first")
             while True:
                 # The ring overwrites without asking. Frames older than its slots are gone, and the oldest one may go.
                 count = self._dcam.cap_transferinfo(self._camera)

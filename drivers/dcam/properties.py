@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from drivers.dcam import codes
 from drivers.dcam.abi import Dcam, DcamError
 from drivers.dcam.codes import Error, Property
@@ -13,7 +15,8 @@ _TRIGGERS = {
     TriggerSource.EXTERNAL: codes.TRIGGERSOURCE_EXTERNAL,
     TriggerSource.SOFTWARE: codes.TRIGGERSOURCE_SOFTWARE,
 }
-_READOUTS = {"ultra_quiet": codes.READOUTSPEED_ULTRA_QUIET, "standard": codes.READOUTSPEED_STANDARD}
+_READOUTS = {"standard": codes.READOUTSPEED_STANDARD, "ultra_quiet": codes.READOUTSPEED_ULTRA_QUIET}
+_SIZES = (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE)
 
 # What a camera answers to a value that it cannot take, or not now; the vendor's manuals disagree on which it will be.
 _REFUSALS = frozenset(
@@ -46,17 +49,28 @@ class Properties:
             DeviceRefused: out of range, or not now.
         """
         limits = self._dcam.prop_getattr(self._camera, prop)
-        legal = f"{prop.name} from {limits.minimum:g} to {limits.maximum:g} in steps of {limits.step:g}"
         if limits.attribute & codes.ATTRIBUTE_HASRANGE and not limits.minimum <= value <= limits.maximum:
             # Left to itself, a property that rounds would take the nearest limit without a word.
-            raise DeviceRefused(self._device, f"{prop.name} = {value:g} is out of range", expected=legal)
+            raise DeviceRefused(self._device, f"{prop.name} = {value:g} is out of range", advice=self.legal(prop))
         try:
             self._dcam.prop_setvalue(self._camera, prop, value)
         except DcamError as error:
             if error.code not in _REFUSALS:
                 raise
             problem, reply = f"it refuses {prop.name} = {value:g}", codes.error_name(error.code)
-            raise DeviceRefused(self._device, problem, reply=reply, expected=legal) from error
+            raise DeviceRefused(self._device, problem, reply=reply, advice=self.legal(prop)) from error
+
+    def legal(self, prop: Property) -> str:
+        """What a property can be, in words."""
+        limits = self._dcam.prop_getattr(self._camera, prop)
+        if limits.attribute & codes.ATTRIBUTE_TYPE_MASK != codes.ATTRIBUTE_TYPE_MODE:
+            unit = " s" if limits.unit == codes.UNIT_SECOND else ""
+            return f"legal: {limits.minimum:g} to {limits.maximum:g}{unit} in steps of {limits.step:g}{unit}"
+        values = [limits.minimum]
+        with suppress(DcamError):  # that is how the list ends
+            while True:
+                values.append(self._dcam.prop_queryvalue(self._camera, prop, values[-1], codes.QUERY_NEXT))
+        return f"legal: {', '.join(f'{value:g}' for value in values)}"
 
     def set_exactly(self, prop: Property, value: int) -> None:
         """Set, read back, and refuse a value that the camera has rounded or ignored."""
@@ -64,8 +78,7 @@ class Properties:
         accepted = self.get(prop)
         if accepted != value:
             problem = f"it made {prop.name} = {accepted:g} of {value}"
-            step = self._dcam.prop_getattr(self._camera, prop).step
-            raise DeviceRefused(self._device, problem, expected=f"a multiple of {step:g}" if step > 1 else "")
+            raise DeviceRefused(self._device, problem, advice=self.legal(prop))
 
     def apply(self, settings: CameraSettings) -> None:
         """Write everything that a triggered scan depends on; only the exposure may be rounded.
@@ -75,7 +88,7 @@ class Properties:
         """
         if settings.readout not in _READOUTS:
             problem = f"there is no readout {settings.readout!r}"
-            raise DeviceRefused(self._device, problem, expected=f"one of {', '.join(_READOUTS)}")
+            raise DeviceRefused(self._device, problem, advice=f"legal: {', '.join(_READOUTS)}")
         # Sensor mode and speed first: they change the ranges of what follows.
         self.set_exactly(Property.SENSORMODE, codes.SENSORMODE_AREA)
         self.set_exactly(Property.READOUTSPEED, _READOUTS[settings.readout])
@@ -86,6 +99,10 @@ class Properties:
         self.set_exactly(Property.SUBARRAYMODE, codes.OFF)
         if settings.roi is not None:
             row0, col0, rows, cols = settings.roi
+            height, width = (self._dcam.prop_getattr(self._camera, prop).maximum for prop in _SIZES)
+            if not (0 <= row0 <= height - rows and 0 <= col0 <= width - cols):
+                problem = f"the region {settings.roi} (row0, col0, rows, cols) does not lie on the sensor"
+                raise DeviceRefused(self._device, problem, expected=f"a region within {height:g} x {width:g}")
             # Positions to 0 first: position + size must stay within the sensor at every step.
             self.set_exactly(Property.SUBARRAYVPOS, 0)
             self.set_exactly(Property.SUBARRAYHPOS, 0)
@@ -111,12 +128,7 @@ class Properties:
     def read(self) -> CameraSettings:
         """The camera's present settings."""
         triggers, readouts = {v: k for k, v in _TRIGGERS.items()}, {v: k for k, v in _READOUTS.items()}
-        subarray = (
-            Property.SUBARRAYVPOS,
-            Property.SUBARRAYHPOS,
-            Property.SUBARRAYVSIZE,
-            Property.SUBARRAYHSIZE,
-        )
+        subarray = (Property.SUBARRAYVPOS, Property.SUBARRAYHPOS, *_SIZES)
         row0, col0, rows, cols = (round(self.get(prop)) for prop in subarray)
         return CameraSettings(
             exposure=self.get(Property.EXPOSURETIME),

@@ -6,17 +6,19 @@ import ctypes
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.clock import Clock, SystemClock
 from drivers.dcam.camera import DcamCamera
 from drivers.protocols import CameraSettings, TriggerSource
 
 SENSOR = (48, 72)
+EXPOSURETIME, TIMING_READOUTTIME = 0x001F0110, 0x00403010
 SOURCE = Path(__file__).parent / "fake_dcam.c"
 
 
@@ -36,21 +38,40 @@ def fake_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _build(tmp_path_factory.mktemp("fakedcam"))
 
 
+class VirtualTime:
+    """The fake's own time as a Clock: sleeping and waiting for the camera jump."""
+
+    def __init__(self, fake: ctypes.CDLL) -> None:
+        self._fake = fake
+
+    def now(self) -> float:
+        return self._fake.fakedcam_now()
+
+    def sleep(self, seconds: float) -> None:
+        self._fake.fakedcam_sleep(max(seconds, 0.0))
+
+
 class World:
-    """Fires triggers at the fake camera and breaks things. The camera's clock starts at 1000 s."""
+    """Fires triggers at the fake camera and breaks things; it begins anew with every World, in virtual time."""
 
     def __init__(self, library: Path) -> None:
         self.path = library
         self._fake = ctypes.CDLL(str(library))
-        self._fake.fakedcam_pulse.argtypes = (ctypes.c_double, ctypes.c_double)
-        self._fake.fakedcam_override.argtypes = (ctypes.c_int32, ctypes.c_double)
-        self._fake.fakedcam_preset.argtypes = (ctypes.c_int32, ctypes.c_double)
-        self._fake.fakedcam_value.restype = ctypes.c_double
-        self._time = 1000.0
+        real, integer = ctypes.c_double, ctypes.c_int32
+        self._fake.fakedcam_reset.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int, real)
+        self._fake.fakedcam_pulse.argtypes = self._fake.fakedcam_sleep.argtypes = (real,)
+        self._fake.fakedcam_override.argtypes = self._fake.fakedcam_preset.argtypes = (integer, real)
+        self._fake.fakedcam_value.restype = self._fake.fakedcam_now.restype = real
+        self.clock: Clock = VirtualTime(self._fake)
         self.reset()
 
-    def reset(self, rows: int = SENSOR[0], cols: int = SENSOR[1], devices: int = 1) -> None:
-        self._fake.fakedcam_reset(devices, rows, cols)
+    def reset(self, rows: int = SENSOR[0], cols: int = SENSOR[1], real_time: bool = False) -> None:
+        self._fake.fakedcam_reset(1, rows, cols, 0.0 if real_time else 1000.0)
+        self.clock = SystemClock() if real_time else VirtualTime(self._fake)
+        self._last = self.clock.now()
+
+    def connect(self, ring_bytes: int = 1 << 30) -> DcamCamera:
+        return DcamCamera(self.path, clock=self.clock, ring_bytes=ring_bytes)
 
     def fault(self, name: str, value: int = 1) -> None:
         assert self._fake.fakedcam_fault(name.encode(), value), f"the fake knows no fault {name!r}"
@@ -64,10 +85,19 @@ class World:
     def value(self, property_id: int) -> float:
         return self._fake.fakedcam_value(property_id)
 
-    def pulse(self, after: float = 0.1, width: float = 0.001) -> bool:
-        """One pulse, `after` s after the one before; whether an exposure began."""
-        self._time += after
-        return bool(self._fake.fakedcam_pulse(self._time, width))
+    def schedule(self, times: Sequence[float]) -> None:
+        """Rising edges on the trigger input, at times on the clock."""
+        for time in times:
+            assert self._fake.fakedcam_pulse(time)
+
+    def pulse(self, after: float = 0.1) -> bool:
+        """A pulse `after` s after the one before (or now), and the time to read it out; whether an exposure began."""
+        before = self._fake.fakedcam_exposed()
+        self._last = max(self._last + after, self.clock.now())
+        self.schedule([self._last])
+        done = self._last + self.value(EXPOSURETIME) + self.value(TIMING_READOUTTIME) + 1e-6
+        self.clock.sleep(done - self.clock.now())
+        return self._fake.fakedcam_exposed() > before
 
     def pulses(self, n: int, period: float = 0.1) -> int:
         """n pulses; how many began an exposure."""
@@ -108,7 +138,7 @@ def world(fake_library: Path) -> World:
 @pytest.fixture
 def camera(world: World) -> Iterator[DcamCamera]:
     """A camera on external triggers; everything that it opened must be closed at the end."""
-    camera = DcamCamera(world.path)
+    camera = world.connect()
     camera.configure(CameraSettings(0.001, TriggerSource.EXTERNAL))
     yield camera
     camera.close()

@@ -1,12 +1,15 @@
 /* An ORCA-Quest for the fake library: its properties, its ring, its trigger input, and what may go wrong.
  *
  * Pixels say where and when they were taken: four bits of the framestamp, six of the sensor row, six of the sensor column.
- * Row padding is 0xEE. The world outside acts through the functions named fakedcam_*. */
+ * Row padding is 0xEE. A frame is in the ring an exposure and a readout after its trigger. Time is virtual (a wait jumps to
+ * the next thing that happens) or real. The world outside acts through the functions named fakedcam_*. */
 #include <math.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+
+#define PULSE_WIDTH 1e-3
 
 enum { ST_BUSY = 1, ST_READY = 2, ST_STABLE = 3 };
 enum { EV_FRAMEREADY = 2, EV_STOPPED = 16 };
@@ -60,22 +63,28 @@ static const char *const FAULTS[] = {"no_camera", "unplugged", "drop", "report_l
                                      "overrun_in_lock", "swallow_events", "refuse", "no_memory", "no_stopped_event"};
 enum { NO_CAMERA, UNPLUGGED, DROP, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, NO_MEMORY, NO_STOPPED_EVENT, N_FAULTS };
 
+enum { MAX_PULSES = 4096 };
 static struct {
     Property props[N_PROPS];
     int overridden[N_PROPS], faults[N_FAULTS];
     double override[N_PROPS];
     int sensor_rows, sensor_cols, devices;
     int session, opened, waiting_open, status, mode, polls, waiters, pending;
-    int slots, count, exposed, pulses;
+    int slots, count, exposed, accepted;
     uint8_t **ring;
     int32_t *stamps;
-    double *times, last_edge, started;
+    double *times, last_edge, started, boot, virtual_now; /* virtual_now 0: real time */
+    double pulses[MAX_PULSES];
+    int n_pulses, seen;
+    struct { double edge, ready; int stamp; } flying[4]; /* exposed, not yet read out */
+    int n_flying;
     char camera, wait; /* their addresses are the handles */
 } fake;
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t changed = PTHREAD_COND_INITIALIZER;
 
 static double now(void) {
+    if (fake.virtual_now > 0) return fake.virtual_now;
     struct timespec t;
     clock_gettime(CLOCK_REALTIME, &t);
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
@@ -100,12 +109,13 @@ static double get(int p) {
     }
 }
 
-static void expose(double time) {
-    int stamp = fake.faults[FIRST_STAMP] + fake.exposed++;
-    if (fake.faults[DROP] > 0) { fake.faults[DROP]--; return; }
+static int capturing(void) { return fake.status == ST_BUSY && fake.polls >= fake.faults[START_POLLS]; }
+
+static void deliver(void) { /* the oldest exposed frame, into the ring */
     int slot = fake.count % fake.slots, rows = (int)get(HEIGHT), cols = (int)get(WIDTH), stride = (int)get(ROWBYTES);
     int subarray = fake.props[SUBARRAYMODE].value == 2, binning = (int)fake.props[BINNING].value;
     int row0 = subarray ? (int)fake.props[VPOS].value : 0, col0 = subarray ? (int)fake.props[HPOS].value : 0;
+    int stamp = fake.flying[0].stamp;
     for (int r = 0; r < rows; r++) {
         uint8_t *row = fake.ring[slot] + (size_t)r * (size_t)stride;
         memset(row, 0xEE, (size_t)stride);
@@ -116,7 +126,9 @@ static void expose(double time) {
         }
     }
     fake.stamps[slot] = stamp;
-    fake.times[slot] = time;
+    fake.times[slot] = fake.flying[0].edge - fake.boot; /* the camera's clock starts when it is switched on */
+    memmove(fake.flying, fake.flying + 1, sizeof fake.flying - sizeof *fake.flying);
+    fake.n_flying--;
     fake.count++;
     if (fake.faults[SWALLOW] > 0) fake.faults[SWALLOW]--;
     else fake.pending |= EV_FRAMEREADY;
@@ -124,10 +136,39 @@ static void expose(double time) {
     pthread_cond_broadcast(&changed);
 }
 
-static int capturing(void) { return fake.status == ST_BUSY && fake.polls >= fake.faults[START_POLLS]; }
+static void expose(double edge) {
+    int stamp = fake.faults[FIRST_STAMP] + fake.exposed++;
+    fake.last_edge = edge;
+    if (fake.n_flying == 4) deliver();
+    if (fake.faults[DROP] > 0) { fake.faults[DROP]--; return; }
+    fake.flying[fake.n_flying].edge = edge;
+    fake.flying[fake.n_flying].ready = edge + get(EXPOSURETIME) + get(READOUTTIME);
+    fake.flying[fake.n_flying++].stamp = stamp;
+}
 
-static void free_run(void) { /* internal trigger: no clock here, each wait brings the next frame */
-    if (capturing() && fake.props[TRIGGERSOURCE].value == 1) expose(fake.started + fake.exposed * get(FRAMEINTERVAL));
+static double next_edge(void) {
+    if (fake.seen < fake.n_pulses) return fake.pulses[fake.seen] + (fake.props[TRIGGERPOLARITY].value == 2 ? 0 : PULSE_WIDTH);
+    if (!capturing() || fake.props[TRIGGERSOURCE].value != 1 || (fake.mode == 0 && fake.exposed >= fake.slots)) return INFINITY;
+    return fake.started + fake.exposed * get(FRAMEINTERVAL);
+}
+
+static double next_ready(void) { return fake.n_flying ? fake.flying[0].ready : INFINITY; }
+
+static void trigger(double edge) { /* an edge on the input, or of the free run */
+    if (fake.seen < fake.n_pulses) {
+        fake.seen++;
+        if (!capturing() || fake.props[TRIGGERSOURCE].value != 2 || edge - fake.last_edge < get(MININTERVAL) - 1e-6) return;
+        if (++fake.accepted % (int)fake.props[TRIGGERTIMES].value) return;
+        edge += fake.props[TRIGGERDELAY].value;
+    }
+    expose(edge);
+}
+
+static void catch_up(void) {
+    while (fmin(next_edge(), next_ready()) <= now()) {
+        if (next_ready() <= next_edge()) deliver();
+        else trigger(next_edge());
+    }
 }
 
 static int supported_events(void) { return EV_FRAMEREADY | (fake.faults[NO_STOPPED_EVENT] ? 0 : EV_STOPPED); }
@@ -135,21 +176,23 @@ static int supported_events(void) { return EV_FRAMEREADY | (fake.faults[NO_STOPP
 static void release(void) {
     for (int i = 0; i < fake.slots; i++) free(fake.ring[i]);
     free(fake.ring); free(fake.stamps); free(fake.times);
-    fake.ring = NULL; fake.stamps = NULL; fake.times = NULL; fake.slots = 0;
+    fake.ring = NULL; fake.stamps = NULL; fake.times = NULL; fake.slots = fake.n_flying = 0;
     fake.status = ST_STABLE;
 }
 
 static void stop(void) {
     if (fake.status != ST_BUSY) return;
     fake.status = ST_READY;
+    fake.n_flying = 0;
     fake.pending |= EV_STOPPED;
     pthread_cond_broadcast(&changed);
 }
 
-void fakedcam_reset(int devices, int rows, int cols) {
+void fakedcam_reset(int devices, int rows, int cols, double virtual_now) {
     pthread_mutex_lock(&lock);
     if (fake.slots) release();
     memset(&fake, 0, sizeof fake);
+    fake.virtual_now = virtual_now; fake.boot = now() - 77.25;
     fake.devices = devices; fake.sensor_rows = rows; fake.sensor_cols = cols; fake.status = ST_STABLE;
     memcpy(fake.props, TABLE, sizeof TABLE);
     for (int p = 0; p < N_PROPS; p++) fake.props[p].value = TABLE[p].initial;
@@ -185,14 +228,24 @@ int fakedcam_preset(int32_t id, double value) { /* as another program left it */
 
 double fakedcam_value(int32_t id) { return get(find(id)); }
 
-int fakedcam_pulse(double rise, double width) { /* on the trigger input; 1 if it started an exposure */
+int fakedcam_exposed(void) { return fake.exposed; }
+
+double fakedcam_now(void) { return now(); }
+
+void fakedcam_sleep(double seconds) { /* in virtual time */
     pthread_mutex_lock(&lock);
-    double edge = (fake.props[TRIGGERPOLARITY].value == 2 ? rise : rise + width) + fake.props[TRIGGERDELAY].value;
-    int taken = capturing() && fake.props[TRIGGERSOURCE].value == 2 && edge - fake.last_edge >= get(MININTERVAL) - 1e-12;
-    if (taken && ++fake.pulses % (int)fake.props[TRIGGERTIMES].value) taken = 0;
-    if (taken) { fake.last_edge = edge; expose(edge); }
+    fake.virtual_now += seconds;
+    catch_up();
     pthread_mutex_unlock(&lock);
-    return taken;
+}
+
+int fakedcam_pulse(double rise) { /* on the trigger input, some time from now on and after those before */
+    pthread_mutex_lock(&lock);
+    int room = fake.n_pulses < MAX_PULSES;
+    if (room) fake.pulses[fake.n_pulses++] = rise;
+    pthread_cond_broadcast(&changed);
+    pthread_mutex_unlock(&lock);
+    return room;
 }
 
 void fakedcam_stop(void) { pthread_mutex_lock(&lock); stop(); pthread_mutex_unlock(&lock); }

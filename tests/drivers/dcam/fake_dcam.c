@@ -6,7 +6,8 @@
 static int32_t leave(int32_t code) { pthread_mutex_unlock(&lock); return code; }
 #define ENTER() do { pthread_mutex_lock(&lock); \
     if (!fake.session) return leave(UNLOADED); \
-    if (fake.faults[UNPLUGGED]) return leave(NOCONNECTION); } while (0)
+    if (fake.faults[UNPLUGGED]) return leave(NOCONNECTION); \
+    catch_up(); } while (0)
 #define CAMERA(h) do { ENTER(); if ((h) != &fake.camera || !fake.opened) return leave(INVALIDHANDLE); } while (0)
 #define SIZED(p, field) do { if (!(p) || (p)->field != (int32_t)sizeof *(p)) return leave(INVALIDPARAM); } while (0)
 
@@ -59,6 +60,7 @@ int32_t dcamprop_getattr(void *h, DCAMPROP_ATTR *a) {
     const Property *q = &fake.props[p];
     int ranged = q->max > q->min;
     a->attribute = (int32_t)((ranged ? 0xC0000000u : 0u) | 0x10000u | (uint32_t)q->access | (uint32_t)q->type);
+    a->iUnit = (q->type & 15) == REAL && p != TEMPERATURE; /* 1: second */
     a->valuemin = p == EXPOSURETIME && fake.props[READOUTSPEED].value == 1 ? 172.8e-6 : q->min;
     a->valuemax = q->max; a->valuestep = q->step; a->valuedefault = q->initial;
     return leave(SUCCESS);
@@ -101,6 +103,17 @@ int32_t dcamprop_setvalue(void *h, int32_t id, double value) {
     return leave(SUCCESS);
 }
 
+int32_t dcamprop_queryvalue(void *h, int32_t id, double *value, int32_t option) {
+    CAMERA(h);
+    int p = find(id);
+    if (p < 0) return leave(NOTSUPPORT);
+    if (option != 0x01000000 || (fake.props[p].type & 15) != MODE) return leave(INVALIDPARAM);
+    for (int i = 0; i < 4; i++) {
+        if (fake.props[p].legal[i] > *value) { *value = fake.props[p].legal[i]; return leave(SUCCESS); }
+    }
+    return leave(OUTOFRANGE);
+}
+
 int32_t dcambuf_alloc(void *h, int32_t n) {
     CAMERA(h);
     if (fake.status != ST_STABLE) return leave(BUSY);
@@ -134,7 +147,10 @@ int32_t dcambuf_lockframe(void *h, DCAMBUF_FRAME *f) {
     f->timestamp.sec = (uint32_t)floor(fake.times[slot]);
     f->timestamp.microsec = (int32_t)lround((fake.times[slot] - floor(fake.times[slot])) * 1e6);
     f->framestamp = fake.stamps[slot]; f->camerastamp = 0;
-    for (; fake.faults[OVERRUN_IN_LOCK] > 0; fake.faults[OVERRUN_IN_LOCK]--) expose(fake.last_edge += get(MININTERVAL));
+    for (; fake.faults[OVERRUN_IN_LOCK] > 0; fake.faults[OVERRUN_IN_LOCK]--) {
+        expose(fake.last_edge + get(MININTERVAL));
+        deliver();
+    }
     return leave(SUCCESS);
 }
 
@@ -143,9 +159,8 @@ int32_t dcamcap_start(void *h, int32_t mode) {
     if (mode != -1 && mode != 0) return leave(INVALIDPARAM);
     if (fake.status != ST_READY) return leave(fake.status == ST_BUSY ? BUSY : NOTREADY);
     fake.status = ST_BUSY; fake.mode = mode; fake.polls = 0;
-    fake.count = fake.exposed = fake.pulses = fake.pending = 0;
+    fake.count = fake.exposed = fake.accepted = fake.pending = 0;
     fake.started = now(); fake.last_edge = -1e9;
-    while (mode == 0 && capturing() && fake.props[TRIGGERSOURCE].value == 1) free_run();
     return leave(SUCCESS);
 }
 
@@ -174,8 +189,10 @@ int32_t dcamcap_firetrigger(void *h, int32_t kind) {
     CAMERA(h);
     if (kind != 0) return leave(INVALIDPARAM);
     if (!capturing() || fake.props[TRIGGERSOURCE].value != 3) return leave(NOTREADY);
-    fake.last_edge = fmax(now(), fake.last_edge + get(MININTERVAL)); /* it waits until the camera can take it */
-    expose(fake.last_edge);
+    double edge = fmax(now(), fake.last_edge + get(MININTERVAL)); /* it waits until the camera can take it */
+    if (fake.virtual_now > 0) fake.virtual_now = edge;
+    catch_up();
+    expose(edge);
     return leave(SUCCESS);
 }
 
@@ -198,16 +215,18 @@ int32_t dcamwait_start(void *w, DCAMWAIT_START *p) {
     double deadline = now() + p->timeout / 1000.0;
     int32_t answer = 0;
     fake.waiters++;
-    free_run();
     while (!answer) {
+        catch_up();
         if (fake.faults[REPORT_LOSS] > 0) { fake.faults[REPORT_LOSS]--; answer = LOSTFRAME; break; }
         p->eventhappened = fake.pending & p->eventmask;
         fake.pending &= ~p->eventmask;
         if (p->eventhappened) answer = SUCCESS;
         else if (now() >= deadline) answer = TIMEOUT;
         else {
-            struct timespec t = {(time_t)deadline, (long)((deadline - floor(deadline)) * 1e9)};
-            pthread_cond_timedwait(&changed, &lock, &t);
+            double until = fmin(deadline, fmin(next_edge(), next_ready()));
+            struct timespec t = {(time_t)until, (long)((until - floor(until)) * 1e9)};
+            if (fake.virtual_now > 0) fake.virtual_now = fmax(until, fake.virtual_now);
+            else pthread_cond_timedwait(&changed, &lock, &t);
         }
     }
     fake.waiters--;
