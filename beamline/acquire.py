@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +62,7 @@ class Acquisition:
         """Triggers, counted over the whole plan, that gave no frame so far."""
         return [done.block.first_row + i for done in self._done for i in done.taken.missing]
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         """Frames, each with its own memory, its row in the file, its trigger and its angle.
 
         However it ends (also when the caller closes the iterator): stage stopped, camera and trigger output disarmed,

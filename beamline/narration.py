@@ -1,0 +1,65 @@
+"""Narration: an event as a sentence for people, or nothing where people need not be told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+from beamline.events import Event
+from beamline.ledger import spans
+from beamline.plan_checks import size
+
+
+def sentence(event: Event) -> str | None:
+    """What happened, in words; None for the events that only move a progress display."""
+    data = event.data
+    match event.event:
+        case "run_started":
+            size_text = size(data["total_bytes"])
+            return f"Run {data['folder']}: {data['n_frames']} frames, {size_text}, {data['duration']:.0f} s"
+        case "state" | "warning":
+            text = str(data.get("message") or data.get("state"))
+            return f"Warning: {text}" if event.event == "warning" else text
+        case "block_started":
+            return f"{data['n']} {data['kind']} frames ({data['mode']}, {data['exposure']:g} s each)"
+        case "block_done":
+            return _missing(data)
+        case "flag":
+            return f"{str(data['level']).capitalize()} ({data['check']}, row {data['view']}): {data['advice']}"
+        case "recon_started":
+            return "Live reconstruction started"
+        case "snapshot":
+            return f"Volume from {data['n_views']} views: {data['path']}"
+        case "scan_done":
+            return (
+                f"Scan {data['status']}: {data['n_frames']} frames, {size(data['bytes'])}, {data['seconds']:.1f} s: "
+                f"{data['path']}"
+            )
+        case "recon_done":
+            return f"Volume: {data.get('output', '')}"
+        case "failed":
+            return f"Failed: {data['message']}"
+        case "done":
+            return f"Done: {data['folder']}"
+    return None
+
+
+class UserLog:
+    """A sink that writes plain sentences with their UTC time."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __call__(self, event: Event) -> None:
+        text = sentence(event)
+        if text:
+            stamp = datetime.fromtimestamp(event.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+            self._stream.write(f"{stamp}  {text}\n")
+            self._stream.flush()
+
+
+def _missing(data: Mapping[str, Any]) -> str | None:
+    parts = [f"{len(data['missing'])} missing ({spans(data['missing'])})"] if data["missing"] else []
+    parts += [f"{data['extra']} without a trigger"] if data["extra"] else []
+    return f"Of {data['n']} {data['kind']} frames: {', '.join(parts)}" if parts else None

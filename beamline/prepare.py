@@ -1,0 +1,102 @@
+"""Prepare: a configuration and connected devices become a scan that may start, or a refusal before anything moves."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beamline.config import Config, plan_of, resolved_yaml
+from beamline.devices import Bench, camera_settings
+from beamline.digest import digest
+from beamline.dry_run import free_bytes, refuse_violations
+from beamline.monitor import scan as monitor
+from beamline.monitor.flag import Context
+from beamline.plan import Mode, ScanPlan, Timeline
+from beamline.storage.nxtomo import ScanInfo
+from beamline.timeline import work_out
+from drivers.frame import FrameKind
+from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A scan that may start.
+
+    Attributes:
+        settings: the camera's, as it accepted them for the views.
+        timing: what the camera says of them.
+        watch: the monitor before the first frame.
+        info: what the file will say of the scan.
+    """
+
+    plan: ScanPlan
+    timeline: Timeline
+    settings: CameraSettings
+    timing: CameraTiming
+    watch: monitor.Watch
+    info: ScanInfo
+
+
+def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
+    """Ask the devices what they can do, and work the plan out for them. Nothing moves.
+
+    Args:
+        runs: where the file will be, for the free disk.
+
+    Raises:
+        ConfigError: a plan that cannot be, every broken limit, or an unknown threshold.
+        DeviceRefused: the camera does not take its settings.
+    """
+    stage, camera = bench.devices.stage, bench.devices.camera
+    plan = plan_of(config)
+    settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
+    timing, free = camera.timing, free_bytes(runs)
+    axis_col = config.optics.axis_col
+    timeline = work_out(plan, stage.limits, stage.to_counts, timing, axis_col=axis_col, free_bytes=free)
+    refuse_violations(timeline)
+    watch = monitor.start(_context(plan, timeline, timing), config.monitor.thresholds)
+    # The first call compiles, which must not happen while frames are coming.
+    digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, config.storage.preview_bin)
+    return Prepared(plan, timeline, settings, timing, watch, _info(config, bench, plan))
+
+
+def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> Context:
+    views = next(block for block in timeline.blocks if block.kind is FrameKind.PROJECTION)
+    starts = np.cumsum([0, *(train.n for train in views.trains)])[:-1]
+    return Context(
+        saturation=2**timing.bits - 1,
+        pixels=math.prod(timing.shape),
+        period=plan.period if plan.mode is Mode.FLY else None,
+        pass_starts=frozenset(starts.tolist()),
+    )
+
+
+def _info(config: Config, bench: Bench, plan: ScanPlan) -> ScanInfo:
+    optics, devices = config.optics, bench.devices
+    asked = {
+        "scheme": plan.scheme,
+        "mode": plan.mode,
+        "exposure_s": plan.exposure,
+        "period_s": plan.period,
+        "settle_s": plan.settle,
+        "darks": {"count": plan.darks.count, "at": plan.darks.at, "exposure_s": plan.darks.exposure},
+        "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},
+        "angles_deg": np.degrees(plan.angles).tolist(),
+    }
+    return ScanInfo(
+        sample=config.sample.name,
+        title=config.sample.description,
+        pixel_size_mm=optics.pixel_size_um * 1e-3 * config.devices.camera.binning,
+        energy_kev=optics.energy_kev,
+        distance_mm=optics.distance_mm,
+        exposure=plan.exposure,
+        period=plan.period,
+        axis_col=optics.axis_col,
+        plan=json.dumps(asked),
+        config=resolved_yaml(config),
+        devices={device.name: device.describe() for device in (devices.stage, devices.camera)},
+    )

@@ -1,0 +1,273 @@
+"""Run: one scan from configuration to file, in a folder of its own, told as events, and closed whatever happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from beamline.acquire import Acquisition
+from beamline.announce import Announcer
+from beamline.config import Config, resolved_yaml
+from beamline.devices import Bench, connect
+from beamline.errors import INTERRUPTED, BeamlineError, InstrumentError, ScanStopped
+from beamline.events import JsonLines, Sink
+from beamline.exposures import Emit
+from beamline.ledger import LedgerError
+from beamline.live import LiveCommand, LiveReconstruction
+from beamline.narration import UserLog
+from beamline.prepare import Prepared, prepare
+from beamline.recorder import Recorder
+from beamline.stop import ScanAborted, StopRequest
+from beamline.storage.nxtomo import NXtomoWriter
+from drivers.clock import SystemClock
+from drivers.errors import DeviceError
+
+SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
+EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
+
+
+class State(StrEnum):
+    """What a run is doing, in this order; any but `done` may be followed by `failed`."""
+
+    IDLE = "idle"
+    PREPARING = "preparing"
+    ACQUIRING = "acquiring"
+    STOPPING = "stopping"
+    DONE = "done"
+    FAILED = "failed"
+
+
+MESSAGES: Mapping[State, str] = {
+    State.PREPARING: "Preparing",
+    State.ACQUIRING: "Acquiring",
+    State.STOPPING: "The instrument is safe; the last frames are being written",
+    State.DONE: "Finished",
+    State.FAILED: "Ended early",
+}
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished scan.
+
+    Attributes:
+        path: the scan file; its folder holds everything else.
+        n_frames: rows of the file.
+        missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
+        flags: frames that each of the monitor's checks flagged.
+        seconds: real time of the whole run.
+        bytes: size of the scan file.
+        recon: what the live reconstruction said at its end; None without one, or where it failed.
+    """
+
+    path: Path
+    n_frames: int
+    missing: tuple[int, ...]
+    flags: Mapping[str, int]
+    seconds: float
+    bytes: int
+    recon: Mapping[str, Any] | None
+
+
+def run_scan(
+    config: Config,
+    runs: Path | None = None,
+    sinks: Sequence[Sink] = (),
+    stop: StopRequest | None = None,
+    *,
+    live: LiveCommand | None = None,
+    bench: Bench | None = None,
+) -> RunResult:
+    """Run the scan that `config` describes.
+
+    Args:
+        runs: the folder in which the run gets its own; the configured one unless given.
+        sinks: besides events.jsonl and user.log in the run's folder.
+        stop: to end it from another thread or a signal handler.
+        live: makes the command line of a live reconstruction; None: none.
+        bench: connected devices, left open at the end; None: those that `config` names, opened and closed here.
+
+    Raises:
+        ConfigError: the plan breaks a limit; nothing has moved and no folder was made.
+        DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: somebody asked for it.
+        DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
+            the file; the event `scan_done` says how much, and `failed` why.
+    """
+    began = time.monotonic()
+    stop = stop or StopRequest()
+    runs = runs or Path(config.storage.folder)
+    with ExitStack() as connected:
+        bench = bench or connected.enter_context(connect(config))
+        prepared = prepare(config, bench, runs)
+        if stop.stopping:
+            raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
+        folder = create_run_folder(runs, config.sample.name, SystemClock().now())
+        (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
+        with ExitStack() as stack:
+            events = stack.enter_context((folder / EVENTS).open("x", encoding="utf-8"))
+            log = stack.enter_context((folder / USER_LOG).open("x", encoding="utf-8"))
+            emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], bench.clock))
+            run = _Run(config, bench, prepared, folder, stop, emit, began)
+            return run.go(live, release=connected.close)
+
+
+def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
+    """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
+    stem = f"{time.strftime('%Y-%m-%dT%H-%M-%S', time.gmtime(seconds))}_{sample}"
+    folder, number = runs / stem, 1
+    while True:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            folder = runs / f"{stem}-{number}"
+        else:
+            return folder
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    config: Config
+    bench: Bench
+    prepared: Prepared
+    folder: Path
+    stop: StopRequest
+    emit: Emit
+    began: float
+
+    def go(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
+        """The whole run, and its last word."""
+        try:
+            self._enter(State.PREPARING)
+            result = self._scan(live, release)
+        except BaseException as error:
+            self._enter(State.FAILED)
+            message = str(error) or repr(error)
+            self.emit("failed", {"message": message, "exit_code": exit_code(error), "folder": self.folder})
+            raise
+        self._enter(State.DONE)
+        self.emit("done", {**asdict(result), "folder": self.folder})
+        return result
+
+    def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
+        path = self.folder / SCAN
+        command = None if live is None else live(path, self.folder / RECON)
+        self.emit("run_started", self._facts(path))
+        writer = self._writer(path)
+        recorder = self._recorder(writer)
+        follower = None if command is None else LiveReconstruction(command, self.folder / RECON_LOG, self.emit)
+        acquisition = self._acquisition()
+        self._enter(State.ACQUIRING)
+        error = _failure_of(lambda: _acquire(acquisition, recorder))
+        self._enter(State.STOPPING)
+        disk = _failure_of(recorder.finish)
+        error = self._graver(error, disk)
+        status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
+        unfinished = _failure_of(lambda: writer.close(status, acquisition.missing))
+        error = self._graver(error, unfinished)
+        for remark in writer.remarks:
+            self.emit("warning", {"message": remark})
+        release()
+        result = RunResult(
+            path=path,
+            n_frames=writer.committed,
+            missing=tuple(acquisition.missing),
+            flags=dict(recorder.flagged),
+            seconds=time.monotonic() - self.began,
+            bytes=path.stat().st_size,
+            recon=None,
+        )
+        self.emit("scan_done", {**asdict(result), "status": status})
+        if follower is not None:
+            result = replace(result, recon=follower.finish(self._give_up(unfinished is not None)))
+        if error is not None:
+            raise error
+        return replace(result, seconds=time.monotonic() - self.began)
+
+    def _give_up(self, unfinished: bool) -> Callable[[], bool]:
+        """The live reconstruction ends early after an abort, a stop that came after the scan, or with a broken file."""
+        stopped = self.stop.stopping
+        return lambda: unfinished or self.stop.aborting or (self.stop.stopping and not stopped)
+
+    def _graver(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
+        """Of two failures the one that the run ends with: a stop or lost frames give way to another; both are told."""
+        if error is None or after is None or after is error:
+            return error or after
+        if isinstance(error, ScanStopped | LedgerError):
+            error, after = after, error
+        self.emit("warning", {"message": str(after)})
+        return error
+
+    def _enter(self, state: State) -> None:
+        self.emit("state", {"state": state, "message": MESSAGES[state]})
+
+    def _writer(self, path: Path) -> NXtomoWriter:
+        storage = self.config.storage
+        return NXtomoWriter(
+            path,
+            self.prepared.info,
+            self.prepared.timing.shape,
+            clock=self.bench.clock,
+            preview_bin=storage.preview_bin,
+            flush_every=storage.flush_every,
+        )
+
+    def _recorder(self, writer: NXtomoWriter) -> Recorder:
+        return Recorder(
+            writer,
+            self.prepared.watch,
+            self.prepared.timeline,
+            preview_bin=self.config.storage.preview_bin,
+            emit=self.emit,
+            stop=self.stop,
+            stop_on_alarm=self.config.monitor.on_alarm == "stop",
+        )
+
+    def _acquisition(self) -> Acquisition:
+        prepared, bench = self.prepared, self.bench
+        settle = prepared.plan.settle
+        return Acquisition(
+            bench.devices, prepared.timeline, prepared.settings, settle, bench.clock, self.stop, self.emit
+        )
+
+    def _facts(self, path: Path) -> Mapping[str, Any]:
+        timeline = self.prepared.timeline
+        return {
+            "folder": self.folder,
+            "path": path,
+            "sample": self.config.sample.name,
+            "n_frames": timeline.n_frames,
+            "duration": timeline.duration,
+            "total_bytes": timeline.total_bytes,
+            "remarks": timeline.remarks,
+        }
+
+
+def exit_code(error: BaseException) -> int:
+    """The code that the command will end with."""
+    if isinstance(error, BeamlineError):
+        return error.exit_code
+    if isinstance(error, DeviceError):
+        return InstrumentError.exit_code
+    return INTERRUPTED if isinstance(error, KeyboardInterrupt) else BeamlineError.exit_code
+
+
+def _acquire(acquisition: Acquisition, recorder: Recorder) -> None:
+    # Closing the iterator is what makes the instrument safe when the recorder fails.
+    with closing(acquisition.frames()) as frames:
+        for frame in frames:
+            recorder.put(frame)
+
+
+def _failure_of(action: Callable[[], None]) -> BaseException | None:
+    """What the action raised; the run goes on to close what is open before it is raised again."""
+    try:
+        action()
+    except BaseException as error:
+        return error
+    return None
