@@ -52,9 +52,10 @@ class Tube:
 
     def __post_init__(self) -> None:
         _check(self, inner_radius=self.inner_radius, height=self.height)
-        if not self.outer_radius > self.inner_radius:
-            raise ValueError(f"a tube's outer_radius must exceed its inner_radius {self.inner_radius} mm, "
-                             f"got {self.outer_radius} mm")  # fmt: skip
+        if not math.inf > self.outer_radius > self.inner_radius:
+            raise ValueError(
+                f"tube: outer_radius must exceed the inner {self.inner_radius} mm, got {self.outer_radius}"
+            )
 
     @property
     def volume(self) -> float:
@@ -71,7 +72,7 @@ class Ellipsoid:
     quaternion: Quaternion = UPRIGHT
 
     def __post_init__(self) -> None:
-        _check(self, semi_axes=min(self.semi_axes))
+        _check(self, semi_axes=self.semi_axes)
 
     @property
     def volume(self) -> float:
@@ -88,7 +89,7 @@ class Box:
     quaternion: Quaternion = UPRIGHT
 
     def __post_init__(self) -> None:
-        _check(self, edges=min(self.edges))
+        _check(self, edges=self.edges)
 
     @property
     def volume(self) -> float:
@@ -105,7 +106,7 @@ class Octahedron:
     quaternion: Quaternion = UPRIGHT
 
     def __post_init__(self) -> None:
-        _check(self, half_diagonals=min(self.half_diagonals))
+        _check(self, half_diagonals=self.half_diagonals)
 
     @property
     def volume(self) -> float:
@@ -198,12 +199,12 @@ def _bodies(solid: Solid) -> list[Cylinder | Ellipsoid | Box | Octahedron]:
     return [solid]
 
 
-def _check(solid: Solid, **lengths: float) -> None:
+def _check(solid: Solid, **lengths: float | Vector) -> None:
     """Raises ValueError for a length that is not positive, a non-finite number or a zero quaternion."""
     name = type(solid).__name__.lower()
     for key, value in lengths.items():
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: {key} must be a positive length in mm, got {value}")
+        if not all(math.isfinite(v) and v > 0 for v in (value if isinstance(value, tuple) else (value,))):
+            raise ValueError(f"{name}: {key} must be positive in mm, got {value}")
     if not all(math.isfinite(v) for v in (solid.attenuation, *solid.centre)):
         raise ValueError(f"{name}: attenuation {solid.attenuation} and centre {solid.centre} must be finite")
     if isinstance(solid, Ellipsoid | Box | Octahedron) and not math.hypot(*solid.quaternion) > 0:
