@@ -152,6 +152,6 @@ def _locate(data: Any, folder: Path) -> None:
             parent = parent.get(name) if isinstance(parent, dict) else None
         if isinstance(parent, dict) and isinstance(parent.get(key), str):
             found = (folder / parent[key]).resolve()
-            # A scene that is not there is one of those that come with the package; its name stays portable.
-            if found.is_file() or not bundled:
+            # A scene that comes with the package keeps its short name, so that the resolved file works elsewhere.
+            if not bundled or (found.is_file() and not found.is_relative_to(config_folder().resolve())):
                 parent[key] = str(found)

@@ -126,6 +126,7 @@ def test_resolved_reads_back_as_itself(name: str, tmp_path: Path) -> None:
     loaded = config.load(config.config_folder() / f"{name}.yaml", environment={})
     text = config.resolved_yaml(loaded)
     assert text.splitlines()[0].startswith("# splatline ")
+    assert str(config.config_folder().parent) not in text  # nothing of this machine
     assert load(write(tmp_path, text)) == loaded
 
 
