@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from pathlib import Path
 
@@ -29,7 +28,8 @@ def load_angles(angles: Angles) -> NDArray[np.float64]:
 def parse_angles(content: str, name: str) -> NDArray[np.float64]:
     """Radians from text in degrees; `name` is where it came from."""
     try:
-        degrees = np.loadtxt(io.StringIO(content), ndmin=2) if content.strip() else np.empty((0, 1))
+        lines = [line for line in content.splitlines() if line.partition("#")[0].strip()]
+        degrees = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 1))
     except ValueError as error:
         raise DataError(f"{name}: expected one angle in degrees a line ({error}).") from error
     if degrees.shape[1] != 1 or degrees.size == 0:

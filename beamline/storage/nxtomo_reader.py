@@ -72,9 +72,10 @@ class NXtomoSource:
             n = int(places.data.shape[0])
         angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
         keys = np.ravel(key[()])
-        if not self._ours and not n == keys.size == angles.size:
+        sizes = (int(places.data.shape[0]), keys.size, angles.size)
+        if min(sizes) < n or (not self._ours and max(sizes) > n):
             raise DataError(
-                f"{self.path}: {n} frames, {keys.size} image keys and {angles.size} angles; expected as many of each."
+                f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
         self.n, self.image_key, self.angles = n, keys[:n].astype(np.int32), angles[:n]
         return n

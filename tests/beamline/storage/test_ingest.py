@@ -1,0 +1,175 @@
+"""ingest: whole or not at all, in the memory of a few frames."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.digest import digest
+from beamline.errors import DataError, ScanStopped
+from beamline.storage.ingest import ingest
+from beamline.storage.source import open_scan
+from beamline.storage.validate import validate
+from drivers.frame import Frame, FrameKind
+
+SHAPE = (24, 32)
+N = 9
+
+
+@pytest.fixture
+def stack(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, np.ndarray]:
+    """A float32 BigTIFF of line integrals with NaN and no-data pixels; and its pixels."""
+    pages = rng.normal(1, 0.2, (N, *SHAPE)).astype(np.float32)
+    pages[2, 3, 4] = np.nan
+    pages[5, :2] = -999
+    pages[7] = np.nan
+    tifffile.imwrite(tmp_path / "lab.tif", pages, bigtiff=True, photometric="minisblack")
+    return tmp_path / "lab.tif", pages
+
+
+ANGLES = np.linspace(0, np.pi, N)
+
+
+def test_a_float_stack_keeps_its_pixels_and_gets_statistics(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    tif, pages = stack
+    seen: list[tuple[int, int]] = []
+    done = ingest(
+        tif,
+        tmp_path / "out.h5",
+        angles=ANGLES,
+        quantity="line_integrals",
+        pixel_size_mm=0.01,
+        no_data=-999,
+        progress=lambda i, n: seen.append((i, n)),
+    )
+    assert seen == [(i + 1, N) for i in range(N)]
+    assert (done.frames, done.invalid_frames, done.pixel_bytes) == (N, 1, pages.nbytes)
+    assert done.definition == "splatline_float_projections"
+    with open_scan(tmp_path / "out.h5") as source:
+        assert (source.format, source.dtype, source.quantity) == ("float_projections", np.float32, "line_integrals")
+        assert (source.pixel_size_mm, source.attributes["no_data"]) == (0.01, -999.0)
+        np.testing.assert_array_equal(source.read(slice(None)), pages)
+        np.testing.assert_allclose(source.angles, ANGLES, rtol=1e-15)
+    with h5py.File(tmp_path / "out.h5") as file:
+        for i, page in enumerate(pages):
+            expected = digest(page, no_data=-999)
+            for name in ("minimum", "maximum", "mean", "variance", "sum_abs", "invalid_fraction", "entropy"):
+                np.testing.assert_equal(file[f"entry/digest/{name}"][i], getattr(expected, name))
+        assert file["entry/digest/invalid_fraction"][5] == pytest.approx(2 / 24)
+        np.testing.assert_array_equal(file["exchange/data"][()], pages)
+        assert file["exchange/data"].attrs["units"] == b"line_integrals"
+
+
+def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.Generator) -> None:
+    pages = rng.poisson(500, (N, *SHAPE)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "raw.tif", pages, photometric="minisblack")
+    flats, darks = np.full((2, *SHAPE), 1000, np.uint16), np.full((1, *SHAPE), 100, np.uint16)
+    done = ingest(
+        tmp_path / "raw.tif",
+        tmp_path / "out.h5",
+        angles=ANGLES,
+        flats=flats,
+        darks=darks,
+        pixel_size_mm=0.01,
+        sample="rock",
+    )
+    assert done.definition == "NXtomo"
+    with open_scan(tmp_path / "out.h5") as source:
+        assert source.image_key.tolist() == [2, 1, 1, *[0] * N]
+        assert (source.quantity, source.attributes["sample"]) == ("counts", "rock")
+        np.testing.assert_array_equal(source.read(slice(3, None)), pages)
+    assert [finding.rule for finding in validate(tmp_path / "out.h5")] == ["stuck-frames"]  # the flats are equal here
+
+
+def test_a_scan_of_ours_can_be_ingested_again(
+    write: Callable[[list[Frame]], Path], frames: list[Frame], tmp_path: Path
+) -> None:
+    ingest(write(frames), tmp_path / "again.h5")
+    with open_scan(tmp_path / "again.h5") as source:
+        np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames])
+        assert source.image_key.tolist() == [int(frame.kind) for frame in frames]
+        assert source.axis_col == 7.25
+
+
+def left(folder: Path) -> set[str]:
+    return {file.name for file in folder.iterdir()}
+
+
+def test_stopping_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    count = iter(range(100))
+    with pytest.raises(ScanStopped, match="after 4 of 9 frames"):
+        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES, should_stop=lambda: next(count) >= 4)
+    assert left(tmp_path) == {"lab.tif"}
+
+
+def test_a_failure_halfway_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    def fail(i: int, _: int) -> None:
+        if i == 5:
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(DataError, match="No space left"):
+        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES, progress=fail)
+    assert left(tmp_path) == {"lab.tif"}
+
+
+def test_a_cut_input_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    tif = stack[0]
+    tif.write_bytes(tif.read_bytes()[: tif.stat().st_size // 2])
+    with pytest.raises(DataError):
+        ingest(tif, tmp_path / "out.h5", angles=ANGLES)
+    assert left(tmp_path) == {"lab.tif"}
+
+
+def test_nothing_is_overwritten(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    (tmp_path / "out.h5").write_text("precious")
+    with pytest.raises(DataError, match="exists"):
+        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES)
+    assert (tmp_path / "out.h5").read_text() == "precious"
+    (tmp_path / "new.h5.part").write_text("someone's")
+    with pytest.raises(DataError, match="another ingest"):
+        ingest(stack[0], tmp_path / "new.h5", angles=ANGLES)
+    assert (tmp_path / "new.h5.part").read_text() == "someone's"
+
+
+@pytest.mark.parametrize(
+    ("angles", "said"),
+    [(None, "does not say the angles of its 9 projections"), (ANGLES[:4], "4 angles"), (ANGLES * np.nan, "angles")],
+)
+def test_projections_need_angles(
+    stack: tuple[Path, np.ndarray], tmp_path: Path, angles: np.ndarray | None, said: str
+) -> None:
+    with pytest.raises(DataError, match=said):
+        ingest(stack[0], tmp_path / "out.h5", angles=angles)
+    assert left(tmp_path) == {"lab.tif"}
+
+
+def test_memory_does_not_grow_with_the_stack(tmp_path: Path, rng: np.random.Generator) -> None:
+    page = rng.normal(size=(256, 256)).astype(np.float32)
+    peaks = []
+    for n in (8, 64):
+        with tifffile.TiffWriter(tmp_path / f"{n}.tif", bigtiff=True) as tif:
+            for _ in range(n):
+                tif.write(page, contiguous=True, photometric="minisblack")
+        tracemalloc.start()
+        ingest(tmp_path / f"{n}.tif", tmp_path / f"{n}.h5", angles=np.linspace(0, 3, n))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + page.nbytes  # 64 pages are 16.8 MB
+    assert peaks[1] < 16 * page.nbytes
+
+
+def test_kinds_and_order_come_through(tmp_path: Path) -> None:
+    """A series with its own darks and flats, by name."""
+    (tmp_path / "scan").mkdir()
+    for name, value in (("dark_1", 10), ("flat_1", 900), ("raw_2", 502), ("raw_10", 510)):
+        tifffile.imwrite(tmp_path / "scan" / f"{name}.tif", np.full(SHAPE, value, np.uint16))
+    ingest(tmp_path / "scan", tmp_path / "out.h5", angles=[0.0, 1.0])
+    with open_scan(tmp_path / "out.h5") as source:
+        assert source.read(slice(None))[:, 0, 0].tolist() == [10, 900, 502, 510]
+        assert source.image_key.tolist() == [FrameKind.DARK, FrameKind.FLAT, 0, 0]
