@@ -1,0 +1,125 @@
+"""`beamline scan`: run the scan that a configuration describes, or say what it would do."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from beamline.cli.config import OVERRIDE_HELP
+from beamline.config import Config, load
+from beamline.dry_run import dry_run, refuse_violations
+from beamline.errors import BeamlineError
+from beamline.events import Event, JsonLines, Sink
+from beamline.live import LiveCommand, follow_command
+from beamline.run import RECON, RunResult, exit_code, run_scan
+from beamline.stop import StopRequest
+from beamline.terminal import Terminal
+from drivers.clock import SystemClock
+from drivers.errors import DeviceError
+
+
+@click.command()
+@click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
+@click.option("--dry-run", "dry", is_flag=True, help="Print timeline, limits and free disk; no device is touched.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=OVERRIDE_HELP)
+@click.option("--no-live", is_flag=True, help="No live reconstruction.")
+@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), help="Where runs get their folders.")
+def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_json: bool, output: Path | None) -> None:
+    """Run the scan in CONFIG.
+
+    Each run has its own folder (UTC time and sample). The first Ctrl-C stops cleanly, the second aborts; SIGTERM
+    stops. All of them leave a readable file.
+
+    Exit code: 0 done, 2 configuration or a violated limit, 3 device, 4 stopped, 5 frames missing or disk, 130
+    interrupted before anything was acquired, or aborted.
+    """
+    with _told_as_json(as_json) as json_sinks:
+        config = load(file, overrides)
+        if dry:
+            _dry_run(config, json_sinks)
+            return
+        stop = StopRequest()
+        with _signals(stop), Terminal(sys.stderr) as terminal:
+            result = run_scan(config, output, [terminal, *json_sinks], stop, live=_live(config, no_live))
+    if not as_json:
+        click.echo(_results(result))
+
+
+def _dry_run(config: Config, json_sinks: Sequence[Sink]) -> None:
+    worked = dry_run(config)
+    if not json_sinks:
+        click.echo("\n".join(worked.lines()))
+    refuse_violations(worked.timeline)
+    for sink in json_sinks:
+        sink(Event("done", SystemClock().now(), worked.data()))
+
+
+def _live(config: Config, no_live: bool) -> LiveCommand | None:
+    if no_live or not config.recon.live:
+        return None
+    if config.recon.method != "r2":
+        click.echo(
+            f"No live volume: {config.recon.method} needs the whole scan; use beamline recon afterwards.", err=True
+        )
+        return None
+    return follow_command(config)
+
+
+@contextmanager
+def _told_as_json(wanted: bool) -> Iterator[list[Sink]]:
+    """The sinks for stdout. With JSON its last line is `done` or `failed`, also where the run never began."""
+    if not wanted:
+        yield []
+        return
+    lines = JsonLines(sys.stdout)
+    last = ""
+
+    def remember(event: Event) -> None:
+        nonlocal last
+        last = event.event
+        lines(event)
+
+    try:
+        yield [remember]
+    except (BeamlineError, DeviceError) as error:
+        if last != "failed":
+            lines(Event("failed", SystemClock().now(), {"message": str(error), "exit_code": exit_code(error)}))
+        raise
+
+
+@contextmanager
+def _signals(stop: StopRequest) -> Iterator[None]:
+    """Ctrl-C: first stop, then abort. SIGTERM: stop."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if stop.stopping:
+            stop.abort("Ctrl-C was pressed again")
+            click.echo("Aborting.", err=True)
+        else:
+            stop.stop("Ctrl-C was pressed")
+            click.echo("Stopping cleanly; Ctrl-C again aborts.", err=True)
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        stop.stop("the process was asked to end (SIGTERM)")
+
+    with ExitStack() as restore:
+        for number, handler in ((signal.SIGINT, interrupt), (signal.SIGTERM, terminate)):
+            restore.callback(signal.signal, number, signal.signal(number, handler))
+        yield
+
+
+def _results(result: RunResult) -> str:
+    lines = [f"{'scan':<10}{result.path}", f"{'frames':<10}{result.n_frames}"]
+    if result.flags:
+        counts = ", ".join(f"{check} {n}" for check, n in sorted(result.flags.items()))
+        lines.append(f"{'flagged':<10}{counts} frames; see {result.path.parent}")
+    if result.recon is not None:
+        lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
+    return "\n".join(lines)

@@ -1,0 +1,81 @@
+"""Terminal: a scan's events for the operator: a bar where a terminal is, plain lines where there is none."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from beamline.events import Event
+from beamline.narration import sentence
+
+PLAIN_EVERY = 5.0
+"""Real s between progress lines where there is no terminal."""
+
+
+class Terminal:
+    """A sink; use it as a context manager, so that the bar is gone before anything else is printed.
+
+    Args:
+        stream: where it goes (stderr: results belong to stdout). A terminal gets a bar, anything else plain lines.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._console = Console(file=stream, highlight=False, markup=False, soft_wrap=True)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[note]}"),
+            console=self._console,
+            transient=True,
+            disable=not self._console.is_terminal,
+        )
+        self._tasks: dict[str, TaskID] = {}
+        self._said: dict[str, float] = {}
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def __call__(self, event: Event) -> None:
+        if event.event == "frame":
+            self._show("scan", event.data["n"], event.data["of"], rates(event.data))
+        elif event.event == "progress":
+            self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
+        elif event.event not in ("failed", "done"):  # the command has the last word
+            text = sentence(event)
+            if text:
+                self._console.print(text)
+
+    def _show(self, what: str, done: int, total: int, note: str) -> None:
+        if not self._bar.disable:
+            if what not in self._tasks:
+                self._tasks[what] = self._bar.add_task(what, note=note)
+            self._bar.update(self._tasks[what], completed=done, total=total or None, note=note)
+            return
+        now = time.monotonic()
+        if now - self._said.get(what, -PLAIN_EVERY) >= PLAIN_EVERY or done == total:
+            self._said[what] = now
+            self._console.print(f"{what}: {note}")
+
+
+def rates(data: Mapping[str, Any]) -> str:
+    """n/N, frames/s, MB/s and the time left, of a `frame` event."""
+    left = round(data["eta_s"])
+    eta = f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
+    return f"{data['n']}/{data['of']}  {data['frames_per_s']:.1f} frames/s  {data['mb_per_s']:.1f} MB/s  {eta} left"
+
+
+def fit(data: Mapping[str, Any]) -> str:
+    """Views, Gaussians and residual, of a live reconstruction's `progress` event."""
+    residual = "" if data["residual"] is None else f", residual {data['residual']:.4f}"
+    return f"{data['n_views']} views, {data['n_gaussians']} Gaussians{residual}"
