@@ -146,12 +146,18 @@ def _field(fields: Fields, exposure: float) -> FieldPlan:
 
 def _locate(data: Any, folder: Path) -> None:
     """Make the file names in plain configuration values independent of the working directory, in place."""
-    for group, key, bundled in ((("scan", "angles"), "path", False), (("simulation",), "scene", True)):
-        parent = data
-        for name in group:
-            parent = parent.get(name) if isinstance(parent, dict) else None
-        if isinstance(parent, dict) and isinstance(parent.get(key), str):
-            found = (folder / parent[key]).resolve()
-            # A scene that comes with the package keeps its short name, so that the resolved file works elsewhere.
-            if not bundled or (found.is_file() and not found.is_relative_to(config_folder().resolve())):
-                parent[key] = str(found)
+    if (scan := _group(data, "scan", "angles", "path")) is not None:
+        scan["path"] = str((folder / scan["path"]).resolve())
+    if (simulation := _group(data, "simulation", "scene")) is not None:
+        found, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
+        if found.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
+            simulation["scene"] = found.relative_to(shipped).as_posix()
+        elif found.is_file():  # else it is taken for one of those that come with the package
+            simulation["scene"] = str(found)
+
+
+def _group(data: Any, *path: str) -> dict[str, Any] | None:
+    """The group that holds the key at the end of `path`, where the key holds text."""
+    for name in path[:-1]:
+        data = data.get(name) if isinstance(data, dict) else None
+    return data if isinstance(data, dict) and isinstance(data.get(path[-1]), str) else None

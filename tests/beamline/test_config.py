@@ -290,5 +290,10 @@ def test_scenes_inline_beside_and_installed(tmp_path: Path, monkeypatch: pytest.
     write(home / "scenes", "from: home\n", "a.yaml")
     assert config.scene_mapping(load(path)) == {"from": "home"}
     assert config.scene_mapping(load(path, "simulation.scene={phantom: none}")) == {"phantom": "none"}
+    monkeypatch.chdir(tmp_path)
+    named = load(path, "simulation.scene=installed/scenes/a.yaml")  # a shipped scene, named from where one stands
+    assert config.scene_mapping(named) == {"from": "installed"}
+    assert named.simulation is not None
+    assert named.simulation.scene == "scenes/a.yaml"
     with pytest.raises(ConfigError, match=r"simulation\.scene: .*absent\.yaml cannot be read"):
         config.scene_mapping(load(path, "simulation.scene=absent.yaml"))

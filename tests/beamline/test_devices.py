@@ -16,7 +16,7 @@ from beamline.config_models import Config
 from beamline.dry_run import dry_run
 from beamline.errors import ConfigError
 from beamline.plan import Block
-from beamline.timeline import pass_ends
+from beamline.timeline import block_seconds, pass_ends
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.frame import FrameKind
@@ -88,7 +88,13 @@ def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
     with devices.connect(settings) as bench:
         assert isinstance(bench.clock, VirtualClock)
         bench.devices.shutter.open()
+        began = bench.clock.now()
         stamps, images = fly(bench, block, settings)
+        seconds = bench.clock.now() - began
+    # Nothing but the polls of a standing stage separates the plan from the clock.
+    assert seconds == pytest.approx(
+        block_seconds(block, worked.stage, worked.camera, settle=0), abs=0.05 * len(block.trains)
+    )
     assert stamps == list(range(block.n))
     # The ball's shadow stands at u = x cos(angle) on a detector of 4.6 um pixels whose middle is the axis.
     u = (np.arange(40) - 19.5) * 4.6e-3
