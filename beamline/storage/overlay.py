@@ -115,6 +115,8 @@ class Overlay:
         n = len(self._front)
         indices = frame_indices(frames, n + self._base.image_key.size)
         front = indices < n
+        if not front.any():
+            return self._base.read(indices - n, rows).astype(self.dtype, copy=False)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         out[front] = self._front[indices[front], rows]
         if not front.all():

@@ -102,21 +102,26 @@ class TiffStack:
         out = np.empty((indices.size, len(wanted), self.shape[1]), self.dtype)
         for i, page in enumerate(indices):
             try:
-                out[i] = self._rows(int(page), rows)
+                self._fill(out[i], int(page), rows)
             except UNREADABLE as error:
                 raise DataError(f"Page {page} of {self.path} cannot be read ({error}).") from error
         return out
 
-    def _rows(self, page: int, rows: slice) -> NDArray[Any]:
+    def _fill(self, out: NDArray[Any], page: int, rows: slice) -> None:
         if self._offset is None:
-            return np.asarray(self._tif.pages[page].asarray())[rows]
-        first, last, _ = rows.indices(self.shape[0]) if rows.step in (None, 1) else (0, self.shape[0], 1)
-        line = self.shape[1] * self.dtype.itemsize
-        handle = self._tif.filehandle
-        handle.seek(self._offset + (page * self.shape[0] + first) * line)
-        content = handle.read(max(last - first, 0) * line)
-        block = np.frombuffer(content, self._stored).reshape(max(last - first, 0), self.shape[1])
-        return block if rows.step in (None, 1) else block[rows]
+            out[...] = self._tif.pages[page].asarray()[rows]
+        elif rows.step not in (None, 1):
+            whole = np.empty(self.shape, self.dtype)
+            self._fill(whole, page, WHOLE)
+            out[...] = whole[rows]
+        else:
+            first = rows.indices(self.shape[0])[0]
+            self._tif.filehandle.seek(self._offset + (page * self.shape[0] + first) * self.shape[1] * out.itemsize)
+            n = self._tif.filehandle.readinto(out)
+            if n != out.nbytes:
+                raise EOFError(f"{n} of {out.nbytes} bytes are there")
+            if not self._stored.isnative:
+                out.byteswap(inplace=True)
 
     def frames(self) -> Iterator[Frame]:
         return bare_frames(self)
