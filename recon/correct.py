@@ -190,7 +190,7 @@ def _air(transmission: NDArray[np.float32], left: int, right: int) -> NDArray[np
 
 
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """Of the neighbours of each (r, c): the median, and the third brightest (at the edge of the image the brightest)."""
+    """Of the neighbours of each (r, c): the median, and the third brightest (at the image edge the brightest)."""
     rows, cols = image.shape
     nr, nc = r[:, None] + _NEIGHBOURS[:, 0], c[:, None] + _NEIGHBOURS[:, 1]
     inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)

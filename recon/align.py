@@ -1,0 +1,349 @@
+"""The rotation axis from the data: each estimate comes with its curve and says whether it can be trusted.
+
+Three methods that fail in different ways. A pair of views half a turn apart needs only that pair. The double wedge
+uses all views of about half a turn, sparse, noisy or uneven. The centre of mass needs any sector, but the whole sample
+in the field and air at zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import fft
+
+Floats = NDArray[np.float64]
+
+_MOST_VIEWS, _MOST_ROWS, _MOST_COLS = 256, 16, 1024  # enough for 0.1 px; more costs time only
+_STEP = 0.25  # px between candidates
+_WIDEST_GAP = np.deg2rad(20)  # in a half turn; beyond it the seam no longer fixes the axis
+_AGREE = 1.0  # px by which independent estimates may differ and still be believed
+
+
+class AxisError(ValueError):
+    """The best axis lies at the edge of the search range or outside it: there is no estimate."""
+
+
+@dataclass(frozen=True, eq=False)
+class AxisEstimate:
+    """Where the rotation axis is, and how that was found.
+
+    Attributes:
+        value: axis_col in pixels, 0 at the centre of the first column.
+        candidates: float64 [n], the columns tried.
+        curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 is none.
+        confident: False where the curve is shallow, or parts of the data contradict each other.
+        method: "pair", "double wedge" or "centre of mass".
+    """
+
+    value: float
+    candidates: Floats
+    curve: Floats
+    confident: bool
+    method: str
+
+
+def axis_from_pair(
+    p0: NDArray[np.floating], p180: NDArray[np.floating], search: tuple[float, float] | None = None
+) -> AxisEstimate:
+    """Axis from two views half a turn apart: p180 is p0 mirrored about the axis.
+
+    The normalised correlation of p0 with the mirrored p180 is taken at every half column (a mirror about a half column
+    maps pixels on pixels, so nothing is interpolated), then a parabola through the peak. Samples that reach out of the
+    field do no harm: only columns that both views see are compared.
+
+    Args:
+        p0, p180: float32 [row, col], line integrals.
+        search: (lowest, highest) column; None: the middle three quarters.
+
+    Raises:
+        ValueError: for shapes that differ or values that are not finite.
+        AxisError: where the best match lies at the edge of the search range or outside it.
+    """
+    a, b = np.atleast_2d(p0).astype(np.float64), np.atleast_2d(p180).astype(np.float64)
+    if a.shape != b.shape:
+        raise ValueError(f"the two views have shapes {a.shape} and {b.shape}")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError("the two views hold NaN or infinite values; correct them first")
+    cols = a.shape[1]
+    rows = np.unique(np.linspace(0, len(a) - 1, min(len(a), 4 * _MOST_ROWS)).astype(int))
+    candidates = np.arange(cols // 8 * 2, 2 * cols - 1 - cols // 8 * 2) / 2
+    curve = _mirror_mismatch(a[rows], b[rows], candidates)
+    value, depth = _optimum(candidates, curve, search)
+    confident = depth > 0.5
+    if confident and rows.size >= 8:
+        halves = [_mirror_mismatch(a[part], b[part], candidates) for part in (rows[::2], rows[1::2])]
+        confident = max(abs(_lowest(candidates, half)[0] - value) for half in halves) < _AGREE
+    return AxisEstimate(value, *_within(search, candidates, curve), confident, "pair")
+
+
+def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
+    """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows."""
+    rows, cols = a.shape
+    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    total = (2 * candidates).astype(int)  # i + j of the pixels compared
+    n = fft.next_fast_len(2 * cols, real=True)
+    product = fft.irfft(fft.rfft(a, n) * fft.rfft(b, n), n)[:, total]
+    first, last = np.maximum(total - cols + 1, 0), np.minimum(total, cols - 1) + 1
+
+    def sums(x: Floats) -> Floats:
+        cumulative = np.concatenate([np.zeros((rows, 1)), np.cumsum(x, axis=1)], axis=1)
+        return cumulative[:, last] - cumulative[:, first]
+
+    count, sum_a, sum_b = last - first, sums(a), sums(b)
+    covariance = (product - sum_a * sum_b / count).sum(axis=0)
+    variance = (sums(a * a) - sum_a**2 / count).sum(axis=0) * (sums(b * b) - sum_b**2 / count).sum(axis=0)
+    return 1 - covariance / np.sqrt(np.maximum(variance, 1e-30))
+
+
+def axis_from_sinogram(
+    sinogram: NDArray[np.floating], angles: Floats, search: tuple[float, float] | None = None
+) -> AxisEstimate:
+    """Axis from all views, without needing a pair: uneven, sparse and noisy scans, sectors and full turns.
+
+    About half a turn or more: the double wedge. The Fourier transform of a sinogram along the columns holds, at
+    frequency ω, only the angular harmonics |n| <= ω r of a sample of radius r (Edholm, Lewitt & Lindholm 1986; used for
+    the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis the view at θ + π is the mirrored view at
+    θ, so the real part has even harmonics only and the imaginary part odd ones. The curve is what a least-squares fit
+    of these to the views leaves over. It takes the angles as they are and is a sum of cosines of the axis: nothing is
+    interpolated.
+
+    Less than half a turn, or a wedge that is not sure: the centre of mass of the views, fitted by
+    axis + a cos θ + b sin θ (the first of the Helgason-Ludwig conditions).
+
+    Args:
+        sinogram: float32 [view, col] or [view, row, col], line integrals; a few rows are enough.
+        angles: [view], radians, any order and range.
+        search: (lowest, highest) column; None: the whole detector.
+
+    Raises:
+        ValueError: for shapes that do not fit, fewer than 4 views, or values that are not finite.
+        AxisError: where the best axis lies at the edge of the search range or outside it.
+    """
+    theta = np.asarray(angles, np.float64)
+    if sinogram.ndim not in (2, 3) or theta.shape != sinogram.shape[:1]:
+        raise ValueError(f"sinogram {sinogram.shape} must be [view, col] or [view, row, col] for angles {theta.shape}")
+    data = _few_rows(sinogram[:, None] if sinogram.ndim == 2 else sinogram)
+    if len(theta) < 4 or data.shape[2] < 8:
+        raise ValueError(
+            f"{len(theta)} views of {data.shape[2]} columns are too few to find an axis; 4 of 8 are needed"
+        )
+    if not (np.isfinite(data).all() and np.isfinite(theta).all()):
+        raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")
+    half_turn = np.sort(np.mod(theta, np.pi))
+    gap = np.diff(half_turn, append=half_turn[0] + np.pi).max()
+    if gap > max(_WIDEST_GAP, 4 * np.pi / len(theta)):
+        return _axis_from_mass(data, theta, search)
+    wedge = _axis_from_wedge(data, theta, search)
+    if wedge.confident:
+        return wedge
+    try:
+        mass = _axis_from_mass(data, theta, search)
+    except AxisError:
+        return wedge
+    return mass if mass.confident and abs(mass.value - wedge.value) < _AGREE else wedge
+
+
+def _axis_from_mass(data: Floats, theta: Floats, search: tuple[float, float] | None) -> AxisEstimate:
+    cols = data.shape[2]
+    order = np.argsort(theta)
+    theta, profile = theta[order], data[order].mean(axis=1)
+    mass = profile.sum(axis=1)
+    if not (mass > 0).all():
+        raise AxisError("some views hold no mass to find an axis from; check the dark and flat correction")
+    basis = np.stack([np.ones_like(theta), np.cos(theta), np.sin(theta)], axis=1)
+    centre = profile @ np.arange(cols) / mass
+    covariance = np.linalg.pinv(basis.T @ basis)
+    solution = covariance @ (basis.T @ centre)
+    residual = centre - basis @ solution
+    value, left_over = float(solution[0]), float(residual @ residual)
+    # Fixing the axis elsewhere raises the sum of squares by this much a px²; the curve counts in quarters of the field.
+    rise = 1 / covariance[0, 0]
+    candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
+    curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
+    low, high = _limits(search, candidates)
+    if not low < value < high:
+        raise _axis_error(value, search, candidates, "outside it")
+    # Neighbouring residuals that are alike are not independent; air that is not at zero pulls without any scatter.
+    alike = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
+    error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + alike) / (1 - alike))
+    edge = max(2, cols // 40)
+    left, right = float(profile[:, :edge].mean()), float(profile[:, -edge:].mean())
+    pull = abs(left - right) / 2 * cols**2 / 6 + abs(left + right) / 2 * cols * abs(value - (cols - 1) / 2)
+    whole = max(abs(left), abs(right)) < 0.05 * profile.max() and mass.std() < 0.03 * mass.mean()
+    sure = whole and 2 * error + pull / mass.mean() < _AGREE
+    return AxisEstimate(value, *_within(search, candidates, curve), bool(sure), "centre of mass")
+
+
+def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | None) -> AxisEstimate:
+    views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
+    bin_ = -(-data.shape[2] // _MOST_COLS)
+    cols = data.shape[2] // bin_
+    part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
+    omega, fit = _wedge_residuals(part, theta[views])
+    candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
+    phase = 2 * np.outer(candidates, omega)
+    basis = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
+
+    def curve_for(power: int) -> Floats:
+        weighted = fit * omega**power
+        return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
+
+    curve = curve_for(1)
+    full = candidates * bin_ + (bin_ - 1) / 2
+    value, depth = _optimum(full, curve, search)
+    # Low frequencies feel what is wrong with air and truncation, high ones feel noise: they must agree.
+    bands = abs(_lowest(full, curve_for(0))[0] - _lowest(full, curve_for(2))[0])
+    return AxisEstimate(value, *_within(search, full, curve), depth > 0.5 and bands < _AGREE * bin_, "double wedge")
+
+
+def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
+    """Frequencies ω [k] and coefficients [3, k] of the residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
+    views, rows, cols = data.shape
+    # Air that is not at zero would be a box fixed to the detector, symmetric about its middle: take it off.
+    edge = max(2, cols // 40)
+    left, right = (np.median(part, axis=2)[..., None] for part in (data[:, :, :edge], data[:, :, -edge:]))
+    data = data - (left + (right - left) * np.linspace(0, 1, cols))
+    n = fft.next_fast_len(2 * cols, real=True)
+    radius = cols / 2
+    highest = min(np.pi / 2, 0.7 * views / radius)  # keeps more views than harmonics
+    k = np.arange(1, max(3, int(highest * n / (2 * np.pi))) + 1)
+    omega = 2 * np.pi * k / n
+    harmonics = np.ceil(omega * radius + 2)
+    spectrum = fft.rfft(data, n, axis=2)[:, :, k].reshape(views, -1)
+    re, im = spectrum.real.copy(), spectrum.imag.copy()
+
+    def left_over(first: int) -> list[Floats]:
+        """What the harmonics first, first + 2 ... up to each frequency's limit leave of re·re, im·im and re·im."""
+        order = np.repeat(np.arange(first, harmonics[-1] + 1, 2), 2)
+        columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
+        columns, order = (columns, order) if first else (np.delete(columns, 1, 1), np.delete(order, 1))
+        # Nested: the first m columns of q span the first m harmonics. By torch: NumPy's threads spin, which takes
+        # seconds where other processes want the cores.
+        q, r = (part.numpy() for part in torch.linalg.qr(torch.from_numpy(columns)))
+        independent = np.abs(np.diag(r)) > 0.05 * np.sqrt(views)
+        q, order = torch.from_numpy(q[:, independent]), order[: len(independent)][independent]
+        allowed = order[:, None] <= harmonics
+        in_re, in_im = ((q.T @ torch.from_numpy(part)).numpy().reshape(-1, rows, k.size) for part in (re, im))
+        return [
+            (x * y).reshape(views, rows, -1).sum(axis=(0, 1)) - ((u * v).sum(axis=1) * allowed).sum(axis=0)
+            for x, y, u, v in ((re, re, in_re, in_re), (im, im, in_im, in_im), (re, im, in_re, in_im))
+        ]
+
+    # About an axis a the transform is (re + i im) e^{iωa}: even harmonics in its real part, odd in its imaginary part.
+    even, odd = left_over(0), left_over(1)
+    cosine2, sine2, mixed = even[0] + odd[1], even[1] + odd[0], odd[2] - even[2]
+    return omega, np.stack([(cosine2 + sine2) / 2, (cosine2 - sine2) / 2, mixed])
+
+
+def find_axis(
+    projections: NDArray[np.floating], angles: Floats, search: tuple[float, float] | None = None
+) -> AxisEstimate:
+    """The rotation axis of a scan, from all views and, where two lie half a turn apart, checked against these.
+
+    Args:
+        projections: float32 [view, row, col], line integrals.
+        angles: [view], radians.
+        search: (lowest, highest) column; None: the whole detector.
+
+    Returns:
+        The estimate from all views, or the pair's where that alone is sure; not confident where they contradict.
+
+    Raises:
+        ValueError, AxisError: as `axis_from_sinogram`.
+    """
+    theta = np.asarray(angles, np.float64)
+    if projections.ndim != 3:
+        raise ValueError(f"projections must be [view, row, col], got shape {projections.shape}")
+    everything = axis_from_sinogram(projections, theta, search)
+    pair = _closest_pair(theta, tolerance=2 / projections.shape[2])
+    if pair is None:
+        return everything
+    try:
+        two = axis_from_pair(projections[pair[0]], projections[pair[1]], search)
+    except AxisError:  # nothing to tell in these two views: all the others have told
+        return everything
+    if not two.confident:
+        return everything
+    if abs(everything.value - two.value) > _AGREE:
+        return replace(everything, confident=False)
+    return everything if everything.confident else two
+
+
+def _closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
+    """The two views nearest to half a turn apart; none within the tolerance (radians): None."""
+    order = np.argsort(np.mod(theta, 2 * np.pi))
+    turned = np.mod(theta[order], 2 * np.pi)
+    extended = np.concatenate([turned, turned + 2 * np.pi])
+    at = np.searchsorted(extended, turned + np.pi)
+    options = np.stack([np.clip(at - 1, 0, None), np.clip(at, None, extended.size - 1)])
+    miss = np.abs(extended[options] - turned - np.pi)
+    side, first = np.unravel_index(int(miss.argmin()), miss.shape)
+    if miss[side, first] > tolerance:
+        return None
+    return int(order[first]), int(order[options[side, first] % order.size])
+
+
+def _few_rows(data: NDArray[np.floating]) -> Floats:
+    """At most 16 rows, each the mean of up to 4: a sum of slices is a slice too, with less noise."""
+    rows = data.shape[1]
+    if rows <= _MOST_ROWS:
+        return np.asarray(data, np.float64)
+    group = min(4, rows // _MOST_ROWS)
+    chosen = np.linspace(0, rows - 1, _MOST_ROWS * group).astype(int)
+    return data[:, chosen].reshape(len(data), _MOST_ROWS, group, -1).mean(axis=2, dtype=np.float64)
+
+
+def _lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
+    """Position of the minimum, by a parabola through its three points, and its index."""
+    i = int(curve.argmin())
+    if not 0 < i < curve.size - 1:
+        return float(candidates[i]), i
+    below, here, above = curve[i - 1 : i + 2]
+    bend = below - 2 * here + above
+    shift = 0.5 * (below - above) / bend if bend > 0 else 0.0
+    return float(candidates[i] + shift * (candidates[1] - candidates[0])), i
+
+
+def _within(search: tuple[float, float] | None, candidates: Floats, curve: Floats) -> tuple[Floats, Floats]:
+    if search is None:
+        return candidates, curve
+    inside = (candidates >= search[0]) & (candidates <= search[1])
+    return candidates[inside], curve[inside]
+
+
+def _limits(search: tuple[float, float] | None, candidates: Floats) -> tuple[float, float]:
+    return (float(candidates[0]), float(candidates[-1])) if search is None else search
+
+
+def _axis_error(value: float, search: tuple[float, float] | None, candidates: Floats, where: str) -> AxisError:
+    low, high = _limits(search, candidates)
+    return AxisError(
+        f"no rotation axis in the search range {low:g} to {high:g}: the best column is {value:.2f}, {where}; "
+        "widen the range, or give the axis"
+    )
+
+
+def _optimum(candidates: Floats, curve: Floats, search: tuple[float, float] | None) -> tuple[float, float]:
+    """The minimum inside the search range and its depth, 0 (as bad as the typical candidate) to 1 (perfect agreement).
+
+    A minimum at the edge of the range, or clearly worse than one outside, is refused: a range that leaves the axis out
+    has some minimum too.
+    """
+    part, values = _within(search, candidates, curve)
+    if part.size < 3:
+        low, high = _limits(search, candidates)
+        raise ValueError(
+            f"search range {low:g} to {high:g} holds {part.size} candidates; the axis is looked for in columns "
+            f"{candidates[0]:g} to {candidates[-1]:g}"
+        )
+    value, i = _lowest(part, values)
+    if i in (0, part.size - 1):
+        raise _axis_error(value, search, candidates, "at its edge")
+    typical = float(np.median(curve))
+    depth, deepest = typical - float(values[i]), typical - float(curve.min())
+    if depth < 0.8 * deepest:
+        raise _axis_error(_lowest(candidates, curve)[0], search, candidates, "outside it")
+    return value, depth / typical if typical > 0 else 0.0
