@@ -188,20 +188,19 @@ class PulseMotor:
         self._put_on_line(now)
 
     def stop(self, acceleration: float) -> None:
-        """Slow down to the next whole count at which `acceleration` (counts/s²) allows to stand."""
+        """Slow down with `acceleration` (counts/s²) to the last pulse that still comes on the way."""
         now, move = self._clock.now(), self.move
         self.ended = Ended.SLOW_STOP
         if not self.moving():
             return
         position, velocity = move.position(now), move.velocity(now)
-        room = abs(move.target - position)
-        distance = min(velocity**2 / (2 * acceleration), room)
-        whole = math.ceil(position + distance - 1e-9) if move.direction > 0 else math.floor(position - distance + 1e-9)
-        if whole == position:
-            self._moves[-1] = move.halted(whole)
+        stand = position + move.direction * velocity**2 / (2 * acceleration)
+        last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
+        if move.direction * (last - position) <= 0:
+            self._moves[-1] = move.halted(last)
         else:
-            braked = move.braked(now, velocity**2 / (2 * abs(whole - position)))
-            self._moves[-1] = TrapezoidMove(braked.begin, braked.start, whole, braked.phases)
+            braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
+            self._moves[-1] = TrapezoidMove(braked.begin, braked.start, last, braked.phases)
         self._put_on_line(now)
 
     def halt(self) -> None:

@@ -170,6 +170,12 @@ class StageConformance:
             assert pulse.angle == pytest.approx(asked, abs=math.radians(bench.count))
             assert bench.line.angle_at(pulse.time) == pytest.approx(asked, abs=math.radians(bench.count))
 
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_a_single_pulse_may_have_any_interval(self, bench: StageBench, sign: int) -> None:
+        bench.stage.arm(TriggerTrain(sign * 100, sign, 1))
+        bench.go(sign * 3.0)
+        assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [sign * 100]
+
     def test_at_constant_speed_pulses_are_equally_spaced_in_time(self, bench: StageBench) -> None:
         bench.stage.arm(bench.train(5.0, 0.5, 21))
         bench.go(20.0)

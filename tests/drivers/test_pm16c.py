@@ -28,13 +28,21 @@ QUERIES_TO_OPEN = 7
 
 
 class Rig:
-    """A simulated controller (sample on channel 11, hex B) on a virtual clock, and the driver's settings for it."""
+    """A simulated controller (sample on channel 11, hex B) on a virtual clock, its cable, and the driver's settings."""
 
     def __init__(self, **faults: Any) -> None:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
         self.controller = PM16CController(self.clock, self.line, channel=11, counts_per_turn=COUNTS, **faults)
-        self.url = register(next(NAMES), self.controller)
+        self.url = register(next(NAMES), self)
+        self._lost = b"nothing"
+
+    def receive(self, data: bytes) -> None:
+        if not data.startswith(self._lost) or b"?" in data:
+            self.controller.receive(data)
+
+    def transmit(self) -> bytes:
+        return self.controller.transmit()
 
     def open(self, **settings: Any) -> PM16CStage:
         usual: dict[str, Any] = {
@@ -50,6 +58,10 @@ class Rig:
 
     def bench(self) -> StageBench:
         return StageBench(self.open(), self.clock, self.line)
+
+    def lose(self, prefix: str) -> None:
+        """From now on commands (not queries) that begin so do not reach the controller."""
+        self._lost = prefix.encode()
 
     def say(self, *commands: str) -> str:
         """Another program, or a person at the panel; the reply to the last command."""
@@ -125,9 +137,10 @@ def test_a_channel_that_does_not_exist_is_refused(rig: Rig, channel: int) -> Non
 
 def test_limits_in_the_controller_that_leave_no_room_are_respected(rig: Rig) -> None:
     rig.say("REM", "FLB+20000", "BLB-2000", "SETLSB10000000")
-    with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
-        rig.open()
-    rig.open(high=math.radians(80)).close()
+    for limits in ({}, {"low": math.radians(-8.1), "high": 1.0}):
+        with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
+            rig.open(**limits)
+    rig.open(low=math.radians(-8), high=math.radians(80)).close()
     assert (rig.say("FL?B"), rig.say("SETLS?B")) == ("+0020000", "10000000")
 
 
@@ -222,6 +235,42 @@ def test_a_setting_that_another_program_took_back_is_noticed(rig: Rig) -> None:
     with pytest.raises(DeviceRefused, match="in LOCAL"):
         stage.start_move(0.1, SPEED)
     assert not stage.moving()
+
+
+@pytest.mark.parametrize("lost", ["RTE", "SETCH"])
+def test_a_setting_lost_on_the_way_is_noticed_at_opening(rig: Rig, lost: str) -> None:
+    rig.lose(lost)
+    with pytest.raises(DeviceError, match=lost):
+        rig.open()
+
+
+@pytest.mark.parametrize("lost", ["SPDHB2500", "SPDHB", "ABSB"])
+def test_a_command_lost_on_the_way_is_noticed_before_a_move_counts_as_begun(rig: Rig, lost: str) -> None:
+    stage = rig.open()
+    rig.say("SPDLB")
+    rig.lose(lost)
+    with pytest.raises(DeviceError, match=r"SPD\w+|ABS"):
+        stage.start_move(math.radians(30), SPEED)
+    assert not stage.moving()
+    assert stage.position() == 0.0
+
+
+@pytest.mark.parametrize("lost", ["TMGM", "TMGS", "TMGE", "TMGI", "TMGR"])
+def test_a_trigger_setting_lost_on_the_way_is_noticed_and_nothing_is_emitted(rig: Rig, lost: str) -> None:
+    bench = rig.bench()
+    rig.lose(lost)
+    with pytest.raises(DeviceError, match=f"a setting was not taken.*{lost}B.*Nothing has moved"):
+        bench.stage.arm(TriggerTrain(100, 10, 3))
+    bench.go(20.0)
+    assert bench.pulses() == []
+
+
+def test_a_disarm_lost_on_the_way_is_noticed(rig: Rig) -> None:
+    stage = rig.open()
+    stage.arm(TriggerTrain(100, 10, 3))
+    rig.lose("TMGC")
+    with pytest.raises(DeviceError, match="TMGCB"):
+        stage.disarm()
 
 
 # what stops a move

@@ -153,12 +153,16 @@ def test_a_reply_so_late_that_it_comes_between_probe_and_answer_is_passed_over()
 
 
 def test_a_late_answer_to_an_earlier_probe_is_not_left_behind() -> None:
-    """The probe itself timed out once: two answers to it come, the second must not meet the next request."""
-    line = connect(Echo({0: [], 1: [(1.04, b"ECHO\r\n")], 2: [(0.03, b"ECHO\r\n")]}))
+    """The probe itself timed out once; its late answer ends the second probe, whose own must not meet a request."""
+    echo = Echo({0: [], 1: [(1.15, b"ECHO\r\n")], 2: [(0.08, b"ECHO\r\n")]})
+    line = connect(echo)
     for _ in range(2):
         with pytest.raises(DeviceTimeout):
             ask(line, 1)
     assert ask(line, 2) == 2
+    echo.clock.sleep(1.0)
+    assert ask(line, 3) == 3
+    assert echo.heard == ["N?1", "ID?", "ID?", "N?2", "N?3"]
 
 
 @pytest.mark.parametrize("reply", [b"\xff\x80garbage\r\n", b"\r\n", b"1 2\r\n", b"12\n\r\n", b"ECHO\r\n"])
@@ -172,10 +176,12 @@ def test_a_reply_of_another_form_is_named_and_not_believed(reply: bytes) -> None
     assert echo.heard == ["N?1", "ID?", "N?2"]
 
 
-def test_an_endless_line_is_given_up() -> None:
-    line = connect(Echo({0: [(0.0, b"x" * 5000)]}))
+def test_an_endless_line_is_given_up_long_before_the_timeout() -> None:
+    echo = Echo({0: [(0.0, b"x" * 5000)]})
+    line = connect(echo, timeout=100.0)
     with pytest.raises(DeviceTimeout, match="no whole reply"):
         ask(line, 1)
+    assert echo.clock.now() < 1.0
     assert ask(line, 2) == 2
 
 
