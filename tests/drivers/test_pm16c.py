@@ -2,74 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
-from drivers.stages.pm16c import PM16CStage, achievable_acceleration
+from drivers.stages.pm16c import achievable_acceleration
 from drivers.stages.pm16c_channel import RATES, steepest_code
-from simulators.clock import VirtualClock
-from simulators.serial_url import register
-from simulators.trigger_line import TriggerLine
-from simulators.wires.pm16c import PM16CController
+from tests.drivers.pm16c_rig import COUNTS, Rig
 from tests.drivers.stage_conformance import LONG, SPEED, StageBench, StageConformance
-
-NAMES = (f"pm16c-test-{number}" for number in itertools.count())
-COUNTS = 90_000
-QUERIES_TO_OPEN = 7
-"""VER? STS? STS? SETCH? SETCH? RTE? SETLS?: the faults below count queries from power-on."""
-
-
-class Rig:
-    """A simulated controller (sample on channel 11, hex B) on a virtual clock, its cable, and the driver's settings."""
-
-    def __init__(self, **faults: Any) -> None:
-        self.clock = VirtualClock()
-        self.line = TriggerLine(self.clock)
-        self.controller = PM16CController(self.clock, self.line, channel=11, counts_per_turn=COUNTS, **faults)
-        self.url = register(next(NAMES), self)
-        self._lost = b"nothing"
-
-    def receive(self, data: bytes) -> None:
-        if not data.startswith(self._lost) or b"?" in data:
-            self.controller.receive(data)
-
-    def transmit(self) -> bytes:
-        return self.controller.transmit()
-
-    def open(self, **settings: Any) -> PM16CStage:
-        usual: dict[str, Any] = {
-            "channel": 11,
-            "counts_per_turn": COUNTS,
-            "clock": self.clock,
-            "max_speed": math.radians(30),
-            "acceleration": math.radians(60),
-            "low": math.radians(-5),
-            "high": math.radians(100),
-        }
-        return PM16CStage(self.url, **(usual | settings))
-
-    def bench(self) -> StageBench:
-        return StageBench(self.open(), self.clock, self.line)
-
-    def lose(self, prefix: str) -> None:
-        """From now on commands (not queries) that begin so do not reach the controller."""
-        self._lost = prefix.encode()
-
-    def say(self, *commands: str) -> str:
-        """Another program, or a person at the panel; the reply to the last command."""
-        reply = b""
-        for command in commands:
-            self.controller.receive(command.encode() + b"\r\n")
-            reply = self.controller.transmit()
-        return reply.decode().strip()
 
 
 @pytest.fixture
@@ -237,42 +182,6 @@ def test_a_setting_that_another_program_took_back_is_noticed(rig: Rig) -> None:
     assert not stage.moving()
 
 
-@pytest.mark.parametrize("lost", ["RTE", "SETCH"])
-def test_a_setting_lost_on_the_way_is_noticed_at_opening(rig: Rig, lost: str) -> None:
-    rig.lose(lost)
-    with pytest.raises(DeviceError, match=lost):
-        rig.open()
-
-
-@pytest.mark.parametrize("lost", ["SPDHB2500", "SPDHB", "ABSB"])
-def test_a_command_lost_on_the_way_is_noticed_before_a_move_counts_as_begun(rig: Rig, lost: str) -> None:
-    stage = rig.open()
-    rig.say("SPDLB")
-    rig.lose(lost)
-    with pytest.raises(DeviceError, match=r"SPD\w+|ABS"):
-        stage.start_move(math.radians(30), SPEED)
-    assert not stage.moving()
-    assert stage.position() == 0.0
-
-
-@pytest.mark.parametrize("lost", ["TMGM", "TMGS", "TMGE", "TMGI", "TMGR"])
-def test_a_trigger_setting_lost_on_the_way_is_noticed_and_nothing_is_emitted(rig: Rig, lost: str) -> None:
-    bench = rig.bench()
-    rig.lose(lost)
-    with pytest.raises(DeviceError, match=f"a setting was not taken.*{lost}B.*Nothing has moved"):
-        bench.stage.arm(TriggerTrain(100, 10, 3))
-    bench.go(20.0)
-    assert bench.pulses() == []
-
-
-def test_a_disarm_lost_on_the_way_is_noticed(rig: Rig) -> None:
-    stage = rig.open()
-    stage.arm(TriggerTrain(100, 10, 3))
-    rig.lose("TMGC")
-    with pytest.raises(DeviceError, match="TMGCB"):
-        stage.disarm()
-
-
 # what stops a move
 
 
@@ -323,49 +232,3 @@ def test_a_stop_from_another_thread_ends_the_wait_with_an_error(rig: Rig) -> Non
         stage.wait(1e4)
     stopper.join()
     assert not stage.moving()
-
-
-# a disturbed line
-
-
-def test_no_reply_is_a_timeout_and_the_next_request_is_in_step_again() -> None:
-    rig = Rig(silent={QUERIES_TO_OPEN})
-    stage = rig.open()
-    before = rig.clock.now()
-    with pytest.raises(DeviceTimeout, match=r"no whole reply within 1 s. Asked 'PS\?B'"):
-        stage.position()
-    assert rig.clock.now() - before == pytest.approx(1.0, abs=0.1)
-    assert stage.position() == 0.0
-
-
-def test_garbage_is_named_and_the_next_request_is_in_step_again() -> None:
-    rig = Rig(garbled={QUERIES_TO_OPEN})
-    stage = rig.open()
-    with pytest.raises(DeviceError, match=r"does not have the form.*signed position in pulses"):
-        stage.position()
-    assert stage.position() == 0.0
-
-
-def test_a_timeout_during_a_move_says_that_the_stage_may_be_turning_and_a_stop_still_works() -> None:
-    silent = set(range(QUERIES_TO_OPEN + 4, 10_000))
-    rig = Rig(silent=silent)
-    stage = rig.open()
-    stage.start_move(math.radians(60), math.radians(1))
-    with pytest.raises(DeviceTimeout, match="may be turning"):
-        stage.wait(LONG)
-    rig.clock.sleep(1.0)
-    with pytest.raises(DeviceTimeout):
-        stage.stop()
-    silent.clear()
-    assert rig.say("STSB?")[2] == "S"
-    stage.close()
-
-
-def test_a_dead_line_does_not_keep_the_port() -> None:
-    silent: set[int] = set()
-    rig = Rig(silent=silent)
-    stage = rig.open()
-    silent.update(range(10_000))
-    stage.close()
-    silent.clear()
-    rig.open().close()

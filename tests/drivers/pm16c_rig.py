@@ -1,0 +1,64 @@
+"""A simulated PM16C on a virtual clock, for the driver's tests."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+from drivers.stages.pm16c import PM16CStage
+from simulators.clock import VirtualClock
+from simulators.serial_url import register
+from simulators.trigger_line import TriggerLine
+from simulators.wires.pm16c import PM16CController
+from tests.drivers.stage_conformance import StageBench
+
+NAMES = (f"pm16c-test-{number}" for number in itertools.count())
+COUNTS = 90_000
+QUERIES_TO_OPEN = 7
+"""VER? STS? STS? SETCH? SETCH? RTE? SETLS?: the faults below count queries from power-on."""
+
+
+class Rig:
+    """A simulated controller (sample on channel 11, hex B) on a virtual clock, its cable, and the driver's settings."""
+
+    def __init__(self, **faults: Any) -> None:
+        self.clock = VirtualClock()
+        self.line = TriggerLine(self.clock)
+        self.controller = PM16CController(self.clock, self.line, channel=11, counts_per_turn=COUNTS, **faults)
+        self.url = register(next(NAMES), self)
+        self._lost = b"nothing"
+
+    def receive(self, data: bytes) -> None:
+        if not data.startswith(self._lost) or b"?" in data:
+            self.controller.receive(data)
+
+    def transmit(self) -> bytes:
+        return self.controller.transmit()
+
+    def open(self, **settings: Any) -> PM16CStage:
+        usual: dict[str, Any] = {
+            "channel": 11,
+            "counts_per_turn": COUNTS,
+            "clock": self.clock,
+            "max_speed": math.radians(30),
+            "acceleration": math.radians(60),
+            "low": math.radians(-5),
+            "high": math.radians(100),
+        }
+        return PM16CStage(self.url, **(usual | settings))
+
+    def bench(self) -> StageBench:
+        return StageBench(self.open(), self.clock, self.line)
+
+    def lose(self, prefix: str) -> None:
+        """From now on commands (not queries) that begin so do not reach the controller."""
+        self._lost = prefix.encode()
+
+    def say(self, *commands: str) -> str:
+        """Another program, or a person at the panel; the reply to the last command."""
+        reply = b""
+        for command in commands:
+            self.controller.receive(command.encode() + b"\r\n")
+            reply = self.controller.transmit()
+        return reply.decode().strip()

@@ -1,0 +1,55 @@
+"""A host that talks raw PM16C commands to the simulated controller, on a virtual clock."""
+
+from __future__ import annotations
+
+import math
+
+from simulators.clock import VirtualClock
+from simulators.trigger_line import Pulse, TriggerLine
+from simulators.wires.pm16c import PM16CController
+
+TURN = 360_000
+SPEED = 10_000
+ACCELERATION = 10_000.0
+"""pps²: code 24, 100 ms per 1000 pps."""
+
+
+class Wire:
+    """A controller in REMOTE with speed and acceleration set, and the cable in TP0."""
+
+    def __init__(self, **faults: object) -> None:
+        self.clock = VirtualClock(start=0.0)
+        self.line = TriggerLine(self.clock)
+        self.box = PM16CController(self.clock, self.line, counts_per_turn=TURN, **faults)  # type: ignore[arg-type]
+        self.tell("REM", f"SPDH0{SPEED}", "RTE0024", "TMGM02")
+
+    def tell(self, *commands: str) -> None:
+        for command in commands:
+            self.box.receive(command.encode() + b"\r\n")
+
+    def ask(self, *commands: str) -> str:
+        """The whole reply to the last command, without its CR LF, which must be there."""
+        self.tell(*commands)
+        reply = self.box.transmit()
+        assert reply.endswith(b"\r\n")
+        assert reply.count(b"\r\n") == 1
+        return reply[:-2].decode()
+
+    def train(self, start: int, end: int, interval: int) -> None:
+        self.tell("TMGC0", f"TMGS0{start:+d}", f"TMGE0{end:+d}", f"TMGI0{interval}", "TMGR0")
+
+    def run(self, *commands: str) -> None:
+        """Give commands and let an hour pass."""
+        self.tell(*commands)
+        self.clock.sleep(3600.0)
+
+    def pulses(self) -> list[Pulse]:
+        found, after = [], -math.inf
+        while (pulse := self.line.next_after(after)) is not None and pulse.time <= self.clock.now():
+            found.append(pulse)
+            after = pulse.time
+        return found
+
+    def counts(self) -> list[int]:
+        """Where the pulses were, in counts."""
+        return [round(pulse.angle * TURN / (2 * math.pi)) for pulse in self.pulses()]
