@@ -31,10 +31,9 @@ def add_exchange_view(file: h5py.File) -> None:
     control = file[f"{layout.DETECTOR}/image_key_control"][()]
     angles = file[layout.ANGLE][()]
     n = int(file[layout.COMMITTED][()])
-    text = h5py.string_dtype("utf-8", len("exchange"))
-    file.create_dataset("implements", data=b"exchange", dtype=text)
+    file["implements"] = "exchange"
     group = file.create_group("exchange")
-    units = bytes(file["/entry/record/quantity"][()])
+    units = file["/entry/record/quantity"].asstr()[()]
     for kind, name in NAMES.items():
         rows = np.flatnonzero(control[:n] == kind)
         if rows.size == 0:
@@ -45,7 +44,7 @@ def add_exchange_view(file: h5py.File) -> None:
             virtual[filled : filled + last - first] = h5py.VirtualSource(source)[first:last]
             filled += last - first
         dataset = group.create_virtual_dataset(name, virtual)
-        dataset.attrs["axes"] = np.bytes_(f"{THETA[name]}:y:x")
-        dataset.attrs["units"] = np.bytes_(units)
+        dataset.attrs["axes"] = f"{THETA[name]}:y:x"
+        dataset.attrs["units"] = units
         theta = group.create_dataset(THETA[name], data=angles[rows])
-        theta.attrs["units"] = np.bytes_("deg")
+        theta.attrs["units"] = "deg"

@@ -146,16 +146,17 @@ def create(
         ("/entry/record", "NXcollection"),
         ("/entry/progress", "NXcollection"),
     ):
-        file.create_group(path).attrs["NX_class"] = np.bytes_(kind)
-    file.attrs["default"] = np.bytes_("entry")
-    file[ENTRY].attrs["default"] = np.bytes_("data")
+        file.create_group(path).attrs["NX_class"] = kind
+    file.attrs["default"] = "entry"
+    file[ENTRY].attrs["default"] = "data"
 
-    _text(file, "/entry/definition", definition)
-    _text(file, "/entry/title", info.title or info.sample)
-    _text(file, "/entry/start_time", "" if start is None else iso_time(start))
-    _text(file, END_TIME, "", width=40)
-    _text(file, "/entry/sample/name", info.sample)
-    _text(file, "/entry/instrument/source/probe", "x-ray")
+    file["/entry/definition"] = definition
+    file["/entry/title"] = info.title or info.sample
+    if start is not None:
+        file["/entry/start_time"] = iso_time(start)
+        _rewritable_text(file, END_TIME, "", 40)
+    file["/entry/sample/name"] = info.sample
+    file["/entry/instrument/source/probe"] = "x-ray"
     for path, value, unit in (
         (f"{DETECTOR}/x_pixel_size", info.pixel_size_mm, "mm"),
         (f"{DETECTOR}/y_pixel_size", info.pixel_size_mm, "mm"),
@@ -167,23 +168,19 @@ def create(
     ):
         if value is not None:
             file[path] = np.float64(value)
-            file[path].attrs["units"] = np.bytes_(unit)
+            file[path].attrs["units"] = unit
     for name, text in (
         ("plan", info.plan),
         ("config", info.config),
         ("quantity", quantity),
         ("program", f"splatline {version()}"),
     ):
-        _text(file, f"/entry/record/{name}", text)
+        file[f"/entry/record/{name}"] = text
     for device, description in info.devices.items():
         group = file.create_group(f"/entry/instrument/devices/{device.replace('/', '_')}")
-        group.attrs["NX_class"] = np.bytes_("NXcollection")
+        group.attrs["NX_class"] = "NXcollection"
         for key, said in description.items():
-            path = f"{group.name}/{key.replace('/', '_')}"
-            if isinstance(said, str):
-                _text(file, path, said)
-            else:
-                file[path] = said
+            group[key.replace("/", "_")] = said
 
     _growing(file, DATA, frame_shape, dtype)
     _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
@@ -191,15 +188,15 @@ def create(
     for path, (kind, unit) in COLUMNS.items():
         _growing(file, path, (), np.dtype(kind))
         if unit:
-            file[path].attrs["units"] = np.bytes_(unit)
-    file["/entry/frame_log/time"].attrs["description"] = np.bytes_("since 1970-01-01T00:00:00Z, at the trigger")
+            file[path].attrs["units"] = unit
+    file["/entry/frame_log/time"].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
     _nxdata(file, rows, cols, info.pixel_size_mm)
 
     file[COMMITTED] = np.int64(0)
     file[FINISHED] = np.int8(0)
-    _text(file, STATUS, "running", width=16)
+    _rewritable_text(file, STATUS, "running", 16)
     _growing(file, MISSING, (), np.dtype("<i8"))
-    file[MISSING].attrs["description"] = np.bytes_("triggers of the scan, counted from 0, that gave no frame")
+    file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
 
 
 class Rows:
@@ -236,10 +233,16 @@ class Rows:
             dataset.id.set_extent((n, *dataset.id.shape[1:]))
 
 
-def _text(file: h5py.File, path: str, value: str, width: int = 0) -> None:
-    """A fixed-length UTF-8 string: variable-length ones cannot be read while a SWMR writer holds the file."""
-    encoded = value.encode()
-    file.create_dataset(path, data=encoded, dtype=h5py.string_dtype("utf-8", max(width, len(encoded), 1)))
+def settle_end_time(file: h5py.File) -> None:
+    """Once SWMR writing is over: the end time as variable-length text, which strict validators demand of a time."""
+    end = bytes(file[END_TIME][()]).decode()
+    del file[END_TIME]
+    file[END_TIME] = end
+
+
+def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None:
+    """Text of fixed length: variable-length text that is written under SWMR cannot be read (h5py issue 1273)."""
+    file.create_dataset(path, data=value.encode(), dtype=h5py.string_dtype("utf-8", width))
 
 
 def _growing(file: h5py.File, path: str, item: tuple[int, ...], dtype: np.dtype[Any]) -> None:
@@ -249,13 +252,13 @@ def _growing(file: h5py.File, path: str, item: tuple[int, ...], dtype: np.dtype[
 
 def _nxdata(file: h5py.File, rows: int, cols: int, pixel_size_mm: float | None) -> None:
     group = file["/entry/data"]
-    group.attrs["signal"] = np.bytes_("data")
-    group.attrs["axes"] = np.array([b"rotation_angle", b"y", b"x"])
+    group.attrs["signal"] = "data"
+    group.attrs["axes"] = ["rotation_angle", "y", "x"]
     for path in (DATA, ANGLE, IMAGE_KEY):
-        file[path].attrs["target"] = np.bytes_(path)  # NeXus: a link is a link by the target that it names
+        file[path].attrs["target"] = path  # NeXus: a link is a link by the target that it names
         group[path.rsplit("/", 1)[1]] = file[path]
     for name, n in (("y", rows), ("x", cols)):
         group[name] = np.arange(n) * (1.0 if pixel_size_mm is None else pixel_size_mm)
-        group[name].attrs["units"] = np.bytes_("pixel" if pixel_size_mm is None else "mm")
+        group[name].attrs["units"] = "pixel" if pixel_size_mm is None else "mm"
     for index, name in enumerate(("rotation_angle", "y", "x")):
         group.attrs[f"{name}_indices"] = np.int64(index)

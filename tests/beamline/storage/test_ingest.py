@@ -63,7 +63,7 @@ def test_a_float_stack_keeps_its_pixels_and_gets_statistics(stack: tuple[Path, n
                 np.testing.assert_equal(file[f"entry/digest/{name}"][i], getattr(expected, name))
         assert file["entry/digest/invalid_fraction"][5] == pytest.approx(2 / 24)
         np.testing.assert_array_equal(file["exchange/data"][()], pages)
-        assert file["exchange/data"].attrs["units"] == b"line_integrals"
+        assert file["exchange/data"].attrs["units"] == "line_integrals"
 
 
 def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -105,11 +105,11 @@ def copied_link(file: h5py.File) -> None:
 
 
 def dot_axes(file: h5py.File) -> None:
-    file["entry/data"].attrs["axes"] = np.array([b"rotation_angle", b".", b"."])
+    file["entry/data"].attrs["axes"] = ["rotation_angle", ".", "."]
 
 
 def turned_axes(file: h5py.File) -> None:
-    file["entry/data"].attrs["axes"] = np.array([b"y", b"x", b"rotation_angle"])
+    file["entry/data"].attrs["axes"] = ["y", "x", "rotation_angle"]
 
 
 def no_name(file: h5py.File) -> None:
@@ -117,11 +117,11 @@ def no_name(file: h5py.File) -> None:
 
 
 def german_time(file: h5py.File) -> None:
-    file["entry/end_time"][()] = b"20.11.2026 5 Uhr"
+    file["entry/end_time"][()] = "20.11.2026 5 Uhr"
 
 
 def ends_first(file: h5py.File) -> None:
-    file["entry/end_time"][()] = b"2020-01-01T00:00:00+00:00"
+    file["entry/end_time"][()] = "2020-01-01T00:00:00+00:00"
 
 
 def time_back(file: h5py.File) -> None:
