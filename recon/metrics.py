@@ -1,0 +1,189 @@
+"""How good a volume is: against a truth (PSNR, SSIM, NRMSE), and without one (SNR, CNR of dense against empty)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.cluster.vq import kmeans2
+
+_WINDOW, _SIGMA = 11, 1.5
+_SAMPLE = 100_000  # voxels that fix the two cluster centres
+_SLAB = 32  # slices at a time
+
+Array = NDArray[np.floating]
+
+
+def _same_shape(truth: Array, volume: Array) -> None:
+    if truth.shape != volume.shape or truth.size == 0:
+        raise ValueError(f"truth has shape {truth.shape}, the volume to judge {volume.shape}; they must be equal")
+
+
+def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
+    """Peak signal-to-noise ratio, 10 log₁₀(peak² / mean squared error) in dB; inf for equal volumes.
+
+    Args:
+        truth, volume: the same shape, any number of dimensions.
+        peak: None: the maximum of the truth.
+    """
+    _same_shape(truth, volume)
+    top = float(truth.max()) if peak is None else peak
+    if not top > 0:
+        raise ValueError(f"the peak must be positive, got {top}; give one where the truth has no positive value")
+    error = float(np.mean(np.subtract(volume, truth, dtype=np.float64) ** 2))
+    return float(10 * np.log10(top**2 / error)) if error else float("inf")
+
+
+def nrmse(truth: Array, volume: Array) -> float:
+    """Root mean squared error over the root mean square of the truth: ‖volume - truth‖ / ‖truth‖."""
+    _same_shape(truth, volume)
+    norm = float(np.linalg.norm(np.asarray(truth, np.float64).ravel()))
+    if norm == 0:
+        raise ValueError("the truth is zero everywhere: an error relative to it has no meaning")
+    return float(np.linalg.norm(np.subtract(volume, truth, dtype=np.float64).ravel())) / norm
+
+
+def _data_range(truth: Array, data_range: float | None) -> float:
+    span = float(truth.max() - truth.min()) if data_range is None else data_range
+    if not span > 0:
+        raise ValueError(f"the data range must be positive, got {span}; give one where the truth is constant")
+    return span
+
+
+def _ssim_sum(x: Array, y: Array, span: float, plane: tuple[int, int]) -> tuple[float, int]:
+    """Sum of the local SSIM over windows in the plane (two axes), and their number."""
+
+    def blur(image: Array) -> Array:
+        for axis in plane:
+            image = ndimage.gaussian_filter1d(image, _SIGMA, axis=axis, radius=_WINDOW // 2)
+        return image
+
+    c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
+    mean_x, mean_y = blur(x), blur(y)
+    cross = mean_x * mean_y
+    squares = mean_x**2 + mean_y**2
+    covariance = blur(x * y) - cross
+    variances = blur(x * x + y * y) - squares
+    local = (2 * cross + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))
+    inner = [slice(None)] * x.ndim
+    for axis in plane:
+        if x.shape[axis] >= _WINDOW:
+            inner[axis] = slice(_WINDOW // 2, x.shape[axis] - _WINDOW // 2)
+    local = local[tuple(inner)]
+    return float(local.sum(dtype=np.float64)), local.size
+
+
+def ssim2d(truth: Array, image: Array, data_range: float | None = None) -> float:
+    """Mean structural similarity of two images (Wang et al. 2004, eq. 13), 1 for equal ones.
+
+    Gaussian window of 11 x 11 with σ = 1.5, K1 = 0.01, K2 = 0.03, variances without Bessel's correction, the mean over
+    windows that lie inside the image. Along an axis shorter than the window the image is mirrored.
+
+    Args:
+        truth, image: [row, col].
+        data_range: None: maximum - minimum of the truth.
+    """
+    _same_shape(truth, image)
+    if truth.ndim != 2:
+        raise ValueError(f"images must be [row, col], got shape {truth.shape}")
+    total, count = _ssim_sum(
+        np.asarray(truth, np.float64), np.asarray(image, np.float64), _data_range(truth, data_range), (0, 1)
+    )
+    return total / count
+
+
+def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> float:
+    """Mean over the three directions of the mean `ssim2d` of the slices across it.
+
+    Args:
+        truth, volume: [z, y, x].
+        data_range: one for all slices; None: maximum - minimum of the whole truth.
+    """
+    _same_shape(truth, volume)
+    if truth.ndim != 3:
+        raise ValueError(f"volumes must be [z, y, x], got shape {truth.shape}")
+    span = _data_range(truth, data_range)
+    means = []
+    for across in range(3):
+        first, second = np.moveaxis(truth, across, 0), np.moveaxis(volume, across, 0)
+        total, count = 0.0, 0
+        for start in range(0, len(first), _SLAB):
+            part = slice(start, start + _SLAB)
+            x, y = (np.ascontiguousarray(v[part], np.float32) for v in (first, second))
+            slab_total, slab_count = _ssim_sum(x, y, span, (1, 2))
+            total, count = total + slab_total, count + slab_count
+        means.append(total / count)
+    return float(np.mean(means))
+
+
+def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[slice, slice, slice]:
+    """The box inside the cylinder that the field of view turns through, less a margin: (z, y, x) slices.
+
+    The side is 2 r cos 45° for a circle of radius r = half the smaller of ny and nx. The margin is a fraction of the
+    side, and of the height, taken off at each end.
+    """
+    if not 0 <= margin < 0.5:
+        raise ValueError(f"the margin is a fraction of the side, 0 to 0.5, got {margin}")
+    nz, ny, nx = shape
+    side = min(ny, nx) * np.cos(np.pi / 4)
+    halves = (nz / 2 * (1 - 2 * margin), side / 2 * (1 - 2 * margin), side / 2 * (1 - 2 * margin))
+    return tuple(  # type: ignore[return-value]
+        slice(int(np.floor(n / 2 - min(half, n / 2))), int(np.ceil(n / 2 + min(half, n / 2))))
+        for n, half in zip(shape, halves, strict=True)
+    )
+
+
+def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np.int8]:
+    """Dense and empty regions by k-means with k = 2 on the voxel values, within the inscribed cuboid.
+
+    Args:
+        volume: [z, y, x], good enough to tell the two apart: the mask may then judge other volumes of the same sample.
+        seed: of the sample and of the k-means++ start.
+        margin: see `inscribed_cuboid`.
+
+    Returns:
+        int8 [z, y, x]: 1 dense, 0 empty, -1 outside the cuboid (not judged).
+
+    Raises:
+        ValueError: where all voxels have the same value or some are not finite.
+    """
+    box = inscribed_cuboid(volume.shape, margin)
+    values = np.asarray(volume[box], np.float64).ravel()
+    if not np.isfinite(values).all():
+        raise ValueError("the volume holds NaN or infinite values")
+    rng = np.random.default_rng(seed)
+    sample = values if values.size <= _SAMPLE else rng.choice(values, _SAMPLE, replace=False)
+    if np.ptp(sample) == 0:
+        raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to tell apart")
+    centres, _ = kmeans2(sample[:, None], 2, iter=30, minit="++", rng=rng)
+    mask = np.full(volume.shape, -1, np.int8)
+    mask[box] = volume[box] > centres.mean()
+    return mask
+
+
+def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[float, float]:
+    """Signal-to-noise and contrast-to-noise ratio in dB: 20 log₁₀(μ / σ_b) and 20 log₁₀(|μ - μ_b| / σ_b).
+
+    μ is the mean of the dense region, μ_b and σ_b mean and standard deviation of the empty one. inf where σ_b is 0,
+    -inf where the numerator is not positive.
+
+    Args:
+        volume: [z, y, x].
+        mask: 1 (True) dense, 0 (False) empty, -1 not judged; see `kmeans_mask`.
+
+    Raises:
+        ValueError: where shapes differ or a region is empty of voxels.
+    """
+    if volume.shape != mask.shape:
+        raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
+    dense, empty = np.asarray(volume[mask == 1], np.float64), np.asarray(volume[mask == 0], np.float64)
+    if not dense.size or not empty.size:
+        raise ValueError(f"the mask marks {dense.size} dense and {empty.size} empty voxels; both are needed")
+    spread = float(empty.std())
+
+    def decibel(signal: float) -> float:
+        if not signal > 0:
+            return float("-inf")
+        return float(20 * np.log10(signal / spread)) if spread else float("inf")
+
+    return decibel(float(dense.mean())), decibel(abs(float(dense.mean() - empty.mean())))

@@ -1,0 +1,88 @@
+"""Which views to use, in a word: all, fixed:90, sector:30-150:60, random:45:7, first:20."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FORMS = "all, fixed:N, sector:A-B[:N] (degrees), random:N[:seed], first:N"
+
+_NUMBER = r"[+-]?\d+(?:\.\d*)?"
+_SECTOR = re.compile(rf"({_NUMBER})-({_NUMBER})(?::(\d+))?")
+_RANDOM = re.compile(r"(\d+)(?::(\d+))?")
+_COUNT = re.compile(r"\d+")
+
+
+def parse_views(spec: str, angles: ArrayLike, seed: int = 0) -> NDArray[np.int64]:
+    """Indices of the views that a selection names, ascending, none twice.
+
+    - `all`: every view.
+    - `fixed:N`: N views spread evenly in angle. Views half a turn apart see the same rays, so they count as one place
+      as long as there are N places.
+    - `sector:A-B[:N]`: views with A <= angle <= B degrees (modulo 360); of these, N spread evenly.
+    - `random:N[:seed]`: N views drawn without replacement.
+    - `first:N`: the N views taken first.
+
+    Args:
+        spec: the selection.
+        angles: [view], radians, in the order taken.
+        seed: for `random:N` without a seed of its own.
+
+    Raises:
+        ValueError: for a selection that is not one of these forms, or that asks for more views than there are.
+    """
+    theta = np.asarray(angles, np.float64)
+    everything = np.arange(theta.size)
+    name, _, rest = spec.strip().partition(":")
+    if name == "all" and not rest:
+        return everything
+    if name in ("fixed", "first") and _COUNT.fullmatch(rest):
+        n = _enough(int(rest), theta.size, spec)
+        return everything[:n] if name == "first" else _even(everything, theta, n)
+    if name == "random" and (match := _RANDOM.fullmatch(rest)):
+        n = _enough(int(match[1]), theta.size, spec)
+        rng = np.random.default_rng(seed if match[2] is None else int(match[2]))
+        return np.sort(rng.choice(everything, n, replace=False))
+    if name == "sector" and (match := _SECTOR.fullmatch(rest)):
+        return _sector(theta, float(match[1]), float(match[2]), match[3], spec)
+    raise ValueError(f"unknown selection of views {spec!r}; use one of: {FORMS}")
+
+
+def _enough(n: int, available: int, spec: str) -> int:
+    if not 1 <= n <= available:
+        raise ValueError(f"{spec!r} asks for {n} views; between 1 and {available} can be had")
+    return n
+
+
+def _sector(theta: NDArray[np.float64], low: float, high: float, count: str | None, spec: str) -> NDArray[np.int64]:
+    if not high > low:
+        raise ValueError(f"{spec!r}: the sector must end after it begins, {high:g} is not above {low:g} degrees")
+    slack = 1e-6  # degrees, so that an end that is a view's own angle takes that view
+    from_low = np.mod(np.rad2deg(theta) - low + slack, 360)
+    inside = np.flatnonzero(from_low <= high - low + 2 * slack)
+    if not inside.size:
+        degrees = np.rad2deg(theta)
+        raise ValueError(
+            f"{spec!r} holds none of the {theta.size} views, which lie at "
+            f"{degrees.min():.2f} to {degrees.max():.2f} degrees"
+        )
+    if count is None:
+        return inside
+    return _even(inside, theta, _enough(int(count), inside.size, spec))
+
+
+def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    """n of the views, spread evenly over their places on the half circle, or over themselves if places are too few."""
+    half_turn = np.sort(np.mod(theta[views], np.pi))
+    gaps = np.diff(half_turn, append=half_turn[0] + np.pi)
+    step = float(np.median(gaps[gaps > 1e-9]))
+    # Counted from the first view; where a wedge is missing, from its far side: a sector may cross 180 degrees.
+    widest = int(gaps.argmax())
+    begin = theta[views[0]] if gaps[widest] < 2 * step else half_turn[(widest + 1) % half_turn.size]
+    place = np.mod(theta[views] - begin + 0.05 * step, np.pi)
+    order = np.argsort(place, kind="stable")
+    starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
+    distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # of views at one place the earliest
+    return np.sort(views[distinct[np.arange(n) * distinct.size // n]])
