@@ -1,0 +1,124 @@
+"""`beamline info`, `validate`, `ingest`: what a file holds, whether readers can rely on it, a TIFF made a scan."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+from beamline.cli.scan_options import scan_options
+from beamline.errors import DataError
+from beamline.events import Event, JsonLines
+from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest as ingest_scan
+from beamline.storage.validate import validate as findings_of
+from drivers.clock import SystemClock
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("file", type=_PATH)
+@scan_options
+@click.option("--json", "as_json", is_flag=True, help="One event on stdout.")
+def info(file: Path, as_json: bool, **said: Any) -> None:
+    """Say what the scan in FILE holds; nothing is guessed."""
+    facts = dict(describe(file, **said))
+    if as_json:
+        JsonLines(sys.stdout)(Event("done", SystemClock().now(), facts))
+        return
+    attributes, findings = facts.pop("attributes"), facts.pop("findings")
+    width = max(len(name) for name in (*facts, *attributes)) + 2
+    for name, value in (facts | attributes).items():
+        click.echo(f"{name:<{width}}{_text(value)}")
+    for message in findings:
+        click.echo(f"! {message}")
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "not known"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{n} {name}" for name, n in value.items())
+    if isinstance(value, tuple | list):
+        return " x ".join(str(v) for v in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = str(value)
+    return text if len(text) <= 160 else text[:157] + "..."
+
+
+@click.command()
+@click.argument("file", type=_PATH)
+@scan_options
+@click.option("--json", "as_json", is_flag=True, help="One event a finding on stdout, then the verdict.")
+def validate(file: Path, as_json: bool, **said: Any) -> None:
+    """Check the scan in FILE against the rules that readers rely on. Errors give exit code 5, warnings do not."""
+    findings = findings_of(file, **said)
+    counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
+    if as_json:
+        sink, now = JsonLines(sys.stdout), SystemClock().now()
+        for finding in findings:
+            sink(Event("flag", now, vars(finding)))
+        sink(Event("done", now, {"file": file, **counts}))
+    else:
+        for finding in findings:
+            click.echo(f"{finding.severity:<9}{finding.rule:<16}{finding.message}")
+        click.echo(f"{file}: {counts['error']} errors, {counts['warning']} warnings")
+    if counts["error"]:
+        raise DataError(f"{file} breaks {counts['error']} of the rules that readers rely on; they are listed above.")
+
+
+@click.command()
+@click.argument("source", type=_PATH, metavar="IN")
+@click.argument("output", type=_PATH, metavar="OUT.h5")
+@scan_options
+@click.option("--pixel-size-um", type=click.FloatRange(min=0, min_open=True), help="At the sample.")
+@click.option("--energy-kev", type=click.FloatRange(min=0, min_open=True))
+@click.option("--sample", help="Its name, for the record.")
+@click.option("--no-data", type=float, help="A pixel value that means: not measured.")
+@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+def ingest(
+    source: Path,
+    output: Path,
+    pixel_size_um: float | None,
+    energy_kev: float | None,
+    sample: str | None,
+    no_data: float | None,
+    as_json: bool,
+    **said: Any,
+) -> None:
+    """Copy the scan IN (multi-page TIFF, folder or .zip of TIFFs, HDF5) into the new HDF5 scan OUT.h5.
+
+    One frame is in memory at a time; each gets its statistics and a preview. Nothing is overwritten.
+    """
+    clock = SystemClock()
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("frames", total=None)
+        began = clock.now()
+        done = ingest_scan(
+            source,
+            output,
+            pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
+            energy_kev=energy_kev,
+            sample=sample,
+            no_data=no_data,
+            progress=lambda n, total: bar.update(task, completed=n, total=total),
+            **said,
+        )
+    seconds = clock.now() - began
+    if as_json:
+        JsonLines(sys.stdout)(Event("done", clock.now(), {**vars(done), "output": done.path, "seconds": seconds}))
+        return
+    click.echo(f"output   {done.path} ({done.definition})")
+    click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
+    click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")

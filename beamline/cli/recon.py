@@ -1,0 +1,190 @@
+"""`beamline recon`: a scan file in, a volume and its report out."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.narrate import Narrator
+from beamline.cli.scan_options import scan_options
+from beamline.deliver import Target
+from beamline.errors import BeamlineError
+from beamline.events import Event, JsonLines, Sink
+from beamline.follow import follow as follow_scan
+from beamline.offline import Method, ReconOptions, SourceOptions, run
+from beamline.pipeline import Selection
+from drivers.clock import SystemClock
+from recon.correct import CorrectionSettings
+from recon.fbp import Filter
+
+
+def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """`first:end`, whole numbers."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+):(\d+)", value)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise click.BadParameter(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
+    return int(match[1]), int(match[2])
+
+
+def column(ctx: click.Context, param: click.Parameter, value: str) -> float | None:
+    """A column of the detector; None for "auto"."""
+    if value == "auto":
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise click.BadParameter(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
+    return number
+
+
+def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str | tuple[int, int]:
+    """Which columns at the detector's edges show air: auto, none, or counts `left,right`."""
+    match = re.fullmatch(r"(\d+),(\d+)", value)
+    if match is not None:
+        return int(match[1]), int(match[2])
+    if value not in ("auto", "none"):
+        raise click.BadParameter(f"{value!r} is none of auto, none, LEFT,RIGHT (numbers of columns, e.g. 12,12)")
+    return value
+
+
+@contextmanager
+def telling(as_json: bool, clock: SystemClock) -> Iterator[Sink]:
+    """The sink that the user asked for; with JSON a failure is its last line."""
+    if not as_json:
+        with Narrator() as narrator:
+            yield narrator
+        return
+    sink = JsonLines(sys.stdout)
+    try:
+        yield sink
+    except BeamlineError as error:
+        sink(Event("failed", clock.now(), {"message": str(error), "exit_code": error.exit_code}))
+        raise
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("-m", "--method", type=click.Choice(["r2", "fbp"]), default="r2", show_default=True)
+@click.option(
+    "--views",
+    default="all",
+    show_default=True,
+    metavar="SPEC",
+    help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N",
+)
+@click.option("--rows", callback=span, metavar="FIRST:END", help="Detector rows; the volume has one slice a row.")
+@click.option(
+    "--bin", "binning", type=click.IntRange(min=1), default=1, show_default=True, help="Pixels averaged a side."
+)
+@click.option(
+    "--axis",
+    callback=column,
+    metavar="PX|auto",
+    default="auto",
+    show_default=True,
+    help="Rotation axis: column of the unbinned detector (0 is the centre of the first), or auto to find it.",
+)
+@scan_options
+@click.option("--pixel-size-um", type=click.FloatRange(min=0, min_open=True), help="At the sample; else the file's.")
+@click.option(
+    "--air",
+    callback=air_columns,
+    metavar="auto|none|LEFT,RIGHT",
+    default="auto",
+    show_default=True,
+    help="Edge columns that show air in every view.",
+)
+@click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2).")
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Time for the fit (r2), instead of --steps; with --follow, after the scan has ended.",
+)
+@click.option("--gaussians", type=click.IntRange(min=1), help="How many to start from (r2).")
+@click.option(
+    "--filter", "ramp", type=click.Choice(["ram-lak", "shepp-logan", "hann"]), default="ram-lak", show_default=True
+)
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5), slices A to B.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Default: FILE's stem + _METHOD.h5, here.")
+@click.option("--report/--no-report", default=True, show_default=True, help="An HTML page beside the output.")
+@click.option("--follow", is_flag=True, help="The scan is still running: reconstruct while its file grows.")
+@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+def recon(
+    file: Path,
+    method: Method,
+    views: str,
+    rows: tuple[int, int] | None,
+    binning: int,
+    axis: float | None,
+    pixel_size_um: float | None,
+    air: Any,
+    steps: int | None,
+    seconds: float | None,
+    gaussians: int | None,
+    ramp: Filter,
+    seed: int,
+    truth: str | None,
+    output: Path | None,
+    report: bool,
+    follow: bool,
+    as_json: bool,
+    **said: Any,
+) -> None:
+    """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
+
+    Writes a volume [z, y, x] in 1/mm (1/px where the pixel size is unknown) as NXtomoproc, with everything that it was
+    made with, and a report. Nothing is overwritten, and a failure leaves nothing behind.
+    """
+    if steps is not None and seconds is not None:
+        raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
+    output = output or Path(f"{file.stem}_{method}.h5")
+    options = ReconOptions(
+        source=SourceOptions(file, **said),
+        target=Target(output, report_beside(output) if report else None),
+        selection=Selection(
+            views=views,
+            rows=rows,
+            binning=binning,
+            axis_col=axis,
+            pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
+            correction=CorrectionSettings(air=air),
+            seed=seed,
+        ),
+        method=method,
+        steps=steps,
+        seconds=seconds,
+        gaussians=gaussians,
+        filter=ramp,
+        seed=seed,
+        truth=truth,
+        command=repeated(sys.argv[1:]),
+    )
+    clock = SystemClock()
+    with telling(as_json, clock) as sink:
+        if follow:
+            follow_scan(options, sink, clock)
+        else:
+            run(options, sink, clock)
+
+
+def report_beside(output: Path) -> Path:
+    """A run's recon.h5 has report.html; any other output a page of its own name: several fit in a folder."""
+    return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
+
+
+def repeated(arguments: list[str]) -> str:
+    """The command line that repeats this call."""
+    return shlex.join(["beamline", *arguments])

@@ -1,0 +1,37 @@
+"""Options that say of a scan what its file does not; the same for every command that opens one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+_PATH = click.Path(path_type=Path)
+
+
+def underscored(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
+    """`line-integrals` on the command line is line_integrals inside."""
+    return None if value is None else value.replace("-", "_")
+
+
+def scan_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds --quantity, --angles, --angle-rows, --darks and --flats: the keywords of storage.source.open_scan."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+_OPTIONS = (
+    click.option(
+        "--quantity",
+        type=click.Choice(["counts", "line-integrals"]),
+        callback=underscored,
+        help="What the pixels are, where the file does not say: raw counts, or line integrals that need no correction.",
+    ),
+    click.option("--angles", type=_PATH, help="Text file, degrees, one a line."),
+    click.option("--angle-rows", metavar="A:B", help="Which of these angles belong to the projections."),
+    click.option("--darks", type=_PATH, help="Image file or folder, instead of the file's."),
+    click.option("--flats", type=_PATH, help="Image file or folder, instead of the file's."),
+)

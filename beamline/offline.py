@@ -1,0 +1,164 @@
+"""Offline reconstruction: a finished scan file in, a volume with its report out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import recon
+from beamline.deliver import Target, deliver
+from beamline.errors import DataError
+from beamline.events import Event, Sink
+from beamline.measure import fit_truth, read_truth
+from beamline.pipeline import Prepared, Selection, prepare
+from beamline.recon_report import Context, Made, facts_of
+from beamline.storage.source import Quantity, ScanSource, open_scan
+from drivers.clock import Clock
+from recon.fbp import Filter
+from recon.fit import Progress
+from recon.volume import Grid
+
+Method = Literal["r2", "fbp"]
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """Which scan, and what to take instead of what its file says (see storage.source.open_scan)."""
+
+    path: Path
+    quantity: Quantity | None = None
+    angles: Path | None = None
+    angle_rows: str | None = None
+    darks: Path | None = None
+    flats: Path | None = None
+
+    def open(self, *, follow: bool = False) -> ScanSource:
+        return open_scan(
+            self.path,
+            angles=self.angles,
+            angle_rows=self.angle_rows,
+            darks=self.darks,
+            flats=self.flats,
+            quantity=self.quantity,
+            follow=follow,
+        )
+
+
+@dataclass(frozen=True)
+class ReconOptions:
+    """What to reconstruct and how.
+
+    Attributes:
+        source: the scan.
+        target: where results go.
+        selection: which part of the scan, and its correction.
+        method: "r2" or "fbp".
+        steps: of the fit; None takes the reconstructor's own number.
+        seconds: at most, for the fit; for a followed scan, after its end.
+        gaussians: how many to start from; None derives it from the volume.
+        filter: of the FBP.
+        seed: of everything random.
+        truth: FILE or FILE:first:end to compare with.
+        command: that repeats this, for the record.
+    """
+
+    source: SourceOptions
+    target: Target
+    selection: Selection
+    method: Method = "r2"
+    steps: int | None = None
+    seconds: float | None = None
+    gaussians: int | None = None
+    filter: Filter = "ram-lak"
+    seed: int = 0
+    truth: str | None = None
+    command: str = ""
+
+
+class Warnings:
+    """Collects warnings for the report while it sends them on as events."""
+
+    def __init__(self, sink: Sink, clock: Clock) -> None:
+        self._sink, self._clock = sink, clock
+        self.said: list[str] = []
+
+    def __call__(self, text: str) -> None:
+        if text not in self.said:
+            self.said.append(text)
+            self._sink(Event("warning", self._clock.now(), {"message": text}))
+
+
+def run(options: ReconOptions, sink: Sink, clock: Clock) -> dict[str, float]:
+    """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
+
+    Raises:
+        ConfigError, DataError: with nothing written.
+    """
+    started = clock.now()
+    options.target.refuse_existing()
+    wanted = None if options.truth is None else read_truth(options.truth)
+    warn = Warnings(sink, clock)
+    with options.source.open() as source:
+        if not source.finished:
+            raise DataError(f"{source.path} is still being written. Follow it with --follow, or wait for its end.")
+        facts = facts_of(source)
+        prepared = prepare(source, options.selection, warn)
+    grid = Grid.matching(prepared.geometry)
+    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning)
+    announce(options, prepared, sink, clock)
+    made = reconstruct(options, prepared, grid, sink, clock)
+    context = Context(facts, options.selection, options.command, options.seed, warn.said, started)
+    return deliver(made, prepared, truth, options.target, context, sink, clock)
+
+
+def announce(options: ReconOptions, prepared: Prepared, sink: Sink, clock: Clock) -> None:
+    """Say what is about to be reconstructed."""
+    data = {
+        "file": options.source.path,
+        "method": options.method,
+        "n_views": prepared.geometry.n_views,
+        "n_projections": prepared.n_projections,
+        "detector": prepared.geometry.detector_shape,
+        "axis_col": prepared.axis_col,
+        "axis_confident": None if prepared.axis is None else prepared.axis.confident,
+    }
+    sink(Event("recon_started", clock.now(), data))
+
+
+def reconstruct(options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sink, clock: Clock) -> Made:
+    """Run the reconstructor on prepared views."""
+    try:
+        result = recon.reconstruct(
+            prepared.projections.data,
+            prepared.geometry,
+            grid,
+            method=options.method,
+            steps=options.steps,
+            gaussians=options.gaussians,
+            seed=options.seed,
+            filter=options.filter,
+            seconds=options.seconds,
+            on_progress=progress_events(sink, clock),
+            now=clock.now,
+        )
+    except ValueError as error:
+        raise DataError(f"{options.source.path} cannot be reconstructed by {options.method}: {error}") from error
+    return Made(
+        volume=result.volume,
+        method=options.method,
+        seconds=result.seconds,
+        history=result.history,
+        settings=result.settings,
+        filter=options.filter,
+    )
+
+
+def progress_events(sink: Sink, clock: Clock) -> Callable[[Progress], None]:
+    """A listener that passes the fit's progress on as events."""
+
+    def listen(progress: Progress) -> None:
+        sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress)}))
+
+    return listen

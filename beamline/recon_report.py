@@ -1,0 +1,190 @@
+"""What the report on a reconstruction says: the scan, the settings, the figures of merit and the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline import figures
+from beamline.pipeline import Prepared, Selection
+from beamline.report import METRICS, Picture, Report, formatted
+from beamline.storage.recon_file import Value
+from beamline.storage.source import ScanSource
+from drivers.frame import FrameKind
+from recon.fbp import Filter
+from recon.fit import Progress
+from recon.volume import Volume
+
+METHOD_NAMES = {"fbp": "FBP", "r2": "R²-Gaussian"}
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """What a report says of the scan itself.
+
+    Attributes:
+        path, name: of the file.
+        sample: its name, where the file tells.
+        table: facts for people, by name.
+        frames: frames there are of those planned, e.g. "110/110".
+    """
+
+    path: Path
+    name: str
+    sample: str
+    table: Mapping[str, str]
+    frames: str
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A reconstruction and how it was made.
+
+    Attributes:
+        volume, method: "r2" or "fbp".
+        seconds: of reconstruction alone.
+        history: of the fit; empty for FBP.
+        settings: every setting of the reconstructor, by name.
+        filter: of the FBP (also of the one it is compared with).
+        psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
+    """
+
+    volume: Volume
+    method: str
+    seconds: float
+    history: Sequence[Progress]
+    settings: Mapping[str, Any]
+    filter: Filter = "ram-lak"
+    psnr: Sequence[tuple[float, float]] = ()
+
+
+@dataclass(frozen=True)
+class Context:
+    """What surrounds a reconstruction: the scan, the selection, the command, and what was warned of so far."""
+
+    facts: ScanFacts
+    selection: Selection
+    command: str
+    seed: int
+    warnings: Sequence[str] = ()
+    started: float = 0.0
+    scan_flags: Sequence[str] = field(default_factory=tuple)
+
+
+def facts_of(source: ScanSource) -> ScanFacts:
+    """Facts of an open scan."""
+    counts = {kind: int(np.sum(source.image_key == kind)) for kind in FrameKind}
+    attributes = dict(source.attributes)
+    sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
+    pitch, energy = source.pixel_size_mm, source.energy_kev
+    planned = attributes.pop("frames_planned", None)
+    table = {
+        "file": source.path.name,
+        "format": source.format,
+        "sample": sample or "not stated",
+        "projections": str(counts[FrameKind.PROJECTION]),
+        "flats, darks": f"{counts[FrameKind.FLAT]}, {counts[FrameKind.DARK]}",
+        "detector (rows × columns)": f"{source.shape[0]} × {source.shape[1]}",
+        "pixel size": "not known" if pitch is None else f"{pitch * 1e3:.4g} µm",
+        "energy": "not known" if energy is None else f"{energy:g} keV",
+        "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
+    }
+    table |= {str(k): str(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
+    n = int(source.image_key.size)
+    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{planned if planned else n}")
+
+
+def compose(
+    made: Made,
+    prepared: Prepared,
+    truth: Volume | None,
+    volumes: Mapping[str, Volume],
+    metrics: Mapping[str, Mapping[str, float]],
+    parameters: Mapping[str, Value],
+    context: Context,
+) -> Report:
+    """The report on a reconstruction."""
+    name, geometry = METHOD_NAMES[made.method], prepared.geometry
+    best = "psnr" if truth is not None else "residual"
+    own = metrics[made.method]
+    summary = (
+        f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
+        f"{prepared.n_projections} views in {made.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
+    )
+    if "fbp" in metrics and made.method != "fbp":
+        summary += f" (FBP of the same views: {formatted(best, metrics['fbp'][best])})"
+    settings = {k: str(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
+    footnotes = [
+        "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
+        f"SNR, CNR: between the two classes that k-means makes of {'the truth' if truth else 'this volume'}'s values.",
+    ]
+    if truth is not None:
+        footnotes.append(
+            "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
+        )
+    return Report(
+        title=f"{context.facts.sample or context.facts.name}: {name}",
+        summary=summary + ".",
+        scan=context.facts.table,
+        settings=settings,
+        metrics={METHOD_NAMES[method]: values for method, values in metrics.items()},
+        frames=context.facts.frames,
+        flags=[*context.scan_flags, *context.warnings],
+        pictures=_pictures(made, prepared, truth, volumes),
+        command=context.command,
+        footnotes=footnotes,
+    )
+
+
+def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:
+    data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
+    row = geometry.detector_shape[0] // 2
+    shown = {"Truth": truth} if truth is not None else {}
+    shown |= {METHOD_NAMES[method]: volume for method, volume in volumes.items()}
+    pictures = [
+        Picture(
+            "Slices",
+            "Three orthogonal slices through the middle of the volume, all in one grey window (1st to 99.5th "
+            "percentile of what is shown).",
+            figures.orthogonal_slices(shown, unit),
+        )
+    ]
+    if made.history:
+        pictures.append(
+            Picture(
+                "Quality against time",
+                "Misfit of the model to the views while it was fitted, in the time since the fit began.",
+                figures.quality_against_time(history_arrays(made.history), made.psnr),
+            )
+        )
+    pictures += [
+        Picture(
+            "Projection",
+            "One view after correction: the line integral of the attenuation along each ray.",
+            figures.projection(data, geometry, 0, unit),
+        ),
+        Picture("Sinogram", "The middle detector row in all views used.", figures.sinogram(data, geometry, row)),
+    ]
+    if prepared.axis is not None:
+        axis = prepared.axis
+        pictures.append(
+            Picture(
+                "Rotation axis",
+                f"Score of each candidate for the rotation axis ({axis.method}); columns of the binned detector.",
+                figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
+            )
+        )
+    return pictures
+
+
+def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
+    """The history of a fit as equally long arrays, by name; empty where there is none."""
+    if not history:
+        return {}
+    names = ("step", "seconds", "loss", "residual", "n_gaussians", "n_views")
+    return {name: np.array([getattr(p, name) for p in history], dtype=np.float64) for name in names}

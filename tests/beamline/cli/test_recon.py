@@ -1,0 +1,213 @@
+"""`beamline recon`: options, exit codes, what is printed and what is left."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.cli.recon import repeated, report_beside
+from beamline.storage.recon_file import read_reconstruction
+from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
+N = SCAN.angles.size
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with a good scan in it."""
+    monkeypatch.chdir(tmp_path)
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    return tmp_path
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def _left(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_defaults_and_results(folder: Path) -> None:
+    result = _beamline("recon", "scan.h5", "-m", "fbp")
+    assert result.exit_code == 0, result.output
+    assert _left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html"}
+    lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines()[:4])
+    assert lines == {
+        "output": "scan_fbp.h5",
+        "report": "scan_fbp.html",
+        "volume": "2 x 40 x 40 in 1/mm",
+        **_axis(lines),
+    }
+    assert "Data residual" in result.stdout
+    assert "fbp: 30 views" in result.stderr
+    assert "fbp: 30 views" not in result.stdout
+
+
+def _axis(lines: dict[str, str]) -> dict[str, str]:
+    assert float(lines["axis_col"]) == pytest.approx(SCAN.axis_col, abs=0.25)
+    return {"axis_col": lines["axis_col"]}
+
+
+def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
+    options = ("--steps", "10", "--gaussians", "100", "--seed", "2", "--no-report", "-o", "out.h5", "--json")
+    result = _beamline("recon", "scan.h5", *options, "--views", "fixed:10", "--axis", "20.7", "--bin", "2")
+    assert result.exit_code == 0, result.output
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert events[0]["event"] == "recon_started"
+    done = events[-1]
+    assert done["event"] == "done"
+    assert (done["output"], done["report"], done["axis_col"]) == ("out.h5", None, 20.7)
+    assert done["shape"] == [1, 20, 20]
+    assert {"seconds", "residual", "residual_held_out"} <= set(done)
+    assert _left(folder) == {"scan.h5", "out.h5"}
+    parameters = read_reconstruction(folder / "out.h5").parameters
+    assert (parameters["steps"], parameters["seed"], parameters["views"]) == (10, 2, "fixed:10")
+
+
+def test_settings_reach_the_file(folder: Path) -> None:
+    options = (
+        "-m",
+        "fbp",
+        "--rows",
+        "1:2",
+        "--air",
+        "3,4",
+        "--filter",
+        "hann",
+        "--pixel-size-um",
+        "250",
+        "--no-report",
+    )
+    assert _beamline("recon", "scan.h5", *options, "--axis", "20.7").exit_code == 0
+    parameters = read_reconstruction(folder / "scan_fbp.h5").parameters
+    said = {name: parameters[name] for name in ("rows", "correction_air", "filter", "pixel_pitch")}
+    assert said == {"rows": "1:2", "correction_air": "(3, 4)", "filter": "hann", "pixel_pitch": 0.25}
+
+
+_VIEWS = (N, 2, 40)
+CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
+    "no flats": ({"data_white": None}, ["--quantity", "counts"], 5, "flats"),
+    "no darks": ({"data_dark": None}, ["--quantity", "counts"], 5, "darks"),
+    "unknown quantity": ({"data_white": None, "data_dark": None}, [], 5, "--quantity"),
+    "wrong shape": ({"data_white": np.full((2, 2, 30), 9000, np.uint16)}, [], 5, "shape"),
+    "two dimensions": ({"data": np.zeros((2, 40), np.uint16)}, [], 5, "shape"),
+    "angles missing": ({"theta": None}, [], 5, "theta"),
+    "too few angles": ({"theta": np.zeros(4)}, [], 5, "4 angles"),
+    "NaN angles": ({"theta": np.full(N, np.nan)}, [], 5, "--angles"),
+    "all NaN": ({"data": np.full(_VIEWS, np.nan, np.float32)}, [], 5, "NaN"),
+    "one view": ({"data": np.full((1, 2, 40), 9000, np.uint16), "theta": np.zeros(1)}, [], 5, "at least 2"),
+    "no beam": ({"data_white": np.full((2, 2, 40), DARK, np.uint16)}, [], 5, "no beam"),
+    "empty field": ({"data": np.full(_VIEWS, DARK + BEAM, np.uint16)}, [], 5, "scan.h5"),
+    "one view chosen": ({}, ["--views", "fixed:1"], 2, "at least 2"),
+    "views misspelt": ({}, ["--views", "every:third"], 2, "every:third"),
+    "too many views": ({}, ["--views", "fixed:31"], 2, "30"),
+    "rows outside": ({}, ["--rows", "1:3"], 2, "0:2"),
+    "rows reversed": ({}, ["--rows", "2:1"], 2, "FIRST:END"),
+    "bins too large": ({}, ["--bin", "3"], 2, "--bin 3"),
+    "axis outside": ({}, ["--axis", "99"], 2, "outside"),
+    "axis misspelt": ({}, ["--axis", "middle"], 2, "auto"),
+    "air misspelt": ({}, ["--air", "some"], 2, "LEFT,RIGHT"),
+    "air too wide": ({}, ["--air", "30,30"], 5, "40 columns"),
+    "two budgets": ({}, ["--steps", "5", "--seconds", "5"], 2, "exclude"),
+    "truth missing": ({}, ["--truth", "truth.npz"], 2, "truth.npz"),
+    "truth of another shape": ({}, ["--truth", "scan.npy"], 2, "shape"),
+    "method misspelt": ({}, ["--method", "r3"], 2, "r3"),
+    "folder missing": ({}, ["-o", "no/out.h5"], 5, "does not exist"),
+    "fbp cannot follow": ({}, ["--follow"], 2, "--follow"),
+}
+
+
+@pytest.mark.parametrize("method", ["fbp"])
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str, method: str) -> None:
+    changes, options, code, said = CASES[case]
+    (folder / "scan.h5").unlink()
+    write_exchange(folder / "scan.h5", SCAN, changes)
+    np.save(folder / "scan.npy", np.arange(8.0).reshape(2, 2, 2))
+    before = _left(folder)
+    result = _beamline("recon", "scan.h5", "-m", method, *options)
+    assert result.exit_code == code, result.output
+    assert result.stdout == ""
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+    assert len([line for line in result.stderr.splitlines() if line.startswith(("beamline:", "Error:"))]) == 1
+    assert _left(folder) == before
+
+
+@pytest.mark.parametrize("name", ["missing.h5", "text.h5", "empty.h5", "half.h5", "folder"])
+def test_files_that_cannot_be_read(folder: Path, name: str) -> None:
+    (folder / "text.h5").write_text("no scan")
+    (folder / "empty.h5").write_bytes(b"")
+    (folder / "half.h5").write_bytes((folder / "scan.h5").read_bytes()[:3000])
+    (folder / "folder").mkdir()
+    before = _left(folder)
+    result = _beamline("recon", name)
+    assert result.exit_code == 5, result.output
+    assert name in result.stderr
+    assert result.stderr.startswith("beamline: ")
+    assert _left(folder) == before
+
+
+def test_a_failure_is_the_last_json_event(folder: Path) -> None:
+    result = _beamline("recon", "missing.h5", "--json")
+    assert result.exit_code == 5
+    last = json.loads(result.stdout.splitlines()[-1])
+    assert (last["event"], last["exit_code"]) == ("failed", 5)
+    assert "missing.h5" in last["message"]
+
+
+def test_results_are_never_overwritten(folder: Path) -> None:
+    (folder / "scan_fbp.h5").write_text("precious")
+    result = _beamline("recon", "scan.h5", "-m", "fbp")
+    assert result.exit_code == 5
+    assert (folder / "scan_fbp.h5").read_text() == "precious"
+
+
+def test_as_a_process(folder: Path) -> None:
+    """The same through the operating system: exit code, streams, and no traceback."""
+    root = Path(__file__).parents[3]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    command = [sys.executable, "-m", "beamline.cli.main", "recon", "scan.h5", "--views", "fixed:1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("beamline: --views fixed:1")
+    assert "Traceback" not in done.stderr
+    assert _left(folder) == {"scan.h5"}
+
+
+def test_the_beamless_fixture_is_refused(folder: Path, shared_data: Path) -> None:
+    result = _beamline("recon", str(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx"))
+    assert result.exit_code == 5
+    assert "no beam" in result.stderr
+    assert _left(folder) == {"scan.h5"}
+
+
+def test_a_measured_scan_from_hdf5_and_from_its_tiffs(folder: Path, shared_data: Path) -> None:
+    options = ("-m", "fbp", "--bin", "2", "--no-report")
+    scan = shared_data / "diamond_24737_parallel_91x135x160.h5"
+    tiffs = shared_data / "diamond_24737_tiff_series.zip"
+    assert _beamline("recon", str(scan), *options, "-o", "a.h5").exit_code == 0
+    assert _beamline("recon", str(tiffs), *options, "--angle-rows", "10:101", "-o", "b.h5").exit_code == 0
+    a, b = (read_reconstruction(folder / name) for name in ("a.h5", "b.h5"))
+    assert a.parameters["axis_col"] == pytest.approx(85.75, abs=0.5)
+    assert b.parameters["axis_col"] == pytest.approx(85.75, abs=0.5)
+    spread = float(a.volume.data.std())
+    assert float(np.sqrt(np.mean((a.volume.data - b.volume.data) ** 2))) < 0.05 * spread
+
+
+def test_names() -> None:
+    assert report_beside(Path("runs/x/recon.h5")) == Path("runs/x/report.html")
+    assert report_beside(Path("walnut_r2.h5")) == Path("walnut_r2.html")
+    assert repeated(["recon", "my scan.h5"]) == "beamline recon 'my scan.h5'"

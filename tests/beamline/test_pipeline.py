@@ -1,0 +1,300 @@
+"""From a file's frames to line integrals: the right numbers, the right geometry, only what was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from beamline import pipeline
+from beamline.errors import ConfigError, DataError
+from beamline.pipeline import Prepared, Selection, prepare, unbinned
+from beamline.reading import read_binned, read_references
+from beamline.storage.source import open_scan
+from recon.align import AxisError, AxisEstimate
+from recon.correct import CorrectionSettings
+from recon.geometry import Geometry
+from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
+
+SCAN = TwoCylinders()
+PLAIN = CorrectionSettings(air="none")
+
+
+class ArraySource:
+    """A ScanSource over arrays that notes what is read of it."""
+
+    path = Path("array")
+    format = "array"
+    quantity = "counts"
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    axis_col: float | None = None
+    attributes: dict[str, Any] = {}  # noqa: RUF012
+    finished = True
+
+    def __init__(self, data: NDArray[Any], keys: list[int], angles: NDArray[np.float64]) -> None:
+        self._data = data
+        self.image_key, self.angles = np.array(keys, np.int32), angles
+        self.shape, self.dtype = data.shape[1:], data.dtype
+        self.was_read: list[tuple[list[int], int]] = []
+
+    def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:
+        block = self._data[frames, rows]
+        self.was_read.append((np.arange(len(self._data))[frames].tolist(), block.shape[1]))
+        return block
+
+
+def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[Prepared, list[str]]:
+    warnings: list[str] = []
+    with open_scan(path, **said) as source:
+        return prepare(source, selection, warnings.append), warnings
+
+
+def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    # A count of 20000 is rounded to a half: 2.5e-5 of transmission near 1, less than 1e-4 of a line integral below 1.
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+    assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
+    assert prepared.geometry.axis_col == prepared.axis_col
+    np.testing.assert_allclose(prepared.geometry.angles, SCAN.angles)
+    assert prepared.held_out is None
+    assert (prepared.length_unit, prepared.quantity, prepared.n_projections) == ("mm", "counts", 45)
+    assert warnings == []
+
+
+@pytest.mark.parametrize(("rows", "binning", "shape"), [((1, 4), 1, (3, 40)), (None, 2, (2, 20)), ((0, 4), 3, (1, 13))])
+def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: int, shape: tuple[int, int]) -> None:
+    path = write_exchange(tmp_path / "scan.h5", replace(SCAN, pixel_size_mm=0.5))
+    selection = Selection(rows=rows, binning=binning, axis_col=20.7, correction=PLAIN)
+    prepared, _ = _prepare(path, selection)
+    first, end = rows or (0, 4)
+    expected = Geometry.parallel(SCAN.angles, (end - first, 40), 0.5, 20.7).binned(binning)
+    assert prepared.geometry.detector_shape == shape == expected.detector_shape
+    assert prepared.geometry.axis_col == expected.axis_col
+    assert prepared.geometry.pixel_pitch == 0.5 * binning
+    assert prepared.axis_col == 20.7
+    # Counts are averaged, then the logarithm taken.
+    transmission = np.exp(-SCAN.line_integrals())[:, : shape[0] * binning, : shape[1] * binning]
+    mean = transmission.reshape(45, shape[0], binning, shape[1], binning).mean(axis=(2, 4))
+    np.testing.assert_allclose(prepared.projections.data, -np.log(mean), atol=1e-4)
+
+
+def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(2, 80), axis_col=40.7))
+    prepared, _ = _prepare(path, Selection(binning=2, correction=PLAIN))
+    assert prepared.axis_col == pytest.approx(40.7, abs=0.5)
+    assert prepared.geometry.axis_col == pytest.approx((prepared.axis_col - 0.5) / 2)
+
+
+@given(column=st.floats(-10, 5000), binning=st.integers(1, 16))
+def test_unbinned_inverts_the_geometrys_binning(column: float, binning: int) -> None:
+    binned = Geometry.parallel([0.0], (16, 6000), 1.0, column).binned(binning).axis_col
+    assert unbinned(binned, binning) == pytest.approx(column, abs=1e-6)
+
+
+def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    prepared, _ = _prepare(path, Selection(views="first:10", axis_col=20.7, correction=PLAIN))
+    assert prepared.geometry.n_views == 10
+    assert prepared.n_projections == 45
+    np.testing.assert_array_equal(prepared.projections.view_ids, np.arange(4, 14))  # 2 darks and 2 flats come first
+    assert prepared.held_out is not None
+    data, geometry = prepared.held_out
+    assert data.shape == (16, 4, 40)
+    assert geometry.angles.min() >= SCAN.angles[10]
+    np.testing.assert_allclose(data, replace(SCAN, angles=geometry.angles).line_integrals(), atol=1e-4)
+
+
+def test_only_what_was_asked_for_is_read() -> None:
+    counts = SCAN.counts()
+    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
+    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
+    selection = Selection(views="first:5", rows=(1, 3), axis_col=20.7, correction=PLAIN)
+    corrector = pipeline.Corrector(source, selection, pytest.fail)  # type: ignore[arg-type]
+    corrector.line_integrals(np.arange(2, 7))
+    assert {rows for _, rows in source.was_read} == {2}
+    assert sorted(f for frames, _ in source.was_read for f in frames) == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_reading_is_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = np.arange(7 * 2 * 3, dtype=np.uint16).reshape(7, 2, 3)
+    source = ArraySource(data, [0] * 7, np.zeros(7))
+    monkeypatch.setattr("beamline.reading._BATCH_BYTES", 3 * 2 * 3 * 2)
+    got = read_binned(source, np.array([6, 0, 5, 1, 2]), slice(0, 2), 1)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(got, data[[6, 0, 5, 1, 2]])
+    assert [len(frames) for frames, _ in source.was_read] == [3, 2]
+
+
+@given(
+    rows=st.integers(1, 9),
+    cols=st.integers(1, 9),
+    binning=st.integers(1, 4),
+    holes=st.floats(0, 0.9),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_bins_are_means_of_what_is_finite(rows: int, cols: int, binning: int, holes: float, seed: int) -> None:
+    """Against a loop over the bins."""
+    rng = np.random.default_rng(seed)
+    data = rng.random((2, rows, cols)).astype(np.float32)
+    data[rng.random(data.shape) < holes] = np.nan
+    got = read_binned(ArraySource(data, [0, 0], np.zeros(2)), np.arange(2), slice(0, rows), binning)  # type: ignore[arg-type]
+    assert got.shape == (2, rows // binning, cols // binning)
+    for v, r, c in np.ndindex(got.shape):
+        block = data[v, r * binning : (r + 1) * binning, c * binning : (c + 1) * binning]
+        if np.isfinite(block).any():
+            assert got[v, r, c] == pytest.approx(float(np.nanmean(block)), rel=1e-5)
+        else:
+            assert np.isnan(got[v, r, c])
+
+
+def test_flats_are_grouped_by_the_views_between_them() -> None:
+    keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
+    data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
+    references = read_references(ArraySource(data, keys, np.zeros(12)), slice(0, 2), 1)  # type: ignore[arg-type]
+    assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
+        (1.5, 1.5),
+        (7.0, 7.0),
+        (11.0, 11.0),
+    ]
+    assert references.dark[0, 0] == 5.0
+
+
+def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
+    """The beam loses 20 % from the first flat to the last: interpolation makes the views right."""
+    n = SCAN.angles.size
+    beam = np.linspace(1.0, 0.8, n + 2)
+    views = DARK + BEAM * beam[1:-1, None, None] * np.exp(-SCAN.line_integrals())
+    flats = [np.full((1, 4, 40), DARK + BEAM * b) for b in (beam[0], beam[-1])]
+    data = np.concatenate([np.full((1, 4, 40), DARK), flats[0], views, flats[1]]).astype(np.float32)
+    angles = np.concatenate([[np.nan] * 2, SCAN.angles, [np.nan]])
+    source = ArraySource(data, [2, 1] + [0] * n + [1], angles)
+    prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+
+
+def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
+    data = SCAN.line_integrals().astype(np.float32)
+    data[3, 1, 20] = np.nan
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": data, "data_white": None, "data_dark": None})
+    prepared, _ = _prepare(path, Selection(), quantity="line_integrals")
+    assert prepared.quantity == "line_integrals"
+    left, right = data[3, 1, 19], data[3, 1, 21]
+    assert prepared.projections.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
+    data[3, 1, 20] = prepared.projections.data[3, 1, 20]
+    np.testing.assert_array_equal(prepared.projections.data, data)
+
+
+def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None:
+    counts = SCAN.counts().astype(np.float32)
+    counts[[3, 30]] = np.nan
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": counts})
+    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    assert prepared.geometry.n_views == 43
+    np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
+    np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
+    assert any("2 of 45 views hold no finite pixel (first: frame 7)" in text for text in warnings)
+
+
+_SHAPE = (45, 4, 40)
+BAD_SCANS = {
+    "no flats": ({"data_white": None}, "flats"),
+    "no darks": ({"data_dark": None}, "darks"),
+    "no beam": ({"data_white": np.full((2, 4, 40), DARK, np.uint16)}, "beam"),
+    "one view": ({"data": np.full((1, 4, 40), 9000, np.uint16), "theta": np.zeros(1)}, "at least 2"),
+    "one angle": ({"theta": np.zeros(45)}, "0 degrees"),
+    "angles not known": ({"theta": np.full(45, np.nan)}, "--angles"),
+    "all NaN": ({"data": np.full(_SHAPE, np.nan, np.float32)}, "finite"),
+    "flat of another shape": ({"data_white": np.full((2, 4, 30), 9000, np.uint16)}, "shape"),
+    "too few angles": ({"theta": np.zeros(3)}, "3 angles"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SCANS)
+def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
+    changes, said = BAD_SCANS[case]
+    path = write_exchange(tmp_path / "scan.h5", SCAN, changes)
+    quantity = "counts" if case in ("no flats", "no darks") else None
+    with pytest.raises(DataError, match=said):
+        _prepare(path, Selection(), quantity=quantity)
+
+
+def test_unknown_quantity_names_the_option(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data_white": None, "data_dark": None})
+    with pytest.raises(DataError, match=r"--quantity counts \| line-integrals"):
+        _prepare(path, Selection())
+
+
+def test_empty_field_is_refused(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": np.full(_SHAPE, DARK + BEAM, np.uint16)})
+    with pytest.raises(DataError):
+        _prepare(path, Selection(axis_col=20.0))
+
+
+@pytest.mark.parametrize(
+    ("selection", "said"),
+    [
+        (Selection(views="nonsense"), "--views nonsense"),
+        (Selection(views="first:1"), "at least 2"),
+        (Selection(rows=(2, 9), axis_col=20.0), "--rows 2:9"),
+        (Selection(binning=5, axis_col=20.0), "--bin 5"),
+        (Selection(axis_col=40.0), "outside the detector"),
+    ],
+)
+def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: str) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    with pytest.raises(ConfigError, match=said):
+        _prepare(path, selection)
+
+
+def _estimate(value: float, confident: bool) -> AxisEstimate:
+    return AxisEstimate(value, np.arange(3.0), np.arange(3.0), confident, "pair")
+
+
+def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "find_axis", lambda data, angles: _estimate(18.0, False))
+    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()]).astype(
+        np.uint16
+    )
+    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
+    warnings: list[str] = []
+    prepared = prepare(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    assert prepared.axis_col == 18.0
+    assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
+    source.axis_col = 20.5
+    warnings.clear()
+    prepared = prepare(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    assert prepared.axis_col == 20.5
+    assert any("the file's 20.50 is used" in text for text in warnings)
+
+
+def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def find_axis(data: object, angles: object) -> AxisEstimate:
+        raise AxisError("the best axis, column 0, is at the edge")
+
+    monkeypatch.setattr(pipeline, "find_axis", find_axis)
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    with pytest.raises(DataError, match=r"at the edge.*--axis COLUMN"):
+        _prepare(path, Selection())
+
+
+@pytest.mark.parametrize(
+    ("name", "expected", "tolerance"),
+    [
+        ("diamond_24737_parallel_91x135x160.h5", 85.75, 0.5),
+        ("aps2bm_tooth_181x2x640.h5", 295.6, 0.5),
+    ],
+)
+def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:
+    prepared, _ = _prepare(shared_data / name, Selection())
+    assert prepared.axis_col == pytest.approx(expected, abs=tolerance)
+    assert prepared.axis is not None
+    assert prepared.axis.confident
+    assert np.isfinite(prepared.projections.data).all()
