@@ -59,7 +59,7 @@ class Acquisition:
 
     @property
     def missing(self) -> list[int]:
-        """Triggers, counted over the whole plan, that gave no frame so far."""
+        """Triggers, counted over the whole plan, that gave no frame so far (those never reached are not among them)."""
         return [done.block.first_row + i for done in self._done for i in done.taken.missing]
 
     def frames(self) -> Generator[Frame, None, None]:

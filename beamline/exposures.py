@@ -35,7 +35,7 @@ class Taken:
 
     Attributes:
         frames: delivered, with and without a trigger.
-        missing: triggers, counted within the block, that gave no frame.
+        missing: triggers, counted within the block, that gave no frame though one was waited for.
         lost, ignored: of these, as far as it is known.
         extra: frames that no trigger made.
         shift: triggers by which the angles of a pass may be wrong (see ledger.Account).
@@ -48,13 +48,17 @@ class Taken:
     extra: int = 0
     shift: int = 0
 
-    def enter(self, account: Account, first: int, stopped: bool, last: int) -> None:
-        """Add a pass that began at trigger `first`; after a stop, triggers beyond the `last` seen were never sent."""
-        self.missing += [first + i for i in account.missing if not (stopped and i > last)]
+    def enter(self, account: Account, first: int, cut_short: bool, last: int) -> None:
+        """Add a pass that began at trigger `first`.
+
+        Where it was cut short, triggers beyond the `last` one seen were not waited for: they were not taken, rather
+        than missed.
+        """
+        self.missing += [first + i for i in account.missing if not (cut_short and i > last)]
         self.lost += account.lost
         self.ignored += account.ignored
         self.extra += len(account.extra)
-        self.shift = max(self.shift, 0 if stopped else account.shift)
+        self.shift = max(self.shift, 0 if cut_short else account.shift)
 
 
 @dataclass
@@ -139,10 +143,12 @@ class Exposures:
             self._stage.start_move(end, block.speed)
             seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
             flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), first, seconds)
+            cut_short = True
             try:
                 yield from self._until_standing(block, flight)
+                cut_short = self._stop.stopping
             finally:
-                taken.enter(settle(flight.ledger), first, self._stop.stopping, flight.ledger.last)
+                taken.enter(settle(flight.ledger), first, cut_short, flight.ledger.last)
             self._stage.disarm()
             self._camera.disarm()
             if flight.ledger.last < 0 and not self._stop.stopping:

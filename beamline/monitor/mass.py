@@ -19,6 +19,7 @@ CALIBRATION = 10  # projections
 SIGMAS = 6.0
 AIR = 0.05  # line integral at the edges up to which the whole sample is in the field
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
+EMPTY = 1e-3  # mean line integral of a field with nothing in it but noise
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> 
     mass = float(integrals.mean()) - (left + right) / 2  # the beam's changes are not the sample's
     if state.usual is None:
         return _calibrate(state, mass), None
-    if state.usual <= 0:
+    if state.usual < EMPTY:
         return state, None
     score = mass / state.usual - 1
     limit = max(state.limits.warn, SIGMAS * state.scatter)

@@ -7,7 +7,9 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
+from beamline.devices import Bench
 from beamline.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.timeline import work_out
 from drivers.errors import DeviceError, DeviceTimeout
@@ -27,6 +29,7 @@ from simulators.motion import TrapezoidMove
 COUNTS_PER_TURN = 36000
 SHAPE = (8, 12)
 COUNT = 2 * math.pi / COUNTS_PER_TURN
+LEVEL = {False: 200, True: 20000}  # counts without and with light
 HOME = 100  # counts: where the stage stands at first
 
 
@@ -46,6 +49,7 @@ class Faults:
     ignored: Set[int] = frozenset()
     extra_after: Set[int] = frozenset()  # hardware triggers after which a spurious one follows half a period on
     errors: dict[int, int] = field(default_factory=dict)  # frame number: how often taking it raises DeviceError
+    repeats: Set[int] = frozenset()  # frames that are the one before, pixel for pixel
     stuck_shutter: bool = False
     stall_at: int | None = None  # count
 
@@ -53,7 +57,8 @@ class Faults:
 class Instrument:
     """Stage, camera, shutter and sample mover in one; `devices` is how acquisition sees it.
 
-    Pixels of row 0: [stage count at the trigger, shutter open, sample in, trigger number]; the rest is noise.
+    Pixels hold the level of light and noise; in row 0, on top of the level, digits of the stage's count at the
+    trigger, whether the shutter was open and the sample in, and digits of the trigger's number; see `seen`.
     `log` holds what the devices were told; `on_frame(number)` is called when a frame is taken.
     """
 
@@ -65,6 +70,9 @@ class Instrument:
         self.is_open, self.is_in = False, True
         self.stage, self.camera = Stage(self), Camera(self)
         self.devices = Devices(self.stage, self.camera, Shutter(self), Sample(self))
+
+    def bench(self) -> Bench:
+        return Bench(self.devices, self.clock, None, lambda: self.log.append("close"))
 
     def timeline(
         self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
@@ -172,6 +180,7 @@ class Camera:
     def __init__(self, bench: Instrument) -> None:
         self.bench = bench
         self.rng = np.random.default_rng(1)
+        self.last = np.zeros(SHAPE, np.uint16)
         self.settings = CameraSettings(0.02, TriggerSource.INTERNAL)
         self.armed = False
         self.ring: list[Exposed] = []
@@ -207,7 +216,7 @@ class Camera:
 
     def _expose(self, time: float, number: int, count: int) -> None:
         if number not in self.bench.faults.lost:
-            state = (count, self.bench.is_open, self.bench.is_in, max(number, 0))
+            state = (count + 32768, self.bench.is_open, self.bench.is_in, max(number, 0))
             self.ring.append(Exposed(time, self.framestamp, number, state))
         self.framestamp += 1
 
@@ -242,8 +251,13 @@ class Camera:
             self.bench.faults.errors[frame.number] -= 1
             raise DeviceError(self.name, "ring overrun")
         self.ring.pop(0)
-        counts = self.rng.integers(100, 200, SHAPE).astype(np.uint16)
-        counts[0, :4] = np.array(frame.state).astype(np.uint16)
+        count, is_open, is_in, number = frame.state
+        counts = (LEVEL[bool(is_open)] + self.rng.integers(0, 20, SHAPE)).astype(np.uint16)
+        row = [*digits(count), is_open, is_in, *digits(number)]
+        counts[0, : len(row)] = LEVEL[bool(is_open)] + np.array(row)
+        if frame.number in self.bench.faults.repeats:
+            counts = self.last.copy()
+        self.last = counts
         self.bench.on_frame(frame.number)
         return CameraFrame(counts, frame.framestamp, frame.time)
 
@@ -288,7 +302,18 @@ class Sample:
         self.bench.is_in = True
 
 
+def digits(value: int) -> list[int]:
+    """Three digits to base 64, so that no pixel stands out by more than 63 counts."""
+    return [value // 4096 % 64, value // 64 % 64, value % 64]
+
+
 def seen(frame: Frame) -> tuple[int, bool, bool, int]:
-    """What the instrument was doing: stage count (signed), shutter open, sample in, trigger number."""
-    count, is_open, is_in, number = (int(v) for v in frame.counts[0, :4])
-    return int(np.uint16(count).astype(np.int16)), bool(is_open), bool(is_in), number
+    """What the instrument was doing: stage count, shutter open, sample in, trigger number."""
+    return decode(frame.counts)
+
+
+def decode(counts: NDArray[np.uint16]) -> tuple[int, bool, bool, int]:
+    level = LEVEL[bool(counts[-1].mean() > 1000)]
+    row = [int(v) - level for v in counts[0, :8]]
+    count = row[0] * 4096 + row[1] * 64 + row[2]
+    return count - 32768, bool(row[3]), bool(row[4]), row[5] * 4096 + row[6] * 64 + row[7]

@@ -183,7 +183,7 @@ def test_a_camera_error_once_is_survived_twice_is_not() -> None:
     run = Run(for_good, for_good.timeline())
     assert isinstance(run.error, DeviceError)
     assert len(run.frames) == 10
-    assert run.scan.missing == list(range(10, 17))
+    assert run.scan.missing == []  # what was never reached is not missing
     assert_safe(for_good, home=False)
 
 
@@ -213,7 +213,7 @@ def test_a_stage_that_stops_short_fails_with_its_own_words() -> None:
     assert isinstance(run.error, DeviceError)
     assert "stopped short" in str(run.error)
     assert run.views == list(range(6))
-    assert run.scan.missing == list(range(5 + 6, 17))
+    assert run.scan.missing == []
     assert_safe(bench, home=False)
 
 

@@ -57,3 +57,7 @@ def test_a_truncated_sample_is_left_alone(bench: Any) -> None:
 
 def test_without_flats_there_is_nothing_to_compare(bench: Any) -> None:
     assert only(bench.watch(bench.darks() + bench.views(20) + bench.views(5, first=20, discs=()))) == []
+
+
+def test_an_empty_field_has_no_mass_to_change(bench: Any) -> None:
+    assert only(bench.watch(bench.references() + bench.views(200, discs=()))) == []

@@ -1,0 +1,233 @@
+"""`beamline scan`: what it prints where, what the signals do, and every exit code."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline import run as run_module
+from beamline.cli.main import main
+from beamline.config import config_folder
+from beamline.storage.source import open_scan
+from drivers.errors import DeviceError
+from tests.beamline.fakes import Faults, Instrument
+
+SIMULATED = str(config_folder() / "simulated.yaml")
+SMALL = {
+    "scan.angles.views": 12,
+    "scan.period_s": 0.5,
+    "scan.exposure_s": 0.02,
+    "scan.darks.count": 3,
+    "scan.flats.count": 2,
+    "scan.flats.at": "start",
+}
+
+
+def scan(*arguments: str, **overrides: Any) -> Result:
+    settings = [word for key, value in {**SMALL, **overrides}.items() for word in ("--set", f"{key}={value}")]
+    return CliRunner().invoke(main, ["scan", SIMULATED, "--no-live", *settings, *arguments])
+
+
+def on(monkeypatch: pytest.MonkeyPatch, instrument: Instrument) -> None:
+    """Let the command find `instrument` where the configured devices would be."""
+    monkeypatch.setattr(run_module, "connect", lambda config: instrument.bench())
+
+
+def press(number: int, *at: int) -> Any:
+    """A signal when the frames numbered `at` are taken."""
+    return lambda frame: signal.raise_signal(number) if frame in at else None
+
+
+def rows(runs: Path) -> int:
+    (folder,) = runs.iterdir()
+    with open_scan(folder / "scan.h5") as source:
+        assert source.finished
+        return len(list(source.frames()))
+
+
+def test_0_a_scan_prints_its_file_on_stdout_and_its_story_on_stderr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instrument = Instrument()
+    on(monkeypatch, instrument)
+    result = scan("-o", str(tmp_path))
+    assert result.exit_code == 0, result.output
+    (folder,) = tmp_path.iterdir()
+    assert result.stdout.splitlines() == [f"scan      {folder / 'scan.h5'}", "frames    17"]
+    assert "12 projection frames" in result.stderr
+    assert "scan: 17/17" in result.stderr
+    assert rows(tmp_path) == 17
+    assert instrument.log[-1] == "close"  # devices that the command opened are closed
+
+
+def test_0_with_json_stdout_is_the_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    on(monkeypatch, Instrument())
+    result = scan("-o", str(tmp_path), "--json")
+    assert result.exit_code == 0
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert events[0]["event"] == "state"
+    assert events[-1]["event"] == "done"
+    assert events[-1]["n_frames"] == 17
+    assert Path(events[-1]["path"]).is_file()
+
+
+def test_0_a_dry_run_prints_the_plan_and_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_module, "connect", lambda config: pytest.fail("a device was touched"))
+    result = scan("--dry-run", "-o", str(tmp_path / "runs"), **{"devices.stage.low_deg": -30})
+    assert result.exit_code == 0, result.output
+    for word in ("projection", "taxi", "counts", "blur", "skew", "duration", "free"):
+        assert word in result.stdout
+    assert not (tmp_path / "runs").exists()
+    as_json = scan("--dry-run", "--json", **{"devices.stage.low_deg": -30})
+    (line,) = as_json.stdout.splitlines()
+    assert json.loads(line)["n_frames"] == 17
+
+
+@pytest.mark.parametrize("arguments", [[], ["--dry-run"]])
+def test_2_a_violated_limit(tmp_path: Path, arguments: list[str]) -> None:
+    result = scan("-o", str(tmp_path / "runs"), *arguments, **{"scan.period_s": 0.03})
+    assert result.exit_code == 2
+    assert "limit" in result.stderr
+    assert "nothing was started" in result.stderr
+    assert not (tmp_path / "runs").exists()
+    assert "VIOLATION" in result.stdout or not arguments
+
+
+def test_2_an_unknown_key_and_with_json_the_reason_is_an_event() -> None:
+    result = scan("--json", **{"scan.angels": 3})
+    assert result.exit_code == 2
+    assert "angels" in result.stderr
+    (line,) = result.stdout.splitlines()
+    event = json.loads(line)
+    assert (event["event"], event["exit_code"]) == ("failed", 2)
+
+
+def test_2_no_such_file() -> None:
+    result = CliRunner().invoke(main, ["scan", "nowhere.yaml"])
+    assert result.exit_code == 2
+    assert "nowhere.yaml" in result.stderr
+
+
+def test_2_an_unknown_monitor_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    on(monkeypatch, Instrument())
+    result = scan(**{"monitor.thresholds": "{bean: {warn: 0.1}}"})
+    assert result.exit_code == 2
+    assert "legal: beam" in result.stderr
+
+
+def test_3_a_device_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    on(monkeypatch, Instrument(Faults(errors={10: 99})))
+    result = scan("-o", str(tmp_path))
+    assert result.exit_code == 3
+    assert "ring overrun" in result.stderr
+    assert rows(tmp_path) == 10
+
+
+def test_3_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def silent(config: object) -> None:
+        raise DeviceError("stage", "does not answer")
+
+    monkeypatch.setattr(run_module, "connect", silent)
+    result = scan("-o", str(tmp_path / "runs"), "--json")
+    assert result.exit_code == 3
+    assert json.loads(result.stdout.splitlines()[-1])["exit_code"] == 3
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_4_the_first_signal_stops_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    before = signal.getsignal(number)
+    instrument = Instrument(on_frame=press(number, 8))
+    on(monkeypatch, instrument)
+    result = scan("-o", str(tmp_path), "--json")
+    assert result.exit_code == 4
+    assert "Stopped after" in result.stderr
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [e["event"] for e in events[-2:]] == ["state", "failed"]  # and not told twice
+    assert 9 <= rows(tmp_path) < 17
+    assert not instrument.is_open
+    assert signal.getsignal(number) is before
+
+
+def test_5_missing_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    on(monkeypatch, Instrument(Faults(lost={9})))
+    result = scan("-o", str(tmp_path))
+    assert result.exit_code == 5
+    assert "1 of 12 projections are missing: 4 (from 60° to 60°)" in result.stderr
+    assert rows(tmp_path) == 16
+
+
+def test_130_a_second_ctrl_c_cuts_the_references_that_a_stop_still_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instrument = Instrument(on_frame=press(signal.SIGINT, 5, 6))
+    on(monkeypatch, instrument)
+    at_the_end = {"scan.mode": "step", "scan.flats.at": "end", "scan.darks.at": "end"}
+    result = scan("-o", str(tmp_path), **at_the_end)
+    assert result.exit_code == 130
+    assert rows(tmp_path) == 7  # six views and the flat that was being taken
+    assert not instrument.is_open
+
+
+def test_130_an_abort(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def twice(frame: int) -> None:
+        if frame == 8:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    instrument = Instrument(on_frame=twice)
+    on(monkeypatch, instrument)
+    result = scan("-o", str(tmp_path))
+    assert result.exit_code == 130
+    assert "Stopping cleanly; Ctrl-C again aborts." in result.stderr
+    assert "Aborting." in result.stderr
+    assert "abort stage" in instrument.log
+    assert rows(tmp_path) == 9
+
+
+def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    instrument = Instrument()
+
+    def connect(config: object) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return instrument.bench()
+
+    monkeypatch.setattr(run_module, "connect", connect)
+    result = scan("-o", str(tmp_path / "runs"))
+    assert result.exit_code == 130
+    assert "before anything was acquired" in result.stderr
+    assert not (tmp_path / "runs").exists()
+    assert instrument.log == ["close"]
+
+
+def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def run_scan(config: object, runs: object, sinks: object, stop: object, *, live: Any) -> Any:
+        asked.append(live and list(live(Path("scan.h5"), Path("recon.h5"))))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("beamline.cli.scan.run_scan", run_scan)
+    runner = CliRunner()
+    overrides = ["--set", "recon.seconds=7", "--set", "optics.axis_col=80.5"]
+    assert runner.invoke(main, ["scan", SIMULATED, *overrides]).exit_code == 130
+    assert runner.invoke(main, ["scan", SIMULATED, "--no-live"]).exit_code == 130
+    assert runner.invoke(main, ["scan", SIMULATED, "--set", "recon.live=false"]).exit_code == 130
+    fbp = runner.invoke(main, ["scan", SIMULATED, "--set", "recon.method=fbp"])
+    assert "needs the whole scan" in fbp.stderr
+    assert asked[1:] == [None, None, None]
+    command = asked[0]
+    assert command[1:5] == ["-m", "beamline.cli.main", "recon", "scan.h5"]
+    assert command[command.index("--seconds") + 1] == "7.0"
+    assert command[command.index("--axis") + 1] == "80.5"
+    assert {"--follow", "--json"} <= set(command)
+    recon = main.get_command(click.Context(main), "recon")
+    assert recon is not None
+    parsed = recon.make_context("recon", command[4:]).params  # and the command understands it
+    assert (parsed["seconds"], parsed["axis"], parsed["output"]) == (7.0, 80.5, Path("recon.h5"))

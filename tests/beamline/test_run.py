@@ -1,0 +1,432 @@
+"""A run leaves one folder with a readable file and the whole story, however it ends, and says what it must in time."""
+
+from __future__ import annotations
+
+import errno
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline import recorder as recorder_module
+from beamline import run as module
+from beamline.config import Config, config_folder, load
+from beamline.digest import FrameDigest
+from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
+from beamline.events import Event
+from beamline.ledger import LedgerError
+from beamline.run import RunResult, State, create_run_folder, run_scan
+from beamline.stop import ScanAborted, StopRequest
+from beamline.storage.nxtomo import NXtomoWriter
+from beamline.storage.source import open_scan
+from drivers.errors import DeviceError
+from drivers.frame import Frame, FrameKind
+from tests.beamline.fakes import COUNT, Faults, Instrument, decode
+
+SMALL = (
+    "scan.angles.views=12",
+    "scan.period_s=0.5",
+    "scan.exposure_s=0.02",
+    "scan.darks.count=3",
+    "scan.flats.count=2",
+    "scan.flats.at=both",
+    "recon.live=false",
+)
+
+
+def small(*overrides: str) -> Config:
+    return load(config_folder() / "simulated.yaml", [*SMALL, *overrides], environment={})
+
+
+class Ran:
+    """A run and everything it left."""
+
+    def __init__(
+        self,
+        runs: Path,
+        instrument: Instrument,
+        *overrides: str,
+        stop: StopRequest | None = None,
+        live: Callable[[Path, Path], Sequence[str]] | None = None,
+    ) -> None:
+        self.events: list[Event] = []
+        self.result: RunResult | None = None
+        self.error: BaseException | None = None
+        self.instrument = instrument
+        try:
+            self.result = run_scan(
+                small(*overrides), runs, [self.events.append], stop, live=live, bench=instrument.bench()
+            )
+        except BaseException as error:
+            self.error = error
+        folders = list(runs.iterdir()) if runs.exists() else []
+        self.folder = folders[0] if folders else None
+
+    def of(self, name: str) -> list[Event]:
+        return [event for event in self.events if event.event == name]
+
+    @property
+    def states(self) -> list[str]:
+        return [event.data["state"] for event in self.of("state")]
+
+    def assert_good_file(self, n: int, status: str, missing: Sequence[int] = ()) -> None:
+        """`n` rows, each with the angle that the fake camera wrote into its pixels, and nothing else."""
+        assert self.folder is not None
+        with open_scan(self.folder / "scan.h5") as source:
+            assert source.finished
+            frames = list(source.frames())
+            assert len(frames) == len(source.image_key) == n
+            for frame in frames:
+                count, is_open, is_in, _ = decode(frame.counts)
+                assert is_open is (frame.kind is not FrameKind.DARK)
+                assert is_in is (frame.kind is not FrameKind.FLAT)
+                if frame.kind is not FrameKind.INVALID:
+                    assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
+        with h5py.File(self.folder / "scan.h5") as file:
+            progress = file["entry/progress"]
+            assert progress["status"][()].decode() == status
+            assert list(progress["missing_triggers"]) == list(missing)
+            assert progress["frames_committed"][()] == n
+
+    def assert_safe(self) -> None:
+        assert not self.instrument.is_open
+        assert not self.instrument.camera.armed
+        assert not self.instrument.stage.moving()
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_run_from_trigger_to_file(tmp_path: Path, mode: str) -> None:
+    ran = Ran(tmp_path, Instrument(), f"scan.mode={mode}")
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    ran.assert_good_file(3 + 2 + 12 + 2, "complete")
+    ran.assert_safe()
+    assert ran.result.path == ran.folder / "scan.h5"
+    assert (ran.result.n_frames, ran.result.missing, ran.result.flags) == (19, (), {})
+    assert ran.result.bytes == ran.result.path.stat().st_size
+    assert {p.name for p in ran.folder.iterdir()} == {"config.resolved.yaml", "events.jsonl", "scan.h5", "user.log"}
+    assert ran.folder.name.endswith("_battery")
+    assert load(ran.folder / "config.resolved.yaml", environment={}) == small(f"scan.mode={mode}")
+    assert "close" not in ran.instrument.log  # whoever brings the devices closes them
+
+
+def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument())
+    assert ran.folder is not None
+    names = [event.event for event in ran.events if event.event != "frame"]
+    block = ["block_started", "block_done"]
+    assert names == ["state", "run_started", "state", *block * 4, "state", "scan_done", "state", "done"]
+    assert ran.states == [State.PREPARING, State.ACQUIRING, State.STOPPING, State.DONE]
+    frames = ran.of("frame")
+    assert frames[-1].data["n"] == frames[-1].data["of"] == 19
+    assert frames[-1].data["eta_s"] == 0
+    lines = (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["event"] for line in lines] == [event.event for event in ran.events]
+    log = (ran.folder / "user.log").read_text(encoding="utf-8")
+    assert "12 projection frames (fly, 0.02 s each)" in log
+    assert "Scan complete: 19 frames" in log
+
+
+def test_what_the_file_says_of_the_scan(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument())
+    assert ran.folder is not None
+    with h5py.File(ran.folder / "scan.h5") as file:
+        plan = json.loads(file["entry/record/plan"][()])
+        assert plan["scheme"] == "fixed"
+        np.testing.assert_allclose(plan["angles_deg"], np.arange(0, 180, 15))
+        assert file["entry/instrument/devices/camera/model"][()] == b"fake camera"
+        log = file["entry/frame_log"]
+        assert list(log["trigger"]) == [0, 1, 2, 0, 1, *range(12), 0, 1]
+        assert np.all(np.diff(log["time"][()]) > 0)
+        assert not np.any(log["flags"])
+
+
+def test_missing_frames_are_named_after_everything_else_was_taken(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(Faults(lost={8}, ignored={11, 12})))
+    assert isinstance(ran.error, LedgerError)
+    assert ran.error.missing == (8, 11, 12)
+    assert "3 of 12 projections are missing: 3, 6-7" in str(ran.error)
+    ran.assert_good_file(16, "failed", missing=(8, 11, 12))
+    ran.assert_safe()
+    assert ran.of("scan_done")[0].data["missing"] == (8, 11, 12)
+    assert ran.of("failed")[0].data["exit_code"] == 5
+    assert ran.states[-1] == State.FAILED
+    assert [event.data["check"] for event in ran.of("flag")] == ["timing", "timing"]  # and it was said at once
+
+
+@pytest.mark.parametrize(
+    ("abort", "kind", "code", "least"), [(False, ScanStopped, 4, 11), (True, ScanAborted, 130, 11)]
+)
+def test_stop_and_abort_leave_a_readable_file(
+    tmp_path: Path, abort: bool, kind: type[ScanStopped], code: int, least: int
+) -> None:
+    stop = StopRequest()
+    wish = stop.abort if abort else stop.stop
+    ran = Ran(tmp_path, Instrument(on_frame=lambda number: wish() if number == 10 else None), stop=stop)
+    assert type(ran.error) is kind
+    n = ran.of("scan_done")[0].data["n_frames"]
+    assert least <= n < 17
+    ran.assert_good_file(n, "stopped")
+    ran.assert_safe()
+    assert ran.of("failed")[0].data["exit_code"] == code
+
+
+def test_a_stop_before_the_start_makes_no_folder(tmp_path: Path) -> None:
+    stop = StopRequest()
+    stop.stop()
+    ran = Ran(tmp_path / "runs", Instrument(), stop=stop)
+    assert type(ran.error) is ScanAborted
+    assert ran.folder is None
+    assert ran.instrument.log == []
+
+
+def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    ran = Ran(tmp_path / "runs", Instrument(), "scan.period_s=0.021")
+    assert isinstance(ran.error, ConfigError)
+    assert "nothing was started" in str(ran.error)
+    assert ran.folder is None
+    assert ran.instrument.log == []
+    assert ran.events == []
+
+
+def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(Faults(errors={10: 99})))
+    assert isinstance(ran.error, DeviceError)
+    ran.assert_good_file(10, "failed")
+    ran.assert_safe()
+    assert ran.of("scan_done")[0].data["status"] == "failed"
+    assert ran.of("failed")[0].data["exit_code"] == 3
+
+
+def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:
+    class Full(NXtomoWriter):
+        def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+            if frame.index == at:
+                raise failure
+            super().append(frame, digest, flags)
+
+    return Full
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [DataError("the disk is full. The first 8 frames are in the file."), OSError(errno.ENOSPC, "No space left")],
+)
+def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, failure))
+    ran = Ran(tmp_path, Instrument(), "scan.angles.views=200", "scan.period_s=0.05")
+    assert isinstance(ran.error, DataError)
+    assert "8 frames are in the file" in str(ran.error)
+    ran.assert_good_file(8, "failed")
+    ran.assert_safe()
+    assert ran.instrument.stage.position() == pytest.approx(100 * COUNT)  # the devices are well: back to the start
+    assert ran.of("failed")[0].data["exit_code"] == 5
+
+
+def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import threading
+
+    free = threading.Event()
+
+    class Hanging(NXtomoWriter):
+        def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+            if frame.index == 6:
+                free.wait(60)
+            super().append(frame, digest, flags)
+
+    monkeypatch.setattr(module, "NXtomoWriter", Hanging)
+    monkeypatch.setattr(recorder_module, "STALL", 0.05)
+    monkeypatch.setattr(recorder_module, "RING_FRAMES", (2, 2))
+    try:
+        ran = Ran(tmp_path, Instrument())
+    finally:
+        free.set()
+    assert isinstance(ran.error, DataError)
+    assert "took no frame" in str(ran.error)
+    ran.assert_safe()
+
+
+def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(Faults(repeats={9, 10, 11})))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    assert ran.result.flags == {"stuck": 3}
+    assert [(e.data["check"], e.data["view"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
+    with h5py.File(ran.folder / "scan.h5") as file:
+        flags = file["entry/frame_log/flags"][()]
+    assert np.flatnonzero(flags).tolist() == [9, 10, 11]
+    assert flags[9] == (1 << 2) | (1 << 18)
+
+
+def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "RING_FRAMES", (2, 2))  # on a virtual clock the writer would be far behind
+    ran = Ran(
+        tmp_path, Instrument(Faults(repeats={9})), "monitor.on_alarm=stop", "scan.angles.views=60", "scan.period_s=0.1"
+    )
+    assert type(ran.error) is ScanStopped
+    assert "stuck check raised an alarm" in str(ran.error)
+    done = ran.of("scan_done")[0].data
+    assert done["status"] == "stopped"
+    assert 10 <= done["n_frames"] < 20
+    ran.assert_safe()
+
+
+def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(recorder_module.monitor, "watch", broken)
+    ran = Ran(tmp_path, Instrument())
+    assert ran.error is None
+    ran.assert_good_file(19, "complete")
+    assert ["monitor failed at row 0" in event.data["message"] for event in ran.of("warning")] == [True]
+
+
+def test_an_interpreter_interrupt_closes_the_file_too(tmp_path: Path) -> None:
+    def interrupt(number: int) -> None:
+        if number == 10:
+            raise KeyboardInterrupt
+
+    ran = Ran(tmp_path, Instrument(on_frame=interrupt))
+    assert isinstance(ran.error, KeyboardInterrupt)
+    ran.assert_good_file(10, "failed")
+    ran.assert_safe()
+
+
+def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
+    return lambda scan, output: [sys.executable, "-c", code, str(scan), str(output)]
+
+
+def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
+    code = """
+import json, pathlib, sys
+print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "n_views": 5}))
+print("a library's chatter")
+pathlib.Path(sys.argv[2]).write_text("volume")
+print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
+"""
+    ran = Ran(tmp_path, Instrument(), live=script(code))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    recon = [(e.event, e.data["source"]) for e in ran.events if "source" in e.data]
+    assert recon == [("snapshot", "recon"), ("recon_done", "recon")]
+    assert ran.result.recon is not None
+    assert ran.result.recon["axis_col"] == 80.5
+    assert Path(ran.result.recon["output"]) == ran.folder / "recon.h5"
+    assert ran.events[-1].event == "done"
+    ran.assert_good_file(19, "complete")
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        ("import sys; sys.exit('out of memory')", "ended with code 1"),
+        ("pass", "ended with code 0"),
+        ('print(\'{"event": "failed", "message": "no axis", "exit_code": 5}\'); raise SystemExit(5)', "no axis"),
+    ],
+)
+def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: str, says: str) -> None:
+    ran = Ran(tmp_path, Instrument(), live=script(code))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    assert ran.result.recon is None
+    assert any(says in event.data["message"] for event in ran.of("warning"))
+    ran.assert_good_file(19, "complete")
+    if "memory" in code:
+        assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
+
+
+def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
+    assert ran.error is None
+    assert any("cannot be started" in event.data["message"] for event in ran.of("warning"))
+    ran.assert_good_file(19, "complete")
+
+
+def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
+    stop = StopRequest()
+    ran = Ran(
+        tmp_path,
+        Instrument(on_frame=lambda number: stop.abort() if number == 10 else None),
+        stop=stop,
+        live=script("import time; time.sleep(100)"),
+    )
+    assert type(ran.error) is ScanAborted
+    assert any("it was ended" in event.data["message"] for event in ran.of("warning"))
+
+
+def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path) -> None:
+    stop = StopRequest()
+    instrument = Instrument()
+    events: list[Event] = []
+
+    def sink(event: Event) -> None:
+        events.append(event)
+        if event.event == "scan_done":
+            stop.stop()
+
+    result = run_scan(
+        small(),
+        tmp_path,
+        [sink],
+        stop,
+        live=script("import time; time.sleep(100)"),
+        bench=instrument.bench(),
+    )
+    assert result.n_frames == 19
+    assert result.recon is None
+
+
+def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
+    config = load(
+        config_folder() / "simulated.yaml",
+        [
+            *SMALL,
+            "scan.angles.views=30",
+            "devices.stage.low_deg=-30",
+            "scan.period_s=0.3",
+            "simulation.clock=virtual",
+            "devices.camera.roi=[1136, 2032, 32, 48]",
+            "simulation.scene=scenes/plain.yaml",
+        ],
+        environment={},
+    )
+    result = run_scan(config, tmp_path)
+    assert (result.n_frames, result.missing) == (37, ())
+    with open_scan(result.path) as source:
+        views = source.image_key == FrameKind.PROJECTION
+        np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
+        flats, darks = (source.read(np.flatnonzero(source.image_key == kind)).mean() for kind in (1, 2))
+        assert flats > darks + 1000
+
+
+@pytest.mark.parametrize("taken", [0, 1, 3])
+def test_a_folder_is_never_used_twice(tmp_path: Path, taken: int) -> None:
+    made = [create_run_folder(tmp_path / "runs", "cell", 1_795_152_753.0) for _ in range(taken + 1)]
+    assert len(set(made)) == taken + 1
+    assert made[0].name == "2026-11-20T05-32-33_cell"
+    assert all(folder.is_dir() for folder in made)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (InstrumentError("x"), 3),
+        (DeviceError("stage", "x"), 3),
+        (ConfigError("x"), 2),
+        (KeyboardInterrupt(), 130),
+        (ZeroDivisionError(), 1),
+    ],
+)
+def test_exit_codes(error: BaseException, code: int) -> None:
+    assert module.exit_code(error) == code
