@@ -163,7 +163,7 @@ def _axis_from_mass(data: Floats, theta: Floats, search: tuple[float, float] | N
     rise = 1 / covariance[0, 0]
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
     curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
-    low, high = _limits(search, candidates)
+    low, high = (candidates[0], candidates[-1]) if search is None else search
     if not low < value < high:
         raise _axis_error(value, search, candidates, "outside it")
     # Neighbouring residuals that are alike are not independent; air that is not at zero pulls without any scatter.
@@ -191,11 +191,14 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    curve = curve_for(1)
+    # Low frequencies feel what is wrong with air and truncation, high ones feel noise: they must agree. A sample that
+    # reaches out of the field asks for higher ones.
+    rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
+    power = 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
+    curve = curve_for(power)
     full = candidates * bin_ + (bin_ - 1) / 2
     value, depth = _optimum(full, curve, search)
-    # Low frequencies feel what is wrong with air and truncation, high ones feel noise: they must agree.
-    bands = abs(_lowest(full, curve_for(0))[0] - _lowest(full, curve_for(2))[0])
+    bands = abs(_lowest(full, curve_for(power - 1))[0] - _lowest(full, curve_for(power + 1))[0])
     return AxisEstimate(value, *_within(search, full, curve), depth > 0.5 and bands < _AGREE * bin_, "double wedge")
 
 
@@ -314,12 +317,8 @@ def _within(search: tuple[float, float] | None, candidates: Floats, curve: Float
     return candidates[inside], curve[inside]
 
 
-def _limits(search: tuple[float, float] | None, candidates: Floats) -> tuple[float, float]:
-    return (float(candidates[0]), float(candidates[-1])) if search is None else search
-
-
 def _axis_error(value: float, search: tuple[float, float] | None, candidates: Floats, where: str) -> AxisError:
-    low, high = _limits(search, candidates)
+    low, high = (candidates[0], candidates[-1]) if search is None else search
     return AxisError(
         f"no rotation axis in the search range {low:g} to {high:g}: the best column is {value:.2f}, {where}; "
         "widen the range, or give the axis"
@@ -334,7 +333,7 @@ def _optimum(candidates: Floats, curve: Floats, search: tuple[float, float] | No
     """
     part, values = _within(search, candidates, curve)
     if part.size < 3:
-        low, high = _limits(search, candidates)
+        low, high = (candidates[0], candidates[-1]) if search is None else search
         raise ValueError(
             f"search range {low:g} to {high:g} holds {part.size} candidates; the axis is looked for in columns "
             f"{candidates[0]:g} to {candidates[-1]:g}"

@@ -88,6 +88,15 @@ def test_a_sector_of_a_whole_sample(span: float, photons: float, within: float) 
         assert abs(estimate.value - axis) < within
 
 
+@pytest.mark.parametrize("name", ["half turn", "full turn", "golden"])
+def test_a_sample_that_reaches_out_of_the_field(name: str) -> None:
+    """The scan breaks the double wedge then; what the edges do to low frequencies must not carry the axis along."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        views = ellipses(rng, angle_sets()[name], 56.4, reach=90)
+        assert abs(axis_from_sinogram(views, angle_sets()[name]).value - 56.4) < 0.5
+
+
 def test_a_sector_of_a_truncated_sample_is_not_believed(rng: np.random.Generator) -> None:
     angles = np.deg2rad(np.linspace(30, 150, 60))
     assert not axis_from_sinogram(ellipses(rng, angles, 60.0, reach=85), angles).confident
