@@ -68,7 +68,8 @@ def digest(
         raise ValueError(f"A frame is a non-empty real [row, col] array, not {image.dtype} {image.shape}.")
     if preview_bin < 1:
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
-    image = np.ascontiguousarray(image)
+    image = np.ascontiguousarray(image).view()
+    image.flags.writeable = False  # one compiled kernel for all: numba tells writable arrays from others
     checksum = zlib.crc32(image.data.cast("B"))
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     if image.dtype == np.uint16 and no_data is None:
@@ -77,6 +78,7 @@ def digest(
     else:
         if image.dtype not in (np.float32, np.float64):
             image = image.astype(np.float64)
+            image.flags.writeable = False
         numbers = _from_reals(image, saturation, preview_bin, no_data, preview)
     return FrameDigest(*numbers, checksum, preview)
 

@@ -28,14 +28,14 @@ def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
 def add_exchange_view(file: h5py.File) -> None:
     """Add /exchange for the rows that exist. Kinds without a frame get no dataset, and neither do invalid frames."""
     source = file[layout.DATA]
-    control = file[f"{layout.DETECTOR}/image_key_control"][()]
+    kinds = file[layout.KIND][()]
     angles = file[layout.ANGLE][()]
     n = int(file[layout.COMMITTED][()])
     file["implements"] = "exchange"
     group = file.create_group("exchange")
     units = file["/entry/record/quantity"].asstr()[()]
     for kind, name in NAMES.items():
-        rows = np.flatnonzero(control[:n] == kind)
+        rows = np.flatnonzero(kinds[:n] == kind)
         if rows.size == 0:
             continue
         virtual = h5py.VirtualLayout((rows.size, *source.shape[1:]), source.dtype)

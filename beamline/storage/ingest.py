@@ -7,12 +7,14 @@ rounding would lose what was measured. They keep their type, at the same paths, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.digest import digest
 from beamline.errors import DataError, ScanStopped
@@ -117,17 +119,31 @@ def _copy(
     rows = layout.Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0
-    for i in range(n):
+    for i, (image, record) in enumerate(_frames(source)):
         if should_stop is not None and should_stop():
             raise ScanStopped(f"Stopped after {i} of {n} frames; nothing is left of {file.filename}.")
-        image = source.read([i])[0]
         statistics = digest(image, saturation=saturation, no_data=no_data)
         invalid += statistics.invalid_fraction == 1.0
-        rows.write(i, image, statistics, layout.Record(FrameKind(int(source.image_key[i])), float(source.angles[i])))
+        rows.write(i, image, statistics, record)
         if progress is not None:
             progress(i + 1, n)
     file[layout.COMMITTED][()] = n
     file[layout.STATUS][()] = b"complete"
     file[layout.FINISHED][()] = 1
+    layout.settle(file)
     add_exchange_view(file)
     return invalid
+
+
+def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
+    """Pixels and what is known of each frame; a scan of ours (also one whose writer died) keeps its log."""
+    if source.dtype == np.uint16:
+        for frame in source.frames():
+            yield (
+                frame.counts,
+                layout.Record(frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time),
+            )
+        return
+    keys, angles = source.image_key, source.angles
+    for i in range(keys.size):
+        yield source.read([i])[0], layout.Record(FrameKind(int(keys[i])), float(angles[i]))

@@ -180,7 +180,7 @@ class NXtomoWriter:
         # our own followers hold none.
         try:
             with h5py.File(self.path, "r+", libver=layout.LIBVER) as file:
-                layout.settle_end_time(file)
+                layout.settle(file)
                 add_exchange_view(file)
         except OSError as error:
             self.remarks.append(

@@ -1,18 +1,19 @@
 """The layout of our HDF5 scans: every path, type and unit, made once before the first frame and only grown after.
 
     /entry                      NXentry, definition NXtomo (NeXus definitions 2026.01): title, start_time, end_time
-      instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
-                                count_time (s), x_pixel_size, y_pixel_size, distance (mm)
+      instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, count_time (s),
+                                x_pixel_size, y_pixel_size, distance (mm)
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 trigger, framestamp, time, flags of each frame
+      frame_log                 kind, trigger, framestamp, time, flags of each frame
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
 
-image_key holds 0, 1, 2, 3; image_key_control holds ESRF's extension, -1 for an alignment frame (image_key 0).
+image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind and in image_key_control, ESRF's
+extension, which is added at the end of a scan that has such frames (validators refuse it in others).
 Float frames are no NXtomo (its data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
 """
 
@@ -41,6 +42,7 @@ DETECTOR = "/entry/instrument/detector"
 DATA = f"{DETECTOR}/data"
 IMAGE_KEY = f"{DETECTOR}/image_key"
 ANGLE = "/entry/sample/rotation_angle"
+KIND = "/entry/frame_log/kind"
 PREVIEW = "/entry/digest/preview"
 COMMITTED = "/entry/progress/frames_committed"
 FINISHED = "/entry/progress/finished"
@@ -53,9 +55,9 @@ _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {  # path: (type, unit)
         IMAGE_KEY: ("<i4", ""),
-        f"{DETECTOR}/image_key_control": ("<i4", ""),
         f"{DETECTOR}/count_time": ("<f8", "s"),
         ANGLE: ("<f8", "degree"),
+        KIND: ("<i4", ""),
         "/entry/frame_log/trigger": ("<i8", ""),
         "/entry/frame_log/framestamp": ("<i8", ""),
         "/entry/frame_log/time": ("<f8", "s"),
@@ -209,10 +211,9 @@ class Rows:
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
         """Row `row`, which may exist or be the next: pixels first, then what is said about them."""
-        control = int(record.kind)
         said = {
-            "image_key": 0 if record.kind is FrameKind.ALIGNMENT else control,
-            "image_key_control": control,
+            "image_key": 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
+            "kind": int(record.kind),
             "count_time": record.exposure,
             "rotation_angle": np.degrees(record.angle),
             "trigger": record.trigger,
@@ -233,11 +234,15 @@ class Rows:
             dataset.id.set_extent((n, *dataset.id.shape[1:]))
 
 
-def settle_end_time(file: h5py.File) -> None:
-    """Once SWMR writing is over: the end time as variable-length text, which strict validators demand of a time."""
-    end = bytes(file[END_TIME][()]).decode()
-    del file[END_TIME]
-    file[END_TIME] = end
+def settle(file: h5py.File) -> None:
+    """Once SWMR writing is over: what strict validators want otherwise than a growing file can have it."""
+    if END_TIME in file:
+        end = file[END_TIME].asstr()[()]
+        del file[END_TIME]
+        file[END_TIME] = end
+    kinds = file[KIND][()]
+    if (kinds == FrameKind.ALIGNMENT).any():
+        file[f"{DETECTOR}/image_key_control"] = kinds
 
 
 def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None:

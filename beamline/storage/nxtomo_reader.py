@@ -58,8 +58,11 @@ class NXtomoSource:
 
     def refresh(self) -> int:
         """Look again at a growing file; how many frames can be read now."""
-        places, control = self._places, hdf5.dataset(self._places.detector, "image_key_control")
-        key = places.image_key if control is None else control
+        places = self._places
+        finer = hdf5.dataset(places.detector, "image_key_control")
+        if self._ours:
+            finer = hdf5.dataset(places.entry, "frame_log/kind")
+        key = places.image_key if finer is None else finer
         if self._ours:
             committed = self._file[layout.COMMITTED]
             committed.refresh()
@@ -77,7 +80,9 @@ class NXtomoSource:
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
-        self.n, self.image_key, self.angles = n, keys[:n].astype(np.int32), angles[:n]
+        known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
+        self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
+        self.n, self.angles = n, angles[:n]
         return n
 
     @property

@@ -105,10 +105,10 @@ def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
 def bare_frames(source: ScanSource) -> Iterator[Frame]:
     """Frames of a source that knows no more than kinds and angles: no framestamps, times or exposures."""
     require_counts(source)
-    triggers = count_in_blocks(source.image_key)
-    for i, key in enumerate(source.image_key):
-        angle = float(source.angles[i])
-        yield Frame(source.read([i])[0], FrameKind(int(key)), i, int(triggers[i]), -1, angle, np.nan, np.nan)
+    keys, angles = source.image_key, source.angles
+    triggers = count_in_blocks(keys)
+    for i, key in enumerate(keys):
+        yield Frame(source.read([i])[0], FrameKind(int(key)), i, int(triggers[i]), -1, float(angles[i]), np.nan, np.nan)
 
 
 def require_counts(source: ScanSource) -> None:

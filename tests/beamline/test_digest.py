@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.stats import entropy as scipy_entropy
 
-from beamline.digest import ENTROPY_BINS, digest, preview_shape
+from beamline.digest import ENTROPY_BINS, _count_greys, digest, preview_shape
 
 shapes = st.tuples(st.integers(1, 17), st.integers(1, 17))
 counts = hnp.arrays(np.uint16, shapes)
@@ -110,6 +110,18 @@ def test_a_view_into_a_larger_array_is_digested_like_its_copy(rng: np.random.Gen
     a, b = digest(view), digest(view.copy())
     assert (a.checksum, a.mean, a.variance) == (b.checksum, b.mean, b.variance)
     np.testing.assert_array_equal(a.preview, b.preview)
+
+
+def test_one_frame_compiles_the_kernel_for_all(rng: np.random.Generator) -> None:
+    digest(np.zeros((3, 3), np.uint16))
+    before = len(_count_greys.signatures)
+    image = rng.poisson(100, (20, 20)).astype(np.uint16)
+    for writeable in (True, False):
+        image.flags.writeable = writeable
+        digest(image)
+    digest(image[:, ::2])
+    assert len(_count_greys.signatures) == before
+    assert not image.flags.writeable  # the caller's array is as it was
 
 
 def test_one_changed_pixel_changes_the_checksum(rng: np.random.Generator) -> None:

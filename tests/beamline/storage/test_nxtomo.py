@@ -17,8 +17,9 @@ import pytest
 
 from beamline.digest import digest
 from beamline.errors import DataError
+from beamline.storage import nxtomo_layout as layout
+from beamline.storage.ingest import ingest
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.nxtomo_layout import COLUMNS
 from beamline.storage.source import open_scan
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
@@ -161,6 +162,8 @@ def test_an_alignment_frame_is_a_projection_to_those_who_do_not_know_it(write: W
         assert file["entry/instrument/detector/image_key"][14] == 0
         assert file["entry/instrument/detector/image_key_control"][14] == -1
         assert file["exchange/data"].shape[0] == 9
+    with h5py.File(write(frames, "plain.h5")) as file:  # type: ignore[call-arg]
+        assert "image_key_control" not in file["entry/instrument/detector"]
     with open_scan(path) as source:
         assert source.image_key[14] == FrameKind.ALIGNMENT
 
@@ -215,8 +218,19 @@ def test_wrong_frames_are_refused_and_nothing_is_written(
     with pytest.raises(DataError, match="closed"):
         writer.append(good, digest(good.counts))
     with h5py.File(tmp_path / "s.h5") as file:
-        assert {file[path].shape[0] for path in COLUMNS} == {1}
+        assert {file[path].shape[0] for path in layout.COLUMNS} == {1}
         assert file["entry/instrument/detector/data"].shape[0] == 1
+
+
+def test_rows_only_grow(tmp_path: Path, frames: list[Frame]) -> None:
+    """Writing an earlier row again keeps those after it."""
+    with h5py.File(tmp_path / "s.h5", "x") as file:
+        layout.create(file, INFO, SHAPE, np.dtype("<u2"), quantity="counts", preview_bin=4, start=None)
+        rows = layout.Rows(file)
+        for row in (0, 1, 2, 0):
+            counts = frames[row].counts
+            rows.write(row, counts, digest(counts), layout.Record(frames[row].kind, 0.0))
+        assert {file[path].shape[0] for path in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {3}
 
 
 def test_a_disk_that_takes_no_more_is_named_and_the_rows_before_stay(
@@ -315,6 +329,10 @@ def test_a_killed_writer_leaves_the_flushed_frames(tmp_path: Path) -> None:
             for found, frame in zip(source.frames(), expected, strict=True):
                 np.testing.assert_array_equal(found.counts, frame.counts)
                 assert (found.kind, found.trigger, found.time) == (frame.kind, frame.trigger, frame.time)
+    ingest(tmp_path / "s.h5", tmp_path / "rescued.h5")
+    with open_scan(tmp_path / "rescued.h5") as source:
+        assert source.finished
+        assert [frame.time for frame in source.frames()] == [frame.time for frame in expected]
 
 
 def hold_open(path: Path, opened: Event, released: Event) -> None:
