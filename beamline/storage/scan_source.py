@@ -33,7 +33,7 @@ class ScanSource(Protocol):
         pixel_size_mm: at the sample.
         axis_col: rotation axis in 0-based pixel-centre columns.
         attributes: whatever else the file says, for the record.
-        finished: no more frames will come.
+        finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
 
     @property

@@ -1,0 +1,128 @@
+"""A growing file: followed by others, left behind by a killed writer, locked by a stranger."""
+
+from __future__ import annotations
+
+import multiprocessing
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.digest import digest
+from beamline.storage.ingest import ingest
+from beamline.storage.nxtomo import NXtomoWriter
+from beamline.storage.source import open_scan
+from drivers.clock import SystemClock
+from drivers.frame import Frame
+
+from .conftest import INFO, SHAPE, StandingClock, scan_frames
+
+
+def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=3)
+    with open_scan(tmp_path / "s.h5", follow=True) as source:
+        seen = []
+        for frame in frames[:8]:
+            writer.append(frame, digest(frame.counts))
+            seen.append(source.refresh())
+        assert seen == [0, 0, 3, 3, 3, 6, 6, 6]
+        assert writer.committed == 6
+        assert not source.finished
+        with pytest.raises(IndexError, match=r"only 0\.\.5"):
+            source.read([6])
+        np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames[:6]])
+        np.testing.assert_array_equal(source.image_key, [2, 2, 1, 1, 1, 0])
+    writer.close()
+
+
+def follow_to_the_end(path: Path, opened: Event, result: multiprocessing.SimpleQueue[list[int]]) -> None:
+    """In another process: read what comes until the writer has finished."""
+    seen: list[int] = []
+    sums: list[int] = []
+    with open_scan(path, follow=True) as source:
+        opened.set()
+        while True:
+            finished = source.finished  # asked first: whatever is committed then is all there will be
+            n = source.refresh()
+            sums += [int(source.read([i]).sum()) for i in range(len(sums), n)]
+            seen.append(n)
+            if finished:
+                result.put([*sums, len(sums)])
+                return
+
+
+def test_a_follower_in_another_process_gets_every_frame(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    opened, result = spawn.Event(), spawn.SimpleQueue()
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    follower = spawn.Process(target=follow_to_the_end, args=(tmp_path / "s.h5", opened, result))
+    follower.start()
+    assert opened.wait(60)
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    writer.close()
+    assert writer.remarks == []  # the follower holds no lock: the /exchange view could be added
+    assert result.get() == [*(int(frame.counts.sum()) for frame in frames), len(frames)]
+    follower.join(60)
+    assert follower.exitcode == 0
+
+
+def write_and_wait(path: Path, written: Event) -> None:
+    """In another process: seven frames, the last two not flushed, then wait to be killed."""
+    writer = NXtomoWriter(path, INFO, SHAPE, clock=SystemClock(), flush_every=5)
+    for frame in scan_frames(np.random.default_rng(5))[:7]:
+        writer.append(frame, digest(frame.counts))
+    written.set()
+    multiprocessing.get_context("spawn").Event().wait()
+
+
+def test_a_killed_writer_leaves_the_flushed_frames(tmp_path: Path) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    written = spawn.Event()
+    writer = spawn.Process(target=write_and_wait, args=(tmp_path / "s.h5", written))
+    writer.start()
+    assert written.wait(60)
+    writer.kill()
+    writer.join(60)
+    expected = scan_frames(np.random.default_rng(5))[:5]
+    for follow in (True, False):
+        with open_scan(tmp_path / "s.h5", follow=follow) as source:
+            assert source.refresh() == 5
+            assert not source.finished
+            for found, frame in zip(source.frames(), expected, strict=True):
+                np.testing.assert_array_equal(found.counts, frame.counts)
+                assert (found.kind, found.trigger, found.time) == (frame.kind, frame.trigger, frame.time)
+    ingest(tmp_path / "s.h5", tmp_path / "rescued.h5")
+    with open_scan(tmp_path / "rescued.h5") as source:
+        assert source.finished
+        assert [frame.time for frame in source.frames()] == [frame.time for frame in expected]
+
+
+def hold_open(path: Path, opened: Event, released: Event) -> None:
+    """In another process: a viewer that keeps the file open, with HDF5's own lock."""
+    with h5py.File(path, "r", swmr=True):
+        opened.set()
+        released.wait()
+
+
+def test_another_programs_lock_costs_the_view_and_nothing_else(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    opened, released = spawn.Event(), spawn.Event()
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+    viewer = spawn.Process(target=hold_open, args=(tmp_path / "s.h5", opened, released))
+    viewer.start()
+    assert opened.wait(60)
+    writer.close()
+    released.set()
+    viewer.join(60)
+    assert len(writer.remarks) == 1
+    assert "no /exchange view" in writer.remarks[0]
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "complete")
