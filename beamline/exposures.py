@@ -63,15 +63,20 @@ class Taken:
 
 @dataclass
 class _Pass:
-    """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes."""
+    """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes.
+
+    `braked`: when the stage was told to stop on the way.
+    """
 
     ledger: Ledger
     first: int
     seconds: float
+    braked: float = math.inf
 
     def enter(self, frame: CameraFrame) -> tuple[CameraFrame, int, float]:
         """The frame with its trigger within the block (or EXTRA) and its angle."""
-        self.ledger, entry = assign(self.ledger, frame.framestamp, frame.time)
+        steady = frame.time < self.braked
+        self.ledger, entry = assign(self.ledger, frame.framestamp, frame.time, steady)
         return frame, EXTRA if entry.trigger == EXTRA else self.first + entry.trigger, entry.angle
 
 
@@ -180,6 +185,7 @@ class Exposures:
         braking = False
         while not flight.ledger.complete:
             if self._stop.stopping and not braking:
+                flight.braked = self._clock.now()
                 self._stage.stop()
                 braking = True
             frame = self._next_frame(tail + 2 * block.period if braking else wait, heed_stop=not braking)

@@ -129,21 +129,30 @@ class Account:
         return not self.missing and not self.extra
 
 
-def assign(ledger: Ledger, framestamp: int, time: float) -> tuple[Ledger, Entry]:
+def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
     """Enter a received frame: the ledger with it, and the trigger and angle that it has.
 
-    Frames come in the order in which they were exposed. `time` is the frame's trigger time in s.
+    Frames come in the order in which they were exposed.
+
+    Args:
+        time: the frame's trigger time in s.
+        steady: the stage turned at constant speed. While it brakes, times say nothing, but the triggers come ever
+            later, so none is ignored and the framestamps alone count them.
     """
     train = ledger.train
     new_exposures = framestamp - ledger.exposed
-    if ledger.last < 0:
+    exposures = ledger.unmatched + new_exposures
+    if not steady:
+        steps, residual = exposures, 0.0
+        trigger = ledger.last + steps
+        position = float(trigger)
+    elif ledger.last < 0:
         position, trigger, residual = _first_place(train, framestamp, time)
         steps = trigger + 1
     else:
         position = ledger.last + (time - ledger.phase) / ledger.period
         trigger = round(position)
         steps, residual = trigger - ledger.last, position - trigger
-    exposures = ledger.unmatched + new_exposures
     if new_exposures < 1 or steps < 1 or trigger >= train.n or abs(residual) > FREE:
         angle = float(np.interp(position, np.arange(train.n), train.angles))
         extra = (*ledger.extra, framestamp)

@@ -165,7 +165,7 @@ class Stage:
         if self.moving():
             self.move = move
             low, high = sorted((move.start, move.target))
-            self.pulses = [(time, p) for time, p in self.pulses if low <= p <= high and time <= move.end]
+            self.pulses = [(move.time_at(p), p) for _, p in self.pulses if low <= p <= high]
 
     def describe(self) -> dict[str, str | int | float]:
         return {"model": "fake stage"}

@@ -244,6 +244,20 @@ def test_a_stop_keeps_what_was_exposed_and_takes_the_references_still_owed(mode:
     assert run.scan.missing == []
 
 
+def test_frames_taken_while_the_stage_brakes_keep_their_angles_though_they_come_ever_later() -> None:
+    stop = StopRequest()
+    lost = 33
+    bench = Instrument(Faults(lost={5 + lost}), on_frame=lambda number: stop.stop() if number == 35 else None)
+    run = Run(bench, bench.timeline(n=140, speed=55), stop)
+    assert type(run.error) is ScanStopped
+    assert run.views == [i for i in range(len(run.views) + 1) if i != lost]
+    assert len(run.views) > 36  # some came while it braked, one of which was lost
+    assert np.diff([f.time for f in run.of(FrameKind.PROJECTION)])[-1] > 1.5 * bench.period
+    assert run.of(FrameKind.INVALID) == []
+    assert_true_angles(run)
+    assert run.scan.missing == [5 + lost]
+
+
 def test_a_stop_in_the_owed_references_ends_the_scan() -> None:
     stop = StopRequest()
     bench = Instrument(on_frame=lambda number: stop.stop() if number == 12 else None)
