@@ -1,17 +1,25 @@
-"""Tomographic reconstruction: arrays in, arrays out. `recon.reconstruct` and `recon.Geometry` are the public names."""
+"""Tomographic reconstruction: arrays in, arrays out. `recon.reconstruct` and `recon.Geometry` are the public names.
+
+The values (Geometry, Grid, Volume) load at once; what computes loads torch and numba on first use, so that a program
+which only plans a scan starts quickly.
+"""
 
 from __future__ import annotations
 
-import os
-
-# libgomp reads this when it is loaded: without it idle threads spin, and two processes that share the cores
-# (a scan and its live reconstruction) slow each other down twentyfold.
-os.environ.setdefault("GOMP_SPINCOUNT", "2000")
-
-import torch  # noqa: F401 - before any numba kernel runs: the other order makes torch's operators 20x slower
+from typing import TYPE_CHECKING, Any
 
 from recon.geometry import Geometry
-from recon.reconstruct import Reconstruction, reconstruct
 from recon.volume import Grid, Volume
 
+if TYPE_CHECKING:
+    from recon.reconstruction import Reconstruction, reconstruct
+
 __all__ = ["Geometry", "Grid", "Reconstruction", "Volume", "reconstruct"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("Reconstruction", "reconstruct"):
+        from recon import reconstruction
+
+        return getattr(reconstruction, name)
+    raise AttributeError(f"module 'recon' has no attribute {name!r}")

@@ -15,6 +15,7 @@ from numba import get_num_threads, njit, prange
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from recon import threads  # noqa: F401 - torch before the first numba thread
 from recon.geometry import Geometry
 from recon.volume import Grid
 

@@ -217,9 +217,9 @@ class StreamingFit:
 
 
 def default_count(grid: Grid) -> int:
-    """How many Gaussians a grid is worth: one for 100 voxels of the cylinder in it, 2000 to 200 000."""
+    """How many Gaussians a grid is worth: one for 60 voxels of the cylinder in it, 2000 to 200 000."""
     nz, ny, nx = grid.shape
-    return int(np.clip(np.pi / 4 * nz * ny * nx / 100, 2000, 200_000))
+    return int(np.clip(np.pi / 4 * nz * ny * nx / 60, 2000, 200_000))
 
 
 def _span(theta: NDArray[np.float64]) -> float:
