@@ -238,9 +238,8 @@ def run(
 
 def gaussians_of(state: FitState) -> Gaussians:
     """A copy of the model."""
-    p = state.parameters
-    tensors = [torch.from_numpy(p[name].copy()) for name in NAMES]
-    return Gaussians(*tensors, density_unit=state.unit)
+    means, log_scales, quaternions, raw = (torch.from_numpy(state.parameters[name].copy()) for name in NAMES)
+    return Gaussians(means, log_scales, quaternions, raw, state.unit)
 
 
 def volume_of(state: FitState, grid: Grid, settings: FitSettings) -> Volume:
@@ -284,9 +283,9 @@ def _update(
     shrink = settings.pace * settings.decay**fraction
     for name, rate in zip(NAMES, settings.rates, strict=True):
         scale = problem.half_field if name == "means" else 1.0
-        columns = [a.reshape(state.n, -1) for a in (state.parameters[name], gradients[name])]
-        moments = [a.reshape(state.n, -1) for a in (state.first[name], state.second[name])]
-        adam(*columns, *moments, rate * shrink * scale, state.step - state.restart)
+        arrays = (state.parameters[name], gradients[name], state.first[name], state.second[name])
+        parameter, gradient, first, second = (a.reshape(state.n, -1) for a in arrays)
+        adam(parameter, gradient, first, second, rate * shrink * scale, state.step - state.restart)
     low = np.log(settings.smallest * problem.geometry.pixel_pitch)
     np.clip(state.parameters["log_scales"], low, np.log(problem.half_field), out=state.parameters["log_scales"])
 
@@ -295,7 +294,7 @@ def _grow(state: FitState, problem: Problem, policy: DensityPolicy) -> None:
     p = state.parameters
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)
     z, y, x = (n * problem.grid.voxel_size / 2 for n in problem.grid.shape)
-    statistic = state.statistic / max(1, state.seen)
+    statistic = state.statistic / np.float32(max(1, state.seen))
     change = control(
         p["means"], p["log_scales"], active.rotations, p["raw"], statistic, policy,
         2 * problem.half_field, state.limit, (x, y, z), state.rng,

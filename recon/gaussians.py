@@ -120,7 +120,8 @@ class Gaussians:
         missing = [name for name in (*names, "density_unit") if name not in arrays]
         if missing:
             raise ValueError(f"a checkpoint of Gaussians needs {names} and density_unit; {missing} are missing")
-        return cls(*(_tensor(np.asarray(arrays[name])) for name in names), float(arrays["density_unit"]))
+        means, log_scales, quaternions, raw = (_tensor(np.asarray(arrays[name])) for name in names)
+        return cls(means, log_scales, quaternions, raw, float(arrays["density_unit"]))
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:

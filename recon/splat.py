@@ -102,49 +102,52 @@ def view_backward(
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
         unit: float, geometry: Geometry, truncation: Truncation,
     ) -> Tensor:  # fmt: skip
-        arrays = [t.detach().contiguous().numpy() for t in (means, log_scales, quaternions, raw)]
-        active = Active.of(*arrays, unit)
+        active = Active.of(*(_array(t) for t in (means, log_scales, quaternions, raw)), unit=unit)
         faint = truncation.faint * unit * geometry.pixel_pitch * geometry.detector_shape[1]
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         tables = []
         for view in range(geometry.n_views):
             tables.append(view_table(active, geometry, view, faint, truncation.sigmas))
             render(tables[-1], images[view])
-        ctx.state = (arrays, active, unit, geometry, tables)
+        ctx.state = (_array(quaternions), _array(raw), active, unit, geometry, tables)
         return torch.from_numpy(images)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
-        arrays, active, unit, geometry, tables = ctx.state
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        quaternions, raw, active, unit, geometry, tables = ctx.state
         into = Gradients.zeros(len(active.densities))
         centres = np.empty((len(active.densities), 2), np.float32)
         images = gradient.contiguous().numpy()
         for view, table in enumerate(tables):
             view_backward(active, geometry, view, table, images[view], into, centres)
-        return (*(torch.from_numpy(a) for a in into.to_raw(arrays[2], arrays[3], unit)), None, None, None)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None)
 
 
 class _Voxelize(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
         unit: float, grid: Grid, truncation: Truncation,
     ) -> Tensor:  # fmt: skip
-        arrays = [t.detach().contiguous().numpy() for t in (means, log_scales, quaternions, raw)]
-        layout = grid_layout(Active.of(*arrays, unit), grid, truncation.faint * unit, truncation.sigmas)
-        ctx.state = (arrays, layout, unit)
+        active = Active.of(*(_array(t) for t in (means, log_scales, quaternions, raw)), unit=unit)
+        layout = grid_layout(active, grid, truncation.faint * unit, truncation.sigmas)
+        ctx.state = (_array(quaternions), _array(raw), layout, unit)
         return torch.from_numpy(np.ascontiguousarray(layout.fill()))
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
-        arrays, layout, unit = ctx.state
-        into = Gradients.zeros(len(arrays[3]))
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        quaternions, raw, layout, unit = ctx.state
+        into = Gradients.zeros(len(raw))
         layout.backward(gradient.contiguous().numpy(), into.means, into.log_scales, into.rotations, into.densities)
-        return (*(torch.from_numpy(a) for a in into.to_raw(arrays[2], arrays[3], unit)), None, None, None)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None)
+
+
+def _array(tensor: Tensor) -> F32:
+    return tensor.detach().contiguous().numpy()
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:

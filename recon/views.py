@@ -78,10 +78,7 @@ def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int) -> NDArr
     half_turn = np.sort(np.mod(theta[views], np.pi))
     gaps = np.diff(half_turn, append=half_turn[0] + np.pi)
     step = float(np.median(gaps[gaps > 1e-9]))
-    # Counted from the first view; where a wedge is missing, from its far side: a sector may cross 180 degrees.
-    widest = int(gaps.argmax())
-    begin = theta[views[0]] if gaps[widest] < 2 * step else half_turn[(widest + 1) % half_turn.size]
-    place = np.mod(theta[views] - begin + 0.05 * step, np.pi)
+    place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, np.pi)  # counted from the first view
     order = np.argsort(place, kind="stable")
     starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
     distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # of views at one place the earliest

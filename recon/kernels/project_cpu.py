@@ -174,7 +174,7 @@ def footprints_backward(
     d_densities: F32,
     d_centres: F32,
 ) -> None:
-    """Add to the gradients on means, log scales, rotations and densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
+    """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
     c, s, per = _f(cos), _f(sin), _f(per_mm)
     for i in prange(densities.shape[0]):
         if table[i, _HU] < 0:

@@ -88,18 +88,32 @@ def test_a_sector_of_a_whole_sample(span: float, photons: float, within: float) 
         assert abs(estimate.value - axis) < within
 
 
-@pytest.mark.parametrize("name", ["half turn", "full turn", "golden"])
+@pytest.mark.parametrize("name", ["half turn", "full turn"])
 def test_a_sample_that_reaches_out_of_the_field(name: str) -> None:
     """The scan breaks the double wedge then; what the edges do to low frequencies must not carry the axis along."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        views = ellipses(rng, angle_sets()[name], 56.4, reach=90)
-        assert abs(axis_from_sinogram(views, angle_sets()[name]).value - 56.4) < 0.5
+        views = ellipses(rng, angle_sets()[name], 56.4, reach=74)
+        assert abs(axis_from_sinogram(views, angle_sets()[name]).value - 56.4) < 0.2
 
 
-def test_a_sector_of_a_truncated_sample_is_not_believed(rng: np.random.Generator) -> None:
+def test_what_is_wrong_is_not_believed() -> None:
+    """Few views of a sample larger than the field: some estimates are off by more than a pixel, none of these is sure."""
+    angles = np.arange(20) * np.pi / 20
+    errors = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        estimate = axis_from_sinogram(ellipses(rng, angles, 56.4, reach=74), angles)
+        errors.append(abs(estimate.value - 56.4))
+        assert errors[-1] < 1 or not estimate.confident
+    assert max(errors) > 1
+
+
+@pytest.mark.parametrize("axis", [60.0, 63.5])
+def test_a_sector_of_a_truncated_sample_is_not_believed(rng: np.random.Generator, axis: float) -> None:
     angles = np.deg2rad(np.linspace(30, 150, 60))
-    assert not axis_from_sinogram(ellipses(rng, angles, 60.0, reach=85), angles).confident
+    for reach in (75, 85):
+        assert not axis_from_sinogram(ellipses(rng, angles, axis, reach=reach), angles).confident
 
 
 @pytest.mark.parametrize("photons", [1e9, 1000, 200])

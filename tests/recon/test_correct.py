@@ -86,7 +86,9 @@ def test_the_unit_of_the_counts_does_not_matter(seed: int, scale: float) -> None
     rng = np.random.default_rng(seed)
     counts, references = beer_lambert(sphere(), rng, noise=0.01)
     counts[2, 5, 7] *= 4
+    references.dark[:] = 100
     references.dark[3, 3] += 9_000
+    references.dark[2, 9] += 15  # not hot: a thousandth of the beam
     scaled = References(
         (references.dark * scale).astype(np.float32),
         tuple((p, (flat * scale).astype(np.float32)) for p, flat in references.flats),
@@ -128,12 +130,14 @@ def test_blind_and_hot_pixels_are_filled_from_their_neighbours(rng: np.random.Ge
     flat[5, 5] = references.dark[5, 5]  # blind
     flat[7:9, 20:23] = 0  # a blind patch
     references.dark[0, 0] = np.nan
-    references.dark[3, 30] += 5_000  # hot
+    references.dark[3, 30] += 5_000  # hot, and so less is left for the beam
+    references.dark[10, 8] += 5_000  # hot, though it answers the beam like the others
+    flat[10, 8] += 5_000
     flat[9, 12] *= 0.5  # answers unlike its neighbours
     counts[:, 5, 5] = counts[:, 7:9, 20:23] = counts[:, 3, 30] = 0
     masked = dead_pixels(references)
     expected = np.zeros_like(masked)
-    expected[5, 5] = expected[7:9, 20:23] = expected[0, 0] = expected[3, 30] = expected[9, 12] = True
+    expected[5, 5] = expected[7:9, 20:23] = expected[0, 0] = expected[3, 30] = expected[10, 8] = expected[9, 12] = True
     np.testing.assert_array_equal(masked, expected)
     result = correct(counts, positions(counts), references, CorrectionSettings(air="none"))
     np.testing.assert_array_equal(result.masked, expected)
@@ -168,10 +172,11 @@ def test_air_takes_out_the_beam(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(one_side.air, beam, rtol=0.008)
 
 
-def test_a_sample_that_fills_the_view_has_no_air(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("density", [0.025, 0.004])
+def test_a_sample_that_fills_the_view_has_no_air(rng: np.random.Generator, density: float) -> None:
     c = np.arange(100) - 50.0
-    truth = np.broadcast_to(0.025 * 2 * np.sqrt(62.0**2 - c**2), (20, 8, 100))
-    counts, references = beer_lambert(truth, rng, noise=0.01)
+    truth = np.broadcast_to(density * 2 * np.sqrt(62.0**2 - c**2), (20, 8, 100))
+    counts, references = beer_lambert(truth, rng, noise=0.002)
     result = correct(counts, positions(counts), references)
     assert result.air_columns == (0, 0)
     np.testing.assert_array_equal(result.air, 1)
