@@ -16,6 +16,7 @@ from beamline.recon_report import METHOD_NAMES, Context, Made, compose, history_
 from beamline.report import write_report
 from beamline.storage.recon_file import ReconRecord, Value, refuse_existing, write_reconstruction
 from drivers.clock import Clock
+from recon.align import AxisEstimate
 from recon.fbp import fbp
 from recon.volume import Volume
 
@@ -102,7 +103,7 @@ def parameters_of(made: Made, prepared: Prepared, context: Context) -> dict[str,
     return {
         "method": made.method,
         "axis_col": prepared.axis_col,
-        "axis_source": _axis_source(prepared),
+        **_axis_parameters(prepared.axis),
         "views": selection.views,
         "view_frames": prepared.projections.view_ids,
         "view_angles_deg": np.degrees(geometry.angles),
@@ -136,7 +137,26 @@ def _flat(prefix: str, values: Mapping[str, Any]) -> dict[str, Value]:
     return out
 
 
-def _axis_source(prepared: Prepared) -> str:
-    if prepared.axis is None:
-        return "given"
-    return f"{prepared.axis.method}, {'a clear optimum' if prepared.axis.confident else 'not a clear optimum'}"
+def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
+    if axis is None:
+        return {"axis_source": "given, or stated in the file"}
+    return {
+        "axis_source": axis.method,
+        "axis_confident": axis.confident,
+        "axis_binned": axis.value,
+        "axis_candidates": axis.candidates,
+        "axis_curve": axis.curve,
+    }
+
+
+def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
+    """How the axis was found, from the parameters of a reconstruction; None where it was given."""
+    if "axis_curve" not in parameters:
+        return None
+    return AxisEstimate(
+        value=float(str(parameters["axis_binned"])),
+        candidates=np.asarray(parameters["axis_candidates"]),
+        curve=np.asarray(parameters["axis_curve"]),
+        confident=bool(parameters["axis_confident"]),
+        method=str(parameters["axis_source"]),
+    )

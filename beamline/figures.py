@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from recon.geometry import Geometry
@@ -155,6 +156,9 @@ def quality_against_time(
     positive = [line for line in left.get_lines() if np.all(np.asarray(line.get_ydata()) > 0)]
     if len(positive) == len(left.get_lines()):
         left.set_yscale("log")
+        left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        left.yaxis.set_major_formatter(ScalarFormatter())
+        left.yaxis.set_minor_formatter(NullFormatter())
     left.set(xlabel="time (s)", title="Misfit")
     left.legend(fontsize=8)
     if psnr:

@@ -28,6 +28,7 @@ from beamline.storage.source import NotReadyError, ScanSource
 from beamline.storage.validate import reconstruction_blockers
 from drivers.clock import Clock
 from drivers.frame import FrameKind
+from recon.align import AxisEstimate
 from recon.fit import Progress
 from recon.stream import StreamingFit
 
@@ -80,10 +81,11 @@ def follow(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm | Non
     with _open(options, sink, clock, rhythm) as source:
         growing = _Growing(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
-        made = growing.finish(options.seconds or DEFAULT_SECONDS)
+        made = growing.finish(options.seconds or DEFAULT_SECONDS, rhythm.snapshot)
         facts = facts_of(source)
         # All flats are there now; the geometry stays the one that the volume has grown in.
         prepared = prepare(source, replace(options.selection, axis_col=growing.axis_col), warn)
+        prepared = replace(prepared, axis=growing.axis)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = Context(facts, options.selection, options.command, options.seed, warn.said, started)
     metrics = deliver(made, prepared, truth, options.target, context, sink, clock)
@@ -137,6 +139,7 @@ class _Growing:
         given = options.selection.axis_col
         self.source, self.axis_col = source, source.axis_col if given is None else given
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
+        self.axis: AxisEstimate | None = None  # how the axis was found; None where it was given or stated
         self._corrector: Corrector | None = None
         self._fit: StreamingFit | None = None
         self._frames = 0
@@ -199,7 +202,7 @@ class _Growing:
             return  # the views do not cover enough angles yet
         moved = self.axis_col is None or abs(found - self.axis_col) > _AXIS_MOVES
         if moved and (estimate.confident or last_chance):
-            self.axis_col, self._fit, self._taken = found, None, 0
+            self.axis_col, self.axis, self._fit, self._taken = found, estimate, None, 0
 
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)
@@ -245,8 +248,8 @@ class _Growing:
         data = {"path": self.snapshot_path, "n_views": self._fit.n_views, "seconds": seconds}
         self._sink(Event("snapshot", self._clock.now(), data))
 
-    def finish(self, seconds: float) -> Made:
-        """The last round over all views, and the volume."""
+    def finish(self, seconds: float, snapshot_every: float) -> Made:
+        """The last round over all views in `seconds`, with a snapshot now and then, and the volume."""
         refuse(self.source, reconstruction_blockers(self.source))
         assert self._fit is not None  # two views are there, and the axis was settled with them
         self._sink(
@@ -257,8 +260,14 @@ class _Growing:
             )
         )
 
+        last = self._clock.now()
+
         def listen(progress: Progress) -> bool:
+            nonlocal last
             self._say(progress)
+            if self._clock.now() - last >= snapshot_every:
+                self.write_snapshot()
+                last = self._clock.now()
             return False
 
         try:

@@ -13,7 +13,7 @@ from beamline.errors import ConfigError, DataError
 from beamline.reading import read_binned, read_references
 from beamline.storage.finding import Finding
 from beamline.storage.scan_source import ScanSource
-from beamline.storage.validate import beam_present, quantity_said, reconstruction_blockers, references_present
+from beamline.storage.validate import beam_present, quantity_said, references_present, source_findings
 from drivers.frame import FrameKind
 from recon.align import AxisEstimate, find_axis
 from recon.correct import CorrectionSettings, Projections, References, correct
@@ -141,7 +141,11 @@ def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
-    refuse(source, reconstruction_blockers(source))
+    findings = source_findings(source)
+    refuse(source, findings)
+    for finding in findings:
+        if finding.severity == "warning":
+            warn(finding.message)
     scan_frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     chosen = choose_views(source, scan_frames, selection)
     corrector = Corrector(source, selection, warn)
@@ -175,20 +179,17 @@ def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
 
 
 def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raises DataError for the first of the findings, with what to do about it."""
+    """Raises DataError for the first error among the findings, with what to do about it."""
     for finding in findings:
+        if finding.severity != "error":
+            continue
         option = _OPTIONS.get(finding.rule, "")
         raise DataError(f"{source.path} cannot be reconstructed. {finding.message} {option}".rstrip())
 
 
 def correction_blockers(source: ScanSource) -> list[Finding]:
     """Why the frames of a scan that is still growing cannot be corrected."""
-    return [
-        finding
-        for rule in (quantity_said, references_present, beam_present)
-        for finding in rule(source)
-        if finding.severity == "error"
-    ]
+    return [finding for rule in (quantity_said, references_present, beam_present) for finding in rule(source)]
 
 
 def choose_views(source: ScanSource, frames: NDArray[np.int64], selection: Selection) -> NDArray[np.int64]:

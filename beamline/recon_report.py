@@ -20,6 +20,7 @@ from recon.fbp import Filter
 from recon.fit import Progress
 from recon.volume import Volume
 
+_HISTORY = ("step", "steps", "seconds", "loss", "residual", "n_gaussians", "n_views")
 METHOD_NAMES = {"fbp": "FBP", "r2": "R²-Gaussian"}
 
 
@@ -31,7 +32,8 @@ class ScanFacts:
         path, name: of the file.
         sample: its name, where the file tells.
         table: facts for people, by name.
-        frames: frames there are of those planned, e.g. "110/110".
+        frames: frames there are of those triggered, e.g. "110/110".
+        remarks: what the file says went wrong while it was taken.
     """
 
     path: Path
@@ -39,6 +41,7 @@ class ScanFacts:
     sample: str
     table: Mapping[str, str]
     frames: str
+    remarks: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,7 @@ def facts_of(source: ScanSource) -> ScanFacts:
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
     pitch, energy = source.pixel_size_mm, source.energy_kev
-    planned = attributes.pop("frames_planned", None)
+    missing, flagged = (int(attributes.get(name, 0)) for name in ("missing_triggers", "flagged_frames"))
     table = {
         "file": source.path.name,
         "format": source.format,
@@ -96,7 +99,8 @@ def facts_of(source: ScanSource) -> ScanFacts:
     }
     table |= {str(k): str(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n = int(source.image_key.size)
-    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{planned if planned else n}")
+    remarks = [f"The monitor flagged {flagged} frames while they were taken."] if flagged else []
+    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks)
 
 
 def compose(
@@ -134,7 +138,7 @@ def compose(
         settings=settings,
         metrics={METHOD_NAMES[method]: values for method, values in metrics.items()},
         frames=context.facts.frames,
-        flags=[*context.scan_flags, *context.warnings],
+        flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=_pictures(made, prepared, truth, volumes),
         command=context.command,
         footnotes=footnotes,
@@ -186,5 +190,15 @@ def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]
     """The history of a fit as equally long arrays, by name; empty where there is none."""
     if not history:
         return {}
-    names = ("step", "seconds", "loss", "residual", "n_gaussians", "n_views")
-    return {name: np.array([getattr(p, name) for p in history], dtype=np.float64) for name in names}
+    return {name: np.array([getattr(p, name) for p in history], dtype=np.float64) for name in _HISTORY}
+
+
+def history_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
+    """The history of a fit from `history_arrays`."""
+    if not arrays:
+        return ()
+    columns = {name: arrays[name].tolist() for name in _HISTORY}
+    return tuple(
+        Progress(int(step), int(steps), seconds, loss, residual, int(n_gaussians), int(n_views))
+        for step, steps, seconds, loss, residual, n_gaussians, n_views in zip(*columns.values(), strict=True)
+    )

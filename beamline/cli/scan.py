@@ -40,13 +40,13 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     Exit code: 0 done, 2 configuration or a violated limit, 3 device, 4 stopped, 5 frames missing or disk, 130
     interrupted before anything was acquired, or aborted.
     """
-    with _told_as_json(as_json) as json_sinks:
+    with told_as_json(as_json) as json_sinks:
         config = load(file, overrides)
         if dry:
             _dry_run(config, json_sinks)
             return
         stop = StopRequest()
-        with _signals(stop), Terminal(sys.stderr) as terminal:
+        with stop_signals(stop), Terminal(sys.stderr) as terminal:
             result = run_scan(config, output, [terminal, *json_sinks], stop, live=_live(config, no_live))
     if not as_json:
         click.echo(_results(result))
@@ -73,7 +73,7 @@ def _live(config: Config, no_live: bool) -> LiveCommand | None:
 
 
 @contextmanager
-def _told_as_json(wanted: bool) -> Iterator[list[Sink]]:
+def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
     """The sinks for stdout. With JSON its last line is `done` or `failed`, also where the run never began."""
     if not wanted:
         yield []
@@ -95,7 +95,7 @@ def _told_as_json(wanted: bool) -> Iterator[list[Sink]]:
 
 
 @contextmanager
-def _signals(stop: StopRequest) -> Iterator[None]:
+def stop_signals(stop: StopRequest) -> Iterator[None]:
     """Ctrl-C: first stop, then abort. SIGTERM: stop."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
