@@ -24,6 +24,7 @@ SLICE = 0.5  # s: the longest wait for a frame before the stop request is looked
 POLL = 0.02  # s between looks at a moving stage
 PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera is silent; at least
 PATIENCE_PERIODS = 10  # so many trigger periods
+RAMP_TOLERANCE = 0.1  # of what the acceleration adds to the time of the first pulse
 SILENT_EXPOSURES = 3  # software triggers in a row without a frame
 
 Emit = Callable[[str, Mapping[str, Any]], None]
@@ -167,11 +168,11 @@ class Exposures:
     def _expected(self, block: Block, angles: NDArray[np.float64], before: float, after: float) -> Train:
         """When the pulses should come: taxi at constant acceleration, then constant speed.
 
-        A stage's true acceleration is a step of its own table; half of what it contributes is allowed for.
+        The stage may have begun at any time between `before` and `after`, and its acceleration is only nearly constant.
         """
         ramp = block.speed / (2 * self._stage.limits.acceleration)
         first = (before + after) / 2 + block.taxi / block.speed + ramp
-        return Train(angles, block.period, first, tolerance=(after - before) / 2 + ramp / 2)
+        return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
         """Frames while the stage turns; after a stop, those that are on their way.

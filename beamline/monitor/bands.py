@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
-from beamline.monitor.preview import light
+from beamline.monitor.preview import light, thinned
 from drivers.frame import Frame, FrameKind
 
 NAME = "bands"
@@ -57,7 +57,8 @@ def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> 
 def _look(
     profile: Profile | None, limits: Limits, view: int, digest: FrameDigest, context: Context
 ) -> tuple[Profile, Flag | None]:
-    rows = np.log(np.maximum(np.median(light(digest.preview, context), axis=1), 0.5).astype(np.float64))
+    blocks = light(digest.preview, context, thinned(digest.preview, rows=False))
+    rows = np.log(np.maximum(np.median(blocks, axis=1), 0.5).astype(np.float64))
     if profile is None or profile.usual.shape != rows.shape:
         return Profile(rows, np.zeros_like(rows)), None
     deviation = rows - profile.usual

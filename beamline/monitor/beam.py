@@ -8,7 +8,7 @@ import numpy as np
 
 from beamline.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
-from beamline.monitor.preview import edges, light
+from beamline.monitor.preview import edge_light, light
 from drivers.frame import Frame, FrameKind
 
 NAME = "beam"
@@ -48,9 +48,9 @@ def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> 
         return state, _judge(state.limits, frame.index, score, state.limits.warn, "than in the flats before")
     if frame.kind is not FrameKind.PROJECTION:
         return state, None
-    left, right = edges(light(digest.preview, context))
+    left, right = edge_light(digest.preview, context)
     if state.reference is None:
-        state = replace(state, reference=(left, right) if context.flat is None else edges(light(context.flat, context)))
+        state = replace(state, reference=(left, right) if context.flat is None else edge_light(context.flat, context))
     full_left, full_right = state.reference or (left, right)
     # The sample may cover one edge; the brighter one is the better witness of the beam.
     level = max(left / full_left if full_left > 0 else 0.0, right / full_right if full_right > 0 else 0.0)

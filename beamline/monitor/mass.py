@@ -11,7 +11,7 @@ import numpy as np
 
 from beamline.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
-from beamline.monitor.preview import edges, transmission
+from beamline.monitor.preview import edges, thinned, transmission
 from drivers.frame import Frame, FrameKind
 
 NAME = "mass"
@@ -45,7 +45,7 @@ def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> 
     """Score: relative change of the mean line integral. Silent where the sample is cut off by the detector's edge."""
     if frame.kind is not FrameKind.PROJECTION:
         return state, None
-    through = transmission(digest.preview, context)
+    through = transmission(digest.preview, context, thinned(digest.preview))
     if through is None:
         return state, None
     integrals = -np.log(np.clip(np.nan_to_num(through, nan=1.0), DARKEST, None))

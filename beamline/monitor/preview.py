@@ -8,22 +8,44 @@ from numpy.typing import NDArray
 from beamline.monitor.flag import Context
 
 EDGE_FRACTION = 16  # an edge strip is a sixteenth of the columns
+ENOUGH = 128  # blocks per side that tell a check what it needs; a large preview is thinned to about so many
+
+Region = tuple[slice, slice]
+WHOLE: Region = (slice(None), slice(None))
 
 
-def light(preview: NDArray[np.float32], context: Context) -> NDArray[np.float32]:
-    """Counts above the dark [preview row, preview col]; the raw counts where no dark was seen."""
-    return preview if context.dark is None else preview - context.dark
+def thinned(preview: NDArray[np.float32], rows: bool = True) -> Region:
+    """A region that takes every k-th block of columns (and of rows), so that a large frame costs no more than a small
+    one."""
+    step_rows, step_cols = (max(1, n // ENOUGH) for n in preview.shape)
+    return slice(None, None, step_rows if rows else 1), slice(None, None, step_cols)
 
 
-def transmission(preview: NDArray[np.float32], context: Context) -> NDArray[np.float32] | None:
+def light(preview: NDArray[np.float32], context: Context, region: Region = WHOLE) -> NDArray[np.float32]:
+    """Counts above the dark [preview row, preview col] in a region; the raw counts where no dark was seen."""
+    return preview[region] if context.dark is None else preview[region] - context.dark[region]
+
+
+def transmission(preview: NDArray[np.float32], context: Context, region: Region = WHOLE) -> NDArray[np.float32] | None:
     """Light over the flats' light, or None before any flat. Blocks where the flat has no light are NaN."""
     if context.flat is None:
         return None
-    full = light(context.flat, context)
-    return np.divide(light(preview, context), full, out=np.full_like(full, np.nan), where=full > 0)
+    full = light(context.flat, context, region)
+    return np.divide(light(preview, context, region), full, out=np.full_like(full, np.nan), where=full > 0)
 
 
 def edges(image: NDArray[np.float32]) -> tuple[float, float]:
     """Means of the strips at the left and right edge."""
-    width = max(1, image.shape[1] // EDGE_FRACTION)
-    return float(image[:, :width].mean()), float(image[:, -width:].mean())
+    left, right = _strips(image.shape[1])
+    return float(image[:, left].mean()), float(image[:, right].mean())
+
+
+def edge_light(preview: NDArray[np.float32], context: Context) -> tuple[float, float]:
+    """Mean light of the strips at the left and right edge."""
+    left, right = (float(light(preview, context, (slice(None), strip)).mean()) for strip in _strips(preview.shape[1]))
+    return left, right
+
+
+def _strips(cols: int) -> tuple[slice, slice]:
+    width = max(1, cols // EDGE_FRACTION)
+    return slice(None, width), slice(cols - width, None)
