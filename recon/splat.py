@@ -106,7 +106,7 @@ class _Project(torch.autograd.Function):
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
         unit: float, geometry: Geometry, truncation: Truncation,
     ) -> Tensor:  # fmt: skip
-        active = Active.of(*(_array(t) for t in (means, log_scales, quaternions, raw)), unit=unit)
+        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
         faint = truncation.faint * unit * geometry.pixel_pitch * geometry.detector_shape[1]
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         tables = []
@@ -133,7 +133,7 @@ class _Voxelize(torch.autograd.Function):
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
         unit: float, grid: Grid, truncation: Truncation,
     ) -> Tensor:  # fmt: skip
-        active = Active.of(*(_array(t) for t in (means, log_scales, quaternions, raw)), unit=unit)
+        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
         layout = grid_layout(active, grid, truncation.faint * unit, truncation.sigmas)
         ctx.state = (_array(quaternions), _array(raw), layout, unit)
         return torch.from_numpy(np.ascontiguousarray(layout.fill()))

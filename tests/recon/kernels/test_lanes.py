@@ -41,8 +41,8 @@ def test_exp_is_as_good_as_the_rounding_of_its_argument() -> None:
     out = np.empty_like(x)
     _exp(x, out)
     relative = out / np.exp(x.astype(np.float64)) - 1
-    # Rounding x log2(e) shifts the result by up to 1.2e-7 |x|; the polynomial adds 2.4e-6.
-    assert (np.abs(relative) < 3e-6 + 1.2e-7 * np.abs(x)).all()
+    # Rounding x log2(e) shifts the result by up to 1.2e-7 |x|; the polynomial and its rounding add 4e-6.
+    assert (np.abs(relative) < 4e-6 + 1.2e-7 * np.abs(x)).all()
 
 
 def test_exp_never_overflows_and_vanishes_far_down() -> None:
