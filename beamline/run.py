@@ -26,6 +26,7 @@ from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError
+from drivers.manual import Ask
 
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
@@ -82,6 +83,7 @@ def run_scan(
     *,
     live: LiveCommand | None = None,
     bench: Bench | None = None,
+    ask: Ask | None = None,
 ) -> RunResult:
     """Run the scan that `config` describes.
 
@@ -91,6 +93,8 @@ def run_scan(
         stop: to end it from another thread or a signal handler.
         live: makes the command line of a live reconstruction; None: none.
         bench: connected devices, left open at the end; None: those that `config` names, opened and closed here.
+
+        ask: puts a request to the operator, where the shutter or the sample is moved by hand.
 
     Raises:
         ConfigError: the plan breaks a limit; nothing has moved and no folder was made.
@@ -102,7 +106,7 @@ def run_scan(
     stop = stop or StopRequest()
     runs = runs or Path(config.storage.folder)
     with ExitStack() as connected:
-        bench = bench or connected.enter_context(connect(config))
+        bench = bench or connected.enter_context(connect(config, ask=ask))
         prepared = prepare(config, bench, runs)
         if stop.stopping:
             raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Mapping
 from types import TracebackType
@@ -12,6 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from beamline.events import Event
 from beamline.narration import sentence
+from drivers.manual import Ask
 
 PLAIN_EVERY = 5.0
 """Real s between progress lines where there is no terminal."""
@@ -36,9 +38,10 @@ class Terminal:
         )
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, float] = {}
+        self._lock = threading.Lock()  # events come from one thread, questions from another
+        self._asking = False
 
     def __enter__(self) -> Self:
-        self._bar.start()
         return self
 
     def __exit__(
@@ -46,7 +49,21 @@ class Terminal:
     ) -> None:
         self._bar.stop()
 
+    def ask(self, request: str, put: Ask) -> None:
+        """Put a request to the operator, with the bar out of the way."""
+        with self._lock:
+            self._bar.stop()
+            self._asking = True
+        try:
+            put(request)
+        finally:
+            self._asking = False
+
     def __call__(self, event: Event) -> None:
+        with self._lock:
+            self._take(event)
+
+    def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress":
@@ -57,7 +74,10 @@ class Terminal:
                 self._console.print(text)
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
+        if self._asking:
+            return
         if not self._bar.disable:
+            self._bar.start()
             if what not in self._tasks:
                 self._tasks[what] = self._bar.add_task(what, note=note)
             self._bar.update(self._tasks[what], completed=done, total=total or None, note=note)

@@ -13,6 +13,7 @@ import click
 
 from beamline.cli.config import OVERRIDE_HELP
 from beamline.config import Config, load
+from beamline.devices import ask_operator
 from beamline.dry_run import dry_run, refuse_violations
 from beamline.errors import BeamlineError
 from beamline.events import Event, JsonLines, Sink
@@ -47,7 +48,11 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
             return
         stop = StopRequest()
         with stop_signals(stop), Terminal(sys.stderr) as terminal:
-            result = run_scan(config, output, [terminal, *json_sinks], stop, live=_live(config, no_live))
+            live = _live(config, no_live)
+            sinks: list[Sink] = [terminal, *json_sinks]
+            result = run_scan(
+                config, output, sinks, stop, live=live, ask=lambda request: terminal.ask(request, ask_operator)
+            )
     if not as_json:
         click.echo(_results(result))
 

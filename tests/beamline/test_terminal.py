@@ -66,6 +66,23 @@ def test_a_terminal_gets_a_bar_that_is_gone_at_the_end() -> None:
     assert "\x1b[2K" in text[text.rindex("frames/s") :]  # the line is erased
 
 
+def test_a_question_is_asked_with_the_bar_out_of_the_way() -> None:
+    stream = Tty()
+    with Terminal(stream) as terminal:
+        terminal(Event("frame", 0.0, FRAME))
+
+        def put(request: str) -> None:
+            assert "\x1b[2K" in stream.getvalue()[stream.getvalue().rindex("frames/s") :]  # the bar's line is erased
+            before = stream.getvalue()
+            terminal(Event("progress", 0.0, {"step": 5, "steps": 0, "n_views": 4, "n_gaussians": 2, "residual": 0.1}))
+            assert stream.getvalue() == before  # and nothing overwrites the question
+            stream.write(f"{request}\n")
+
+        terminal.ask("Open the beam shutter.", put)
+        terminal(Event("frame", 0.0, {**FRAME, "n": 91}))
+    assert "91/360" in stream.getvalue().split("Open the beam shutter.")[1]
+
+
 def test_the_fit_has_a_bar_of_its_own() -> None:
     progress = {"step": 5, "steps": 0, "n_views": 40, "n_gaussians": 2000, "residual": None}
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown(Tty(), ("frame", FRAME), ("progress", progress)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline import run as run_module
+from beamline.cli import scan as scan_module
 from beamline.cli.main import main
 from beamline.config import config_folder
 from beamline.storage.source import open_scan
 from drivers.errors import DeviceError
+from drivers.manual import Ask, ManualShutter
 from tests.beamline.fakes import Faults, Instrument
 
 SIMULATED = str(config_folder() / "simulated.yaml")
@@ -36,7 +39,7 @@ def scan(*arguments: str, **overrides: Any) -> Result:
 
 def on(monkeypatch: pytest.MonkeyPatch, instrument: Instrument) -> None:
     """Let the command find `instrument` where the configured devices would be."""
-    monkeypatch.setattr(run_module, "connect", lambda config: instrument.bench())
+    monkeypatch.setattr(run_module, "connect", lambda config, ask: instrument.bench())
 
 
 def press(number: int, *at: int) -> Any:
@@ -78,7 +81,7 @@ def test_0_with_json_stdout_is_the_events(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_0_a_dry_run_prints_the_plan_and_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_module, "connect", lambda config: pytest.fail("a device was touched"))
+    monkeypatch.setattr(run_module, "connect", lambda config, ask: pytest.fail("a device was touched"))
     result = scan("--dry-run", "-o", str(tmp_path / "runs"), **{"devices.stage.low_deg": -30})
     assert result.exit_code == 0, result.output
     for word in ("projection", "taxi", "counts", "blur", "skew", "duration", "free"):
@@ -130,7 +133,7 @@ def test_3_a_device_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_3_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def silent(config: object) -> None:
+    def silent(config: object, ask: object) -> None:
         raise DeviceError("stage", "does not answer")
 
     monkeypatch.setattr(run_module, "connect", silent)
@@ -194,7 +197,7 @@ def test_130_an_abort(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     instrument = Instrument()
 
-    def connect(config: object) -> Any:
+    def connect(config: object, ask: object) -> Any:
         signal.raise_signal(signal.SIGINT)
         return instrument.bench()
 
@@ -206,10 +209,34 @@ def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypat
     assert instrument.log == ["close"]
 
 
+def test_a_shutter_moved_by_hand_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    instrument, asked = Instrument(), []
+    monkeypatch.setattr(scan_module, "ask_operator", asked.append)
+
+    def connect(config: object, ask: Any) -> Any:
+        bench = instrument.bench()
+        return replace(bench, devices=replace(bench.devices, shutter=ByHand(instrument, ask)))
+
+    monkeypatch.setattr(run_module, "connect", connect)
+    assert scan("-o", str(tmp_path)).exit_code == 0
+    assert asked == ["Close the beam shutter.", "Open the beam shutter.", "Close the beam shutter."]
+
+
+class ByHand(ManualShutter):
+    """A shutter that the operator moves when asked, and the fake instrument with it."""
+
+    def __init__(self, instrument: Instrument, ask: Ask) -> None:
+        def put(request: str) -> None:
+            ask(request)
+            instrument.is_open = request.startswith("Open")
+
+        super().__init__(put)
+
+
 def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def run_scan(config: object, runs: object, sinks: object, stop: object, *, live: Any) -> Any:
+    def run_scan(config: object, runs: object, sinks: object, stop: object, *, live: Any, ask: Any) -> Any:
         asked.append(live and list(live(Path("scan.h5"), Path("recon.h5"))))
         raise KeyboardInterrupt
 
