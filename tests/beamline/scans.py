@@ -79,8 +79,9 @@ def write_exchange(path: Path, scan: TwoCylinders, changes: Mapping[str, Any] | 
 
 def frames_of(scan: TwoCylinders, *, time: float = 1.8e9, period: float = 0.1) -> list[Frame]:
     """Two darks, two flats, then the views, as a camera would give them."""
-    images = [np.full(scan.shape, DARK), np.full(scan.shape, DARK)]
-    images += [np.full(scan.shape, DARK + BEAM)] * 2
+    last = np.zeros(scan.shape)
+    last[-1, -1] = 1.0  # no camera takes the same image twice
+    images = [np.full(scan.shape, level) + bump for level in (DARK, DARK + BEAM) for bump in (0.0, last)]
     images += list(scan.counts())
     kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * scan.angles.size
     angles = [np.nan] * 4 + scan.angles.tolist()

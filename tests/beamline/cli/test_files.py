@@ -1,0 +1,152 @@
+"""`beamline info`, `validate` and `ingest`: what they print, their codes, and what they leave."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.digest import digest
+from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.source import open_scan
+from drivers.clock import SystemClock
+from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with a good scan in it, as NXtomo and as Data Exchange."""
+    monkeypatch.chdir(tmp_path)
+    write_exchange(tmp_path / "exchange.h5", SCAN)
+    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, energy_kev=25.0)
+    with NXtomoWriter(tmp_path / "scan.h5", info, SCAN.shape, clock=SystemClock()) as writer:
+        for frame in frames_of(SCAN):
+            writer.append(frame, digest(frame.counts))
+    return tmp_path
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def test_info_for_people(folder: Path) -> None:
+    result = _beamline("info", "scan.h5")
+    assert result.exit_code == 0, result.output
+    said = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    assert said["format"] == "nxtomo"
+    assert said["kinds"] == "18 projection, 2 flat, 2 dark"
+    assert said["shape"] == "4 x 40"
+    assert said["last_angle_deg"] == "170"
+    assert said["axis_col"] == "not known"
+    assert said["reconstructable"] == "yes"
+    assert said["sample"] == "two cylinders"
+
+
+def test_info_for_machines(folder: Path) -> None:
+    result = _beamline("info", "exchange.h5", "--json")
+    (line,) = result.stdout.splitlines()
+    said = json.loads(line)
+    assert (said["event"], said["quantity"], said["pixel_size_mm"]) == ("done", "counts", 0.5)
+    assert said["kinds"] == {"projection": 18, "flat": 2, "dark": 2}
+
+
+def test_info_takes_what_the_caller_says(folder: Path) -> None:
+    with h5py.File("exchange.h5", "r+") as file:
+        del file["exchange/data_white"], file["exchange/data_dark"]
+    assert "quantity" in _beamline("info", "exchange.h5").stdout
+    result = _beamline("info", "exchange.h5", "--quantity", "line-integrals")
+    assert "line_integrals" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["info", "validate"])
+@pytest.mark.parametrize("name", ["missing.h5", "text.h5"])
+def test_unreadable_files(folder: Path, command: str, name: str) -> None:
+    (folder / "text.h5").write_text("no scan")
+    result = _beamline(command, name)
+    assert result.exit_code == 5
+    assert name in result.output
+    assert "Traceback" not in result.output
+
+
+def test_validate_passes_what_we_write(folder: Path) -> None:
+    result = _beamline("validate", "scan.h5")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == ["scan.h5: 0 errors, 0 warnings"]
+
+
+def test_validate_names_each_fault(folder: Path) -> None:
+    with h5py.File("scan.h5", "r+") as file:
+        file["entry/sample/rotation_angle"][7] = np.nan
+    result = _beamline("validate", "scan.h5")
+    assert result.exit_code == 5
+    assert "error    angles" in result.stdout
+    assert "beamline: scan.h5 breaks 1" in result.stderr
+    events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--json").stdout.splitlines()]
+    assert [event["event"] for event in events][-1] == "done"
+    assert events[-1]["error"] == 1
+    assert events[0]["rule"] == "angles"
+
+
+def test_the_fixtures_are_described(folder: Path, shared_data: Path) -> None:
+    for name in ("diad_k11-18014.nxs", "esrf_bm05_nxtomo_20x16x16.nx"):
+        result = _beamline("info", str(shared_data / "fixtures" / name))
+        assert result.exit_code == 0, result.output
+        assert "reconstructable" in result.stdout
+    assert "There is no beam in it" in result.stdout
+
+
+def _stack(folder: Path) -> Path:
+    data = SCAN.line_integrals().astype(np.float32)
+    data[3, 0, :] = -1.0
+    tifffile.imwrite(folder / "in.tif", data, photometric="minisblack")
+    np.savetxt(folder / "angles.txt", np.degrees(SCAN.angles))
+    return folder / "in.tif"
+
+
+def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
+    _stack(folder)
+    options = ("--angles", "angles.txt", "--quantity", "line-integrals", "--pixel-size-um", "500", "--no-data", "-1")
+    result = _beamline("ingest", "in.tif", "out.h5", *options, "--sample", "cylinders", "--energy-kev", "25")
+    assert result.exit_code == 0, result.output
+    assert "out.h5" in result.stdout
+    assert "18, 0 without a valid pixel" in result.stdout
+    with open_scan("out.h5") as source:
+        assert source.quantity == "line_integrals"
+        assert (source.pixel_size_mm, source.energy_kev, source.attributes["sample"]) == (0.5, 25.0, "cylinders")
+        np.testing.assert_allclose(source.angles, SCAN.angles)
+        np.testing.assert_array_equal(source.read([0, 17]), SCAN.line_integrals().astype(np.float32)[[0, 17]])
+
+
+def test_ingest_for_machines(folder: Path) -> None:
+    _stack(folder)
+    result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
+    said = json.loads(result.stdout.splitlines()[-1])
+    assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("in.tif", "out.h5"), "angles"),
+        (("in.tif", "scan.h5", "--angles", "angles.txt"), "exists"),
+        (("missing.tif", "out.h5"), "missing.tif"),
+        (("in.tif", "out.h5", "--angles", "angles.txt", "--angle-rows", "0:99"), "0:99"),
+        (("angles.txt", "out.h5"), "angles.txt"),
+    ],
+)
+def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...], said: str) -> None:
+    _stack(folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    result = _beamline("ingest", *arguments)
+    assert result.exit_code == 5, result.output
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
