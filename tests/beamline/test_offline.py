@@ -92,7 +92,7 @@ def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
     said = {
         "method": "fbp",
         "axis_col": 20.7,
-        "axis_source": "given",
+        "axis_source": "given, or stated in the file",
         "views": "first:20",
         "n_views": 20,
         "n_projections": 45,
