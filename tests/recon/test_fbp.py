@@ -132,6 +132,15 @@ def test_any_grid_samples_the_same_volume() -> None:
     np.testing.assert_allclose(fbp(views, geometry, box), fbp(views, geometry)[np.ix_(*places)], atol=1e-5)
 
 
+def test_slabs_of_rows_make_one_volume(rng: np.random.Generator) -> None:
+    geometry = Geometry.parallel(half_turn(7), (70, 12))
+    views = rng.random((7, 70, 12), dtype=np.float32)
+    volume = fbp(views, geometry)
+    for row in (0, 40, 63, 64, 69):
+        alone = fbp(views[:, row : row + 1], geometry.rows(row, row + 1))
+        np.testing.assert_allclose(volume[row], alone[0], atol=1e-6)
+
+
 def test_rows_between_the_slices_are_interpolated_and_beyond_the_detector_zero() -> None:
     geometry = Geometry.parallel(half_turn(30), (2, 20))
     views = disc_views(geometry, 6, (0, 0))
