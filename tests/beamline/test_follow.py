@@ -60,7 +60,7 @@ class StandingClock:
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
 INTERLACED = replace(SCAN, angles=np.concatenate([SCAN.angles[i::3] for i in (0, 2, 1)]))
-RHYTHM = Rhythm(poll=0.1, slice=0.4, snapshot=1.0, patience=10.0)
+RHYTHM = Rhythm(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)
 
 
 def _schedule(
@@ -68,8 +68,8 @@ def _schedule(
     path: Path,
     frames: list[Frame],
     *,
-    begin: float = 1.0,
-    period: float = 0.2,
+    begin: float = 0.5,
+    period: float = 0.1,
     status: str | None = "complete",
     axis_col: float | None = None,
 ) -> None:
@@ -100,8 +100,8 @@ def _options(tmp_path: Path, **changes: object) -> ReconOptions:
         source=SourceOptions(tmp_path / "scan.h5"),
         target=Target(output, None),
         selection=Selection(axis_col=SCAN.axis_col),
-        seconds=3.0,
-        gaussians=300,
+        seconds=2.0,
+        gaussians=200,
         command="beamline recon scan.h5 --follow",
     )
     return replace(options, **changes)  # type: ignore[arg-type]
@@ -116,7 +116,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     target = Target(tmp_path / "recon.h5", tmp_path / "report.html")
-    metrics = follow(_options(tmp_path, target=target), events.append, clock, RHYTHM)
+    metrics = follow(_options(tmp_path, target=target, seconds=4.0), events.append, clock, RHYTHM)
 
     names = [event.event for event in events]
     assert names[0] == "state"
@@ -183,7 +183,7 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(module, "locate_axis", locate)
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    metrics = follow(_options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    metrics = follow(_options(tmp_path, selection=Selection(), seconds=4.0), events.append, clock, RHYTHM)
     assert [e.data["axis_col"] for e in events if e.event == "recon_started"] == [18.0, 20.7]
     assert events[-1].data["axis_col"] == 20.7
     assert read_reconstruction(tmp_path / "recon.h5").history["n_views"][-1] == 30
@@ -229,8 +229,8 @@ def _has_no_flats(clock: ScanClock, path: Path) -> None:
 @pytest.mark.parametrize(
     ("scan", "said", "left"),
     [
-        (_no_scan, "No scan began in .* within 10 s", set()),
-        (_dies, "has not grown for 10 s and is not finished.*12 views", {"scan.h5", "recon.snapshot.h5"}),
+        (_no_scan, "No scan began in .* within 3 s", set()),
+        (_dies, "has not grown for 3 s and is not finished.*12 views", {"scan.h5", "recon.snapshot.h5"}),
         (_ends_without_views, "0 projections", {"scan.h5"}),
         (_ends_with_one_view, "1 projections", {"scan.h5"}),
         (_has_no_flats, "without flats", {"scan.h5"}),
