@@ -58,6 +58,8 @@ class StandingClock:
         pytest.fail("nobody should wait for this clock")
 
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
 INTERLACED = replace(SCAN, angles=np.concatenate([SCAN.angles[i::3] for i in (0, 2, 1)]))
 RHYTHM = Rhythm(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)

@@ -23,6 +23,8 @@ from recon.metrics import psnr
 from recon.volume import Grid
 from tests.beamline.scans import TwoCylinders, write_exchange
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SCAN = TwoCylinders(shape=(2, 40), pixel_size_mm=0.5)
 
 

@@ -17,6 +17,8 @@ from beamline.events import Event
 from beamline.stop import StopRequest
 from beamline.storage.recon_file import read_reconstruction
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 ROOT = Path(__file__).parents[3]
 SCENE = (
     "{phantom: {kind: solids, solids: ["
@@ -46,6 +48,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current directory; the live reconstruction's process finds the packages of this checkout."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
     return tmp_path
 
 

@@ -18,6 +18,8 @@ from beamline.cli.recon import repeated, report_beside
 from beamline.storage.recon_file import read_reconstruction
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
 N = SCAN.angles.size
 
