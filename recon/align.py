@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from recon import threads  # noqa: F401 - settles the threads before torch starts them
+
+# isort: split
 import numpy as np
 import torch
 from numpy.typing import NDArray
