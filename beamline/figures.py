@@ -19,6 +19,7 @@ from recon.volume import Volume
 Window = tuple[float, float]
 _DPI = 110
 _WIDTH = 8.6  # inches; the report's column
+_THIN = 0.06  # an image lower than this share of its width is stretched to be seen at all
 
 
 def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> Window:
@@ -36,12 +37,14 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     pitch = geometry.pixel_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
     height = np.clip(0.82 * _WIDTH * rows / cols, 1.6, 6.0)
+    thin = rows < _THIN * cols
     figure, axes = _figure((_WIDTH, height + 0.8))
     image = axes.imshow(
         data[view],
         cmap="gray",
         extent=(left * pitch, right * pitch, -rows / 2 * pitch, rows / 2 * pitch),
         origin="lower",
+        aspect="auto" if thin else "equal",
         interpolation="nearest",
         norm=Normalize(*grey_window([data[view]])),
     )
@@ -75,21 +78,23 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
 
 
 def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window | None = None) -> bytes:
-    """Three orthogonal slices through the middle of each volume, side by side in one grey window.
+    """Three orthogonal slices through each volume, side by side in one grey window.
+
+    They meet in the centre of mass of the bright voxels of the last volume.
 
     Args:
-        volumes: by name, all on grids of the same size.
+        volumes: by name, all on the same grid.
         unit: of length; the volumes are in 1/unit.
         window: grey values in 1/unit; None takes the 1st to 99.5th percentile of all the slices shown.
     """
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
-    slices = {name: _middle(volume) for name, volume in volumes.items()}
+    at = _bright_centre(list(volumes.values())[-1].data)
+    slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
     window = window or grey_window([image for images in slices.values() for image in images])
-    # A stack of few rows stays visible, at the cost of its aspect.
-    heights = [ny / nx, max(nz / nx, 0.06), max(nz / ny, 0.06)]
+    heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
     column = min((_WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
-    size = (1.2 + column * len(volumes), 1.3 + (column - 0.35) * sum(heights) + 0.35 * len(heights))
+    size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
     figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
     z, y, x = (_edges(first.centre[i], first.shape[i], first.voxel_size) for i in range(3))
@@ -97,7 +102,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
     for j, (name, images) in enumerate(slices.items()):
         for i, (image, (across, up, h_edges, v_edges)) in enumerate(zip(images, planes, strict=True)):
             axes = panels[i][j]
-            thin = image.shape[0] < 0.06 * image.shape[1]
+            thin = image.shape[0] < _THIN * image.shape[1]
             shown = axes.imshow(
                 image,
                 cmap="gray",
@@ -111,6 +116,8 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)
             if j == 0:
                 axes.set_ylabel(f"{up} ({unit})", fontsize=8)
+                cut = first.coordinates()[i][at[i]]
+                axes.text(0.02, 0.03, f"{'zyx'[i]} = {cut:.3g} {unit}", color="w", fontsize=7, transform=axes.transAxes)
             else:
                 axes.tick_params(labelleft=False)
             if i == 0:
@@ -153,12 +160,14 @@ def quality_against_time(
     for name, colour in (("loss", "tab:blue"), ("residual", "tab:orange")):
         if name in history and np.any(np.isfinite(history[name])):
             left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=name)
-    positive = [line for line in left.get_lines() if np.all(np.asarray(line.get_ydata()) > 0)]
-    if len(positive) == len(left.get_lines()):
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in left.get_lines()])
+    if values.min(initial=np.inf) > 0 and values.max() > 10 * values.min():
         left.set_yscale("log")
-        left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
         left.yaxis.set_major_formatter(ScalarFormatter())
         left.yaxis.set_minor_formatter(NullFormatter())
+    else:
+        left.set_ylim(bottom=0)
     left.set(xlabel="time (s)", title="Misfit")
     left.legend(fontsize=8)
     if psnr:
@@ -178,9 +187,15 @@ def quality_against_time(
     return _png(figure)
 
 
-def _middle(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    nz, ny, nx = volume.grid.shape
-    return volume.data[nz // 2], volume.data[:, ny // 2], volume.data[:, :, nx // 2]
+def _bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
+    """[z, y, x] of the centre of mass of what is brighter than half of the grey window; the middle where nothing is."""
+    low, high = grey_window([data[::2, ::2, ::2]])
+    bright = np.clip(data - (low + high) / 2, 0, high - low)
+    total = float(bright.sum(dtype=np.float64))
+    if total == 0:
+        return data.shape[0] // 2, data.shape[1] // 2, data.shape[2] // 2
+    marginals = (bright.sum(axis=axes, dtype=np.float64) for axes in ((1, 2), (0, 2), (0, 1)))
+    return tuple(round(float(m @ np.arange(m.size)) / total) for m in marginals)  # type: ignore[return-value]
 
 
 def _edges(centre: float, n: int, size: float) -> tuple[float, float]:

@@ -153,7 +153,7 @@ def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Map
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the middle of the volume, all in one grey window (1st to 99.5th "
+            "Three orthogonal slices through the middle of what is bright, all in one grey window (1st to 99.5th "
             "percentile of what is shown).",
             figures.orthogonal_slices(shown, unit),
         )

@@ -148,6 +148,15 @@ def test_slices_share_one_window(rng: np.random.Generator) -> None:
     assert any(abs(level - 0.5) < 0.02 for level in levels)
 
 
+def test_slices_meet_where_the_volume_is_bright() -> None:
+    """One bright ball off the middle: all three slices show it."""
+    grid = Grid((40, 50, 60), 1.0)
+    z, y, x = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
+    ball = ((z - 10) ** 2 + (y - 38) ** 2 + (x - 15) ** 2 < 16).astype(np.float32)
+    assert figures._bright_centre(ball) == (10, 38, 15)
+    assert figures._bright_centre(np.zeros((4, 6, 8), np.float32)) == (2, 3, 4)
+
+
 @pytest.mark.parametrize("shape", [(1, 64, 64), (2, 8, 300), (40, 20, 20)])
 @pytest.mark.parametrize("n", [1, 3])
 def test_slices_of_any_shape(shape: tuple[int, int, int], n: int, rng: np.random.Generator) -> None:
