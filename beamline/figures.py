@@ -117,7 +117,8 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
             if j == 0:
                 axes.set_ylabel(f"{up} ({unit})", fontsize=8)
                 cut = first.coordinates()[i][at[i]]
-                axes.text(0.02, 0.03, f"{'zyx'[i]} = {cut:.3g} {unit}", color="w", fontsize=7, transform=axes.transAxes)
+                text = axes.text(0.02, 0.04, f"{'zyx'[i]} = {cut:.3g} {unit}", fontsize=7, transform=axes.transAxes)
+                text.set_bbox({"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5})
             else:
                 axes.tick_params(labelleft=False)
             if i == 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -313,8 +314,9 @@ def _narrowed(references: References, rows: slice) -> References:
     return References(references.dark[rows], tuple((position, flat[rows]) for position, flat in references.flats))
 
 
-def _as_given(data: NDArray[np.float32], frames: NDArray[np.int64]) -> Projections:
+def _as_given(data: NDArray[Any], frames: NDArray[np.int64]) -> Projections:
     """Line integrals that need no correction; a pixel that is not finite takes the value of the nearest that is."""
+    data = data.astype(np.float32, copy=False)
     bad = ~np.isfinite(data)
     for view in np.flatnonzero(bad.any(axis=(1, 2))):
         nearest = ndimage.distance_transform_edt(bad[view], return_distances=False, return_indices=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,19 +14,21 @@ from recon.correct import References
 _BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 
 
-def read_binned(source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int) -> NDArray[np.float32]:
-    """Frames [frame, row, col] as float32, binned by averaging while they are read; NaN stays out of the averages.
+def read_binned(source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int) -> NDArray[Any]:
+    """Frames [frame, row, col], binned by averaging while they are read; NaN stays out of the averages.
 
-    Trailing columns that do not fill a bin go.
+    Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
+    columns that do not fill a bin go.
     """
     height, width = (rows.stop - rows.start) // binning, source.shape[1] // binning
-    out = np.empty((len(frames), height, width), np.float32)
+    whole = binning == 1 and source.dtype.kind in "ui"
+    out = np.empty((len(frames), height, width), source.dtype.newbyteorder("=") if whole else np.float32)
     frame_bytes = (rows.stop - rows.start) * source.shape[1] * source.dtype.itemsize
     batch = max(1, _BATCH_BYTES // max(1, frame_bytes))
     for start in range(0, len(frames), batch):
-        raw = source.read(frames[start : start + batch], rows).astype(np.float32)
+        raw = source.read(frames[start : start + batch], rows)
         if binning > 1:
-            raw = _mean_bins(raw[:, : height * binning, : width * binning], binning)
+            raw = _mean_bins(raw[:, : height * binning, : width * binning].astype(np.float32), binning)
         out[start : start + batch] = raw
     return out
 
