@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ import click
 from beamline.cli.narrate import Narrator
 from beamline.cli.scan_options import scan_options
 from beamline.deliver import Target
-from beamline.errors import BeamlineError
+from beamline.errors import INTERRUPTED, BeamlineError
 from beamline.events import Event, JsonLines, Sink
 from beamline.follow import follow as follow_scan
 from beamline.offline import Method, ReconOptions, SourceOptions, run
@@ -69,9 +70,20 @@ def telling(as_json: bool, clock: SystemClock) -> Iterator[Sink]:
     sink = JsonLines(sys.stdout)
     try:
         yield sink
-    except BeamlineError as error:
-        sink(Event("failed", clock.now(), {"message": str(error), "exit_code": error.exit_code}))
+    except (BeamlineError, KeyboardInterrupt) as error:
+        code = error.exit_code if isinstance(error, BeamlineError) else INTERRUPTED
+        sink(Event("failed", clock.now(), {"message": str(error) or "interrupted", "exit_code": code}))
         raise
+
+
+@contextmanager
+def terminated_like_interrupted() -> Iterator[None]:
+    """SIGTERM ends the command as Ctrl-C does, so that no half-written file stays behind."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @click.command()
@@ -173,7 +185,7 @@ def recon(
         command=repeated(sys.argv[1:]),
     )
     clock = SystemClock()
-    with telling(as_json, clock) as sink:
+    with terminated_like_interrupted(), telling(as_json, clock) as sink:
         if follow:
             follow_scan(options, sink, clock)
         else:

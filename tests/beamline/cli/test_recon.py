@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -167,6 +168,21 @@ def test_a_failure_is_the_last_json_event(folder: Path) -> None:
     last = json.loads(result.stdout.splitlines()[-1])
     assert (last["event"], last["exit_code"]) == ("failed", 5)
     assert "missing.h5" in last["message"]
+
+
+def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the middle of writing: nothing half-written stays, and the last event says why."""
+
+    def interrupted(*_: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("beamline.storage.recon_file._write_entry", interrupted)
+    before = signal.getsignal(signal.SIGTERM)
+    result = _beamline("recon", "scan.h5", "-m", "fbp", "--json")
+    assert result.exit_code == 130
+    assert json.loads(result.stdout.splitlines()[-1])["exit_code"] == 130
+    assert _left(folder) == {"scan.h5"}
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_results_are_never_overwritten(folder: Path) -> None:
