@@ -7,6 +7,7 @@ in the field and air at zero.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from recon import threads  # noqa: F401 - settles the threads before torch starts them
@@ -142,11 +143,10 @@ def axis_from_sinogram(
     wedge = _axis_from_wedge(data, theta, search)
     if wedge.confident:
         return wedge
-    try:
+    with suppress(AxisError):
         mass = _axis_from_mass(data, theta, search)
-    except AxisError:
-        return wedge
-    return mass if mass.confident and abs(mass.value - wedge.value) < _AGREE else wedge
+        return mass if mass.confident and abs(mass.value - wedge.value) < _AGREE else wedge
+    return wedge
 
 
 def _axis_from_mass(data: Floats, theta: Floats, search: tuple[float, float] | None) -> AxisEstimate:
@@ -194,8 +194,7 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    # Low frequencies feel what is wrong with air and truncation, high ones feel noise: they must agree. A sample that
-    # reaches out of the field asks for higher ones.
+    # Low frequencies feel bad air and truncation, which asks for higher ones; high ones feel noise: they must agree.
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
     power = 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
     curve = curve_for(power)
@@ -225,7 +224,8 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
         """What the harmonics first, first + 2 ... up to each frequency's limit leave of re·re, im·im and re·im."""
         order = np.repeat(np.arange(first, harmonics[-1] + 1, 2), 2)
         columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
-        columns, order = (columns, order) if first else (np.delete(columns, 1, 1), np.delete(order, 1))
+        if first == 0:  # sin 0
+            columns, order = np.delete(columns, 1, 1), np.delete(order, 1)
         # Nested: the first m columns of q span the first m harmonics. By torch: NumPy's threads spin, which takes
         # seconds where other processes want the cores.
         q, r = (part.numpy() for part in torch.linalg.qr(torch.from_numpy(columns)))
