@@ -1,8 +1,7 @@
 """The rotation axis from the data: each estimate comes with its curve and says whether it can be trusted.
 
-Three methods that fail in different ways. A pair of views half a turn apart needs only that pair. The double wedge
-uses all views of about half a turn, sparse, noisy or uneven. The centre of mass needs any sector, but the whole sample
-in the field and air at zero.
+Three methods that fail in different ways: a pair of views half a turn apart needs only these; the double wedge uses all
+views of about half a turn; the centre of mass needs any sector, but the whole sample in the field and air at zero.
 """
 
 from __future__ import annotations
