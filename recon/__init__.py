@@ -6,10 +6,15 @@ which only plans a scan starts quickly.
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 from recon.geometry import Geometry
 from recon.volume import Grid, Volume
+
+# libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores
+# (a scan and its live reconstruction) slow each other down twentyfold.
+os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction, reconstruct

@@ -80,17 +80,28 @@ def scale_to_data(
     Projection is linear in density, so this is the exact least-squares factor; it replaces the published constant 0.15
     and makes the start independent of units and of the number of Gaussians.
     """
-    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))
-    rendered = project(gaussians, geometry, chosen.tolist()).numpy()
-    measured = np.asarray(projections[chosen], np.float64)
-    power = float((rendered.astype(np.float64) ** 2).sum())
-    factor = float((rendered * measured).sum()) / power if power > 0 else 0.0
+    factor = density_factor(gaussians, projections, geometry, views)
     if not factor > 0:
         raise ValueError(
             f"the data do not look like line integrals: the best density factor is {factor:.3g}, it must be positive"
         )
+    return scaled(gaussians, factor)
+
+
+def density_factor(gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, views: int = 12) -> float:
+    """The least-squares factor <Aρ, P> / <Aρ, Aρ> over a few views; 0 where the Gaussians project to nothing."""
+    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))
+    rendered = project(gaussians, geometry, chosen.tolist()).numpy()
+    measured = np.asarray(projections[chosen], np.float64)
+    power = float((rendered.astype(np.float64) ** 2).sum())
+    return float((rendered * measured).sum()) / power if power > 0 else 0.0
+
+
+def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
+    """The same Gaussians with all densities times a positive factor, in the same density unit."""
+    densities = gaussians.densities.double().numpy() * factor
     return Gaussians.from_physical(
-        gaussians.means.numpy(), gaussians.scales.numpy(), gaussians.densities.double().numpy() * factor,
+        gaussians.means.numpy(), gaussians.scales.numpy(), densities,
         gaussians.quaternions.numpy(), gaussians.density_unit,
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from recon import fit
 from recon.fbp import fbp
 from recon.gaussians import Gaussians, concatenate
 from recon.geometry import Geometry
-from recon.initialise import density_unit, sample_gaussians, scale_to_data
+from recon.initialise import density_factor, density_unit, sample_gaussians, scale_to_data, scaled
 from recon.kernels.activation import F32
 from recon.splat import project
 from recon.volume import Grid, Volume
@@ -205,11 +205,11 @@ class StreamingFit:
             placed = sample_gaussians(volume, self._count // 10, self._rng, field_radius=self._field())
         except ValueError:
             return  # nothing unexplained anywhere
-        # A new Gaussian overlaps its neighbours; half the residual each keeps the sum from overshooting.
-        placed = Gaussians.from_physical(
-            placed.means.numpy(), placed.scales.numpy(), 0.5 * placed.densities.double().numpy(),
-            density_unit=model.density_unit,
-        )  # fmt: skip
+        # They overlap each other and the model: take what they explain of the residual, and never more than they hold.
+        factor = density_factor(placed, residual, geometry)
+        if not factor > 0:
+            return
+        placed = scaled(placed, min(1.0, factor))
         alive = model.densities > 1e-4 * model.density_unit
         step, drawn = self._state.step, self._state.rng
         self._state = fit.init(concatenate(model.select(torch.nonzero(alive)[:, 0]), placed), drawn)
