@@ -153,6 +153,8 @@ class Acquisition:
                 attempt(stage.abort)
             except (DeviceError, BeamlineError) as error:
                 problems.append(str(error))
+            except Exception as error:  # a defect in one device must not leave the others unsafe
+                problems.append(f"{type(error).__name__}: {error}")
 
         attempt(stage.abort if self._stop.aborting else self._exposures.stand)
         attempt(camera.disarm)

@@ -223,8 +223,8 @@ class Exposures:
                 self._clock.sleep(self._settle)
                 position = self._stage.position()
             self._clock.sleep(triggered + period - self._clock.now())
-            triggered = self._clock.now()
             self._camera.software_trigger()
+            triggered = self._clock.now()  # after the call: when in it the camera fired is not known
             frame = self._next_frame(patience, heed_stop=False)
             if frame is not None:
                 silent = 0

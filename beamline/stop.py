@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 from beamline.errors import INTERRUPTED, ScanStopped
 
 
@@ -14,31 +12,34 @@ class ScanAborted(ScanStopped):
 
 
 class StopRequest:
-    """Two wishes that cannot be taken back: stop (finish cleanly with what there is) and abort (end at once)."""
+    """Two wishes that cannot be taken back: stop (finish cleanly with what there is) and abort (end at once).
+
+    Plain flags, each set by one assignment: a signal handler may interrupt another one in here, and a lock would hang.
+    """
 
     def __init__(self) -> None:
-        self._stop, self._abort = threading.Event(), threading.Event()
+        self._stop = self._abort = False
         self._reason = ""
 
     def stop(self, reason: str = "the operator asked for it") -> None:
         """End cleanly: frames on their way are taken, references still owed are taken, the stage goes back."""
         self._reason = self._reason or reason
-        self._stop.set()
+        self._stop = True
 
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stands, the shutter closes, nothing else is taken."""
         self._reason = reason
-        self._abort.set()
-        self._stop.set()
+        self._abort = True
+        self._stop = True
 
     @property
     def stopping(self) -> bool:
         """Stop or abort was asked for."""
-        return self._stop.is_set()
+        return self._stop
 
     @property
     def aborting(self) -> bool:
-        return self._abort.is_set()
+        return self._abort
 
     @property
     def reason(self) -> str:

@@ -15,13 +15,16 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """Wall-clock time that never goes back: epoch at start plus the monotonic counter, so that frames stay in order."""
+    """Wall-clock time that never goes back: epoch at start plus a steady counter, so that frames stay in order.
+
+    The counter is the performance counter: Windows advances the other one (time.monotonic) in steps of 16 ms.
+    """
 
     def __init__(self) -> None:
-        self._epoch = time.time() - time.monotonic()
+        self._epoch = time.time() - time.perf_counter()
 
     def now(self) -> float:
-        return self._epoch + time.monotonic()
+        return self._epoch + time.perf_counter()
 
     def sleep(self, seconds: float) -> None:
         if seconds > 0:

@@ -18,8 +18,8 @@ from beamline.plan import Mode, Place, Timeline
 from beamline.stop import ScanAborted, StopRequest
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraSettings, TriggerSource
-from tests.beamline.fakes import COUNT, HOME, Faults, Instrument, seen
+from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
+from tests.beamline.fakes import COUNT, HOME, Camera, Faults, Instrument, seen
 
 SETTLE = 0.05
 
@@ -331,6 +331,29 @@ def test_an_abort_on_the_way_home_stands_at_once() -> None:
     assert_safe(bench, home=False)
 
 
+class Dawdling(Camera):
+    """Slow to be ready again, and every second trigger is fired only 10 ms after the call."""
+
+    @property
+    def timing(self) -> CameraTiming:
+        return replace(super().timing, min_period=self.settings.exposure + 0.05)
+
+    def software_trigger(self) -> None:
+        self.bench.clock.sleep(0.01 * (1 - self.number % 2))
+        super().software_trigger()
+
+
+@pytest.mark.parametrize("mode", [Mode.FLY, Mode.STEP])
+def test_software_triggers_leave_the_least_period_between_exposures_whenever_the_camera_fires(mode: Mode) -> None:
+    bench = Instrument()
+    bench.camera = Dawdling(bench)
+    bench.devices = replace(bench.devices, camera=bench.camera)
+    run = Run(bench, bench.timeline(n=8, mode=mode), None)
+    assert run.error is None
+    for kind, exposure in ((FrameKind.DARK, 0.02), (FrameKind.FLAT, 0.03), (FrameKind.PROJECTION, 0.02)):
+        assert np.diff([frame.time for frame in run.of(kind)]).min() > exposure + 0.05 - 1e-6
+
+
 def test_a_caller_that_gives_up_leaves_a_safe_instrument_at_home() -> None:
     bench = Instrument()
     scan = Acquisition(
@@ -354,4 +377,18 @@ def test_a_stage_that_cannot_be_made_safe_is_said_though_the_data_are_good() -> 
     assert isinstance(run.error, InstrumentError)
     assert "shutter: does not answer" in str(run.error)
     assert len(run.frames) == 12
+    assert not bench.camera.armed
+
+
+def test_a_defect_in_one_driver_does_not_leave_the_other_devices_unsafe() -> None:
+    bench = Instrument(Faults(errors={10: 99}))
+
+    def fail() -> None:
+        raise ZeroDivisionError("defect")
+
+    bench.devices.stage.stop = fail  # type: ignore[method-assign]
+    run = Run(bench, bench.timeline())
+    assert isinstance(run.error, DeviceError)  # what went wrong first
+    assert "ZeroDivisionError: defect" in [data["message"] for event, data in run.events if event == "warning"]
+    assert not bench.is_open
     assert not bench.camera.armed
