@@ -80,16 +80,16 @@ class Problem:
     """The data of a fit, in normalised units: lengths in half fields, densities in density units.
 
     Attributes:
-        images: float32 [view, row, col], projections / (half_field * unit).
-        target_maps: float32 [view, 2, row, col], blurred images for SSIM.
+        images: a float32 [row, col] each view, projections / (half_field * unit).
+        target_maps: a float32 [2, row, col] each view, blurred for SSIM.
         geometry, grid: of the views and of the volume.
         half_field: mm.
         unit: 1/mm.
         loss: the projection loss with its scratch memory.
     """
 
-    images: F32
-    target_maps: F32
+    images: tuple[F32, ...]
+    target_maps: tuple[F32, ...]
     geometry: Geometry
     grid: Grid
     half_field: float
@@ -111,7 +111,6 @@ class FitState:
     rng: np.random.Generator
     limit: int
     step: int = 0
-    restart: int = 0
     drawn: list[int] = field(default_factory=list)
     statistic: F32 = field(default_factory=lambda: np.zeros(0, np.float32))
     seen: int = 0
@@ -136,30 +135,30 @@ def make_problem(projections: F32, geometry: Geometry, grid: Grid, unit: float, 
         bad = int((~np.isfinite(projections)).sum())
         raise ValueError(f"{bad} of {projections.size} projection values are not finite; correct or mask them first")
     half_field = max(grid.shape) * grid.voxel_size / 2
-    images = np.ascontiguousarray(projections, np.float32) * np.float32(1 / (half_field * unit))
     loss = ProjectionLoss(geometry.detector_shape, settings.ssim_weight)
-    maps = np.stack([loss.target_maps(image) for image in images])
-    return Problem(images, maps, geometry, grid, half_field, unit, loss)
+    empty = Problem((), (), geometry, grid, half_field, unit, loss)
+    return replace(_with_views(empty, projections), geometry=geometry)
 
 
 def extend(problem: Problem, projections: F32, angles: NDArray[np.float64]) -> Problem:
-    """The problem with more views."""
-    geometry = Geometry.parallel(
-        angles, problem.geometry.detector_shape, problem.geometry.pixel_pitch, problem.geometry.axis_col
-    )
-    images = np.ascontiguousarray(projections, np.float32) * np.float32(1 / (problem.half_field * problem.unit))
-    maps = np.stack([problem.loss.target_maps(image) for image in images])
-    together = np.concatenate((problem.geometry.angles, geometry.angles))
-    together.setflags(write=False)
-    return replace(
-        problem,
-        images=np.concatenate((problem.images, images)),
-        target_maps=np.concatenate((problem.target_maps, maps)),
-        geometry=replace(problem.geometry, angles=together),
-    )
+    """The problem with more views [view, row, col]; those it has are not copied."""
+    geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
+    return replace(_with_views(problem, projections), geometry=geometry)
 
 
-def init(gaussians: Gaussians, seed: int | np.random.Generator, growth: float = 1.5) -> FitState:
+def _with_views(problem: Problem, projections: F32) -> Problem:
+    scale = np.float32(1 / (problem.half_field * problem.unit))
+    images = tuple(np.ascontiguousarray(view, np.float32) * scale for view in projections)
+    maps = tuple(problem.loss.target_maps(image) for image in images)
+    return replace(problem, images=problem.images + images, target_maps=problem.target_maps + maps)
+
+
+def growth(settings: FitSettings) -> float:
+    """How many times its first count a model may have."""
+    return 1.0 if settings.policy is None else settings.policy.growth
+
+
+def init(gaussians: Gaussians, seed: int | np.random.Generator, growth: float = 1.0) -> FitState:
     """A fresh state; the Gaussians are copied, in an order that keeps neighbours together in memory."""
     order = morton_order(gaussians.means.numpy(), float(gaussians.scales.median()) * 4)
     arrays = gaussians.select(torch.from_numpy(order)).arrays()
@@ -285,7 +284,7 @@ def _update(
         scale = problem.half_field if name == "means" else 1.0
         arrays = (state.parameters[name], gradients[name], state.first[name], state.second[name])
         parameter, gradient, first, second = (a.reshape(state.n, -1) for a in arrays)
-        adam(parameter, gradient, first, second, rate * shrink * scale, state.step - state.restart)
+        adam(parameter, gradient, first, second, rate * shrink * scale, state.step)
     low = np.log(settings.smallest * problem.geometry.pixel_pitch)
     np.clip(state.parameters["log_scales"], low, np.log(problem.half_field), out=state.parameters["log_scales"])
 

@@ -124,21 +124,6 @@ class Gaussians:
         return cls(means, log_scales, quaternions, raw, float(arrays["density_unit"]))
 
 
-def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both sets as one, in the density unit of `first`."""
-    raw = second.raw_densities
-    if second.density_unit != first.density_unit:
-        densities = second.densities.double().numpy() / first.density_unit
-        raw = _tensor(inverse_softplus(densities))
-    return Gaussians(
-        torch.cat((first.means, second.means)),
-        torch.cat((first.log_scales, second.log_scales)),
-        torch.cat((first.quaternions, second.quaternions)),
-        torch.cat((first.raw_densities, raw)),
-        first.density_unit,
-    )
-
-
 def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:
     """x with log(1 + eˣ) = value, for value > 0: value + log(1 - e^-value), which keeps its digits at both ends."""
     value = np.asarray(value, np.float64)

@@ -75,6 +75,10 @@ class Geometry:
         theta.setflags(write=False)
         return replace(self, angles=theta)
 
+    def at(self, angles: ArrayLike) -> Geometry:
+        """The same detector and axis at other angles (radians)."""
+        return Geometry.parallel(angles, self.detector_shape, self.pixel_pitch, self.axis_col)
+
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop; v is measured from the middle of the kept rows."""
         if not 0 <= start < stop <= self.detector_shape[0]:

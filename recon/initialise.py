@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
+from recon.fbp import fbp
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.splat import project
-from recon.volume import Volume
+from recon.volume import Grid, Volume
 
 # Voxels below this fraction of the density unit hold no matter worth a Gaussian (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
@@ -20,6 +21,27 @@ def density_unit(volume: Volume) -> float:
     """A typical high density of the volume: the 99.5th percentile of its positive part, 1/mm."""
     positive = volume.data[volume.data > 0]
     return float(np.percentile(positive, 99.5)) if positive.size else 0.0
+
+
+def default_count(grid: Grid) -> int:
+    """How many Gaussians a grid is worth: one for 60 voxels of the cylinder in it, 2000 to 200 000."""
+    nz, ny, nx = grid.shape
+    return int(np.clip(np.pi / 4 * nz * ny * nx / 60, 2000, 200_000))
+
+
+def place(
+    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, count: int | None, rng: np.random.Generator
+) -> Gaussians:
+    """The starting point of a fit: Gaussians drawn from an FBP of the data [view, row, col], scaled to the data.
+
+    Raises:
+        ValueError: where the data hold no matter or are no line integrals.
+    """
+    volume = Volume(fbp(projections, geometry, grid, "hann"), grid)
+    cols, axis = geometry.detector_shape[1], geometry.axis_col
+    radius = max(axis + 0.5, cols - axis - 0.5) * geometry.pixel_pitch
+    placed = sample_gaussians(volume, default_count(grid) if count is None else count, rng, field_radius=radius)
+    return scale_to_data(placed, projections, geometry)
 
 
 def sample_gaussians(
@@ -80,25 +102,15 @@ def scale_to_data(
     Projection is linear in density, so this is the exact least-squares factor; it replaces the published constant 0.15
     and makes the start independent of units and of the number of Gaussians.
     """
-    factor = density_factor(gaussians, projections, geometry, views)
-    if not factor > 0:
-        raise ValueError(
-            f"the data do not look like line integrals: the best density factor is {factor:.3g}, it must be positive"
-        )
-    return scaled(gaussians, factor)
-
-
-def density_factor(gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, views: int = 12) -> float:
-    """The least-squares factor <Aρ, P> / <Aρ, Aρ> over a few views; 0 where the Gaussians project to nothing."""
     chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))
     rendered = project(gaussians, geometry, chosen.tolist()).numpy()
     measured = np.asarray(projections[chosen], np.float64)
     power = float((rendered.astype(np.float64) ** 2).sum())
-    return float((rendered * measured).sum()) / power if power > 0 else 0.0
-
-
-def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
-    """The same Gaussians with all densities times a positive factor, in the same density unit."""
+    factor = float((rendered * measured).sum()) / power if power > 0 else 0.0
+    if not factor > 0:
+        raise ValueError(
+            f"the data do not look like line integrals: the best density factor is {factor:.3g}, it must be positive"
+        )
     densities = gaussians.densities.double().numpy() * factor
     return Gaussians.from_physical(
         gaussians.means.numpy(), gaussians.scales.numpy(), densities,

@@ -15,8 +15,7 @@ from recon import fit
 from recon.fbp import Filter, fbp
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.initialise import sample_gaussians, scale_to_data
-from recon.stream import default_count
+from recon.initialise import place
 from recon.volume import Grid, Volume
 
 Method = Literal["r2", "fbp"]
@@ -101,9 +100,12 @@ def reconstruct(
     chosen = settings or fit.FitSettings()
     if settings is None and not densify:
         chosen = replace(chosen, policy=None)
-    start = gaussians if isinstance(gaussians, Gaussians) else place(data, geometry, target, gaussians, seed)
-    growth = chosen.policy.growth if chosen.policy is not None else 1.0
-    state = fit.init(start, seed, growth)
+    start = (
+        gaussians
+        if isinstance(gaussians, Gaussians)
+        else place(data, geometry, target, gaussians, np.random.default_rng(seed))
+    )
+    state = fit.init(start, seed, fit.growth(chosen))
     problem = fit.make_problem(data, geometry, target, start.density_unit, chosen)
     planned = steps if steps is not None else (0 if seconds is not None else DEFAULT_STEPS)
     history: list[fit.Progress] = []
@@ -129,16 +131,6 @@ def reconstruct(
     return Reconstruction(
         volume, now() - begin, tuple(history), method, fit.gaussians_of(state), MappingProxyType(used)
     )
-
-
-def place(data: NDArray[np.float32], geometry: Geometry, grid: Grid, count: int | None, seed: int) -> Gaussians:
-    """The fit's starting point: Gaussians drawn from an FBP of the data, scaled to the data."""
-    volume = Volume(fbp(data, geometry, grid, "hann"), grid)
-    cols, axis = geometry.detector_shape[1], geometry.axis_col
-    radius = max(axis + 0.5, cols - axis - 0.5) * geometry.pixel_pitch
-    n = default_count(grid) if count is None else count
-    placed = sample_gaussians(volume, n, np.random.default_rng(seed), field_radius=radius)
-    return scale_to_data(placed, data, geometry)
 
 
 def _progress(state: fit.FitState, planned: int, seconds: float, n_views: int) -> fit.Progress:

@@ -1,29 +1,25 @@
 """StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
 
-The first Gaussians come from an FBP of the first well-spread views. Whenever the number of views has grown by half, the
-model is compared with all of them: what it does not explain is back-projected (the FBP of the residual), new Gaussians
-are placed where that is positive, and the learning rates start again, since there is something new to learn. Between
-arrivals the model keeps fitting: every third step takes one of the newest views, the others replay all of them evenly
-(the rule of on-the-fly mapping: new views must be learnt, old ones not forgotten; Meuleman et al. 2025).
+The first Gaussians come from an FBP of the first well-spread views. Whenever the number of views has grown by half, a
+new round begins: the learning rates start again, since there is something new to learn, and density control clones and
+splits where the new views ask for it. Between arrivals the model keeps fitting: every third step takes one of the
+newest views, the others replay all of them evenly (the rule of on-the-fly mapping: new views must be learnt, old ones
+not forgotten; Meuleman et al. 2025).
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from recon import fit
-from recon.fbp import fbp
-from recon.gaussians import Gaussians, concatenate
+from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.initialise import density_factor, density_unit, sample_gaussians, scale_to_data, scaled
+from recon.initialise import default_count, place
 from recon.kernels.activation import F32
-from recon.splat import project
 from recon.volume import Grid, Volume
 
 _NEWEST = 0.2  # this share of the views counts as the newest
@@ -39,7 +35,7 @@ class StreamingFit:
         grid: of the snapshots; None matches the detector.
         seed: of every random choice.
         gaussians: how many at the first placement; None derives it from the volume (see `default_count`).
-        settings: of the fit. Density control is off by default: the residual rounds add Gaussians.
+        settings: of the fit.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
         now: a clock in s.
     """
@@ -59,7 +55,7 @@ class StreamingFit:
         self._template, self._grid = template, grid or Grid.matching(template)
         self._rng = np.random.default_rng(seed)
         self._count = gaussians or default_count(self._grid)
-        self._settings = settings or fit.FitSettings(policy=None)
+        self._settings = settings or fit.FitSettings()
         self._first_views, self._first_span = first_views, first_span
         self._now, self._start = now, now()
         self._data: list[F32] = []
@@ -89,10 +85,12 @@ class StreamingFit:
             raise ValueError(f"{theta.size} angles need projections of shape {expected}, got {np.shape(data)}")
         if not (np.isfinite(data).all() and np.isfinite(theta).all()):
             raise ValueError("new views hold values or angles that are not finite; nothing was added")
-        self._data.extend(np.ascontiguousarray(image, np.float32) for image in data)
+        images = np.array(data, np.float32)
         self._angles.extend(theta.tolist())
-        if self._problem is not None:
-            self._problem = fit.extend(self._problem, np.asarray(data, np.float32), theta)
+        if self._problem is None:
+            self._data.extend(images)
+        else:
+            self._problem = fit.extend(self._problem, images, theta)
 
     def advance(self, seconds: float) -> fit.Progress:
         """Fit for about `seconds` s (at least one step once there is a model) and say where it stands."""
@@ -169,57 +167,17 @@ class StreamingFit:
             if not force and (theta.size < self._first_views or _span(theta) < self._first_span):
                 return
             self._place_first()
-        else:
-            self._place_more()
         assert self._state is not None
         self._round_views, self._round_step = self.n_views, self._state.step
         self._state.drawn = []  # draw from all views from now on
 
-    def _all(self) -> tuple[F32, Geometry]:
-        angles = np.asarray(self._angles)
-        angles.setflags(write=False)
-        return np.stack(self._data), replace(self._template, angles=angles)
-
-    def _field(self) -> float:
-        cols, axis = self._template.detector_shape[1], self._template.axis_col
-        return max(axis + 0.5, cols - axis - 0.5) * self._template.pixel_pitch
-
     def _place_first(self) -> None:
-        data, geometry = self._all()
-        volume = Volume(fbp(data, geometry, self._grid, "hann"), self._grid)
-        placed = sample_gaussians(volume, self._count, self._rng, field_radius=self._field())
-        placed = scale_to_data(placed, data, geometry)
+        geometry = self._template.at(self._angles)
+        data = np.stack(self._data)
+        placed = place(data, geometry, self._grid, self._count, self._rng)
         self._problem = fit.make_problem(data, geometry, self._grid, placed.density_unit, self._settings)
-        self._state = fit.init(placed, self._rng)
-
-    def _place_more(self) -> None:
-        """New Gaussians where the back-projected residual is positive; at most a tenth of the first count a round."""
-        assert self._state is not None
-        data, geometry = self._all()
-        model = fit.gaussians_of(self._state)
-        residual = data - project(model, geometry, truncation=self._settings.truncation).numpy()
-        volume = Volume(fbp(residual, geometry, self._grid, "hann"), self._grid)
-        if density_unit(volume) < 0.02 * model.density_unit:
-            return
-        try:
-            placed = sample_gaussians(volume, self._count // 10, self._rng, field_radius=self._field())
-        except ValueError:
-            return  # nothing unexplained anywhere
-        # They overlap each other and the model: take what they explain of the residual, and never more than they hold.
-        factor = density_factor(placed, residual, geometry)
-        if not factor > 0:
-            return
-        placed = scaled(placed, min(1.0, factor))
-        alive = model.densities > 1e-4 * model.density_unit
-        step, drawn = self._state.step, self._state.rng
-        self._state = fit.init(concatenate(model.select(torch.nonzero(alive)[:, 0]), placed), drawn)
-        self._state.step = self._state.restart = step
-
-
-def default_count(grid: Grid) -> int:
-    """How many Gaussians a grid is worth: one for 60 voxels of the cylinder in it, 2000 to 200 000."""
-    nz, ny, nx = grid.shape
-    return int(np.clip(np.pi / 4 * nz * ny * nx / 60, 2000, 200_000))
+        self._state = fit.init(placed, self._rng, fit.growth(self._settings))
+        self._data = []  # the problem holds them from now on
 
 
 def _span(theta: NDArray[np.float64]) -> float:

@@ -56,7 +56,7 @@ def test_the_same_seed_gives_the_same_bits(random_gaussians: Make, rng: np.rando
     truth = random_gaussians(30, extent=8.0)
     settings = fit.FitSettings(policy=DensityPolicy(start=0, every=5, threshold=1e-9))
     problem, start = _problem(truth, settings), _disturbed(truth, rng)
-    ends = [fit.run(fit.init(start, 7), problem, settings, 20).parameters for _ in range(2)]
+    ends = [fit.run(fit.init(start, 7, fit.growth(settings)), problem, settings, 20).parameters for _ in range(2)]
     for name in fit.NAMES:
         np.testing.assert_array_equal(ends[0][name], ends[1][name])
     assert ends[0]["raw"].size == 45  # the policy grew the model to its limit

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.gaussians import Gaussians, concatenate, inverse_softplus
+from recon.gaussians import Gaussians, inverse_softplus
 from tests.recon.conftest import Make
 
 
@@ -36,13 +36,6 @@ def test_an_incomplete_checkpoint_is_refused(random_gaussians: Make) -> None:
     del arrays["quaternions"]
     with pytest.raises(ValueError, match="quaternions"):
         Gaussians.from_arrays(arrays)
-
-
-def test_joining_sets_keeps_physical_densities(random_gaussians: Make) -> None:
-    a, b = random_gaussians(5), Gaussians.from_physical(np.ones((3, 3)), [1.0] * 3, [2.0, 3.0, 4.0])
-    joined = concatenate(a, b)
-    np.testing.assert_allclose(joined.densities.numpy(), torch.cat((a.densities, b.densities)).numpy(), rtol=1e-5)
-    assert joined.n == 8 and joined.density_unit == a.density_unit
 
 
 @pytest.mark.parametrize(("scales", "densities"), [([0.0], [1.0]), ([1.0], [-1.0]), ([np.nan], [1.0])])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from recon import Geometry, Grid
+from recon.initialise import default_count
 from recon.metrics import psnr
-from recon.stream import StreamingFit, default_count
+from recon.stream import StreamingFit
 from simulators.phantom import Detector, Phantom
 from simulators.solids import Cylinder, Ellipsoid
 
