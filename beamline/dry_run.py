@@ -15,7 +15,6 @@ from beamline.errors import ConfigError
 from beamline.monitor.flag import Context
 from beamline.monitor.scan import start as start_monitor
 from beamline.plan import ScanPlan, Timeline
-from drivers.frame import FrameKind
 from drivers.protocols import CameraTiming, StageLimits
 
 
@@ -36,7 +35,7 @@ class DryRun:
     def data(self) -> Mapping[str, Any]:
         """For a program: the numbers behind the lines, in s, rad, bytes and pixels."""
         worked = self.timeline
-        views = next(block for block in worked.blocks if block.kind is FrameKind.PROJECTION)
+        views = worked.views
         return {
             "remarks": worked.remarks,
             "duration": worked.duration,

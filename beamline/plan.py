@@ -119,3 +119,8 @@ class Timeline:
     @property
     def n_frames(self) -> int:
         return sum(block.n for block in self.blocks)
+
+    @property
+    def views(self) -> Block:
+        """The block of projections: every timeline has one."""
+        return next(block for block in self.blocks if block.kind is FrameKind.PROJECTION)

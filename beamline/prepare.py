@@ -18,7 +18,6 @@ from beamline.monitor.flag import Context
 from beamline.plan import Mode, ScanPlan, Timeline
 from beamline.storage.nxtomo import ScanInfo
 from beamline.timeline import work_out
-from drivers.frame import FrameKind
 from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
 
 
@@ -61,21 +60,21 @@ def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
     watch = monitor.start(_context(plan, timeline, timing), config.monitor.thresholds)
     # The first call compiles, which must not happen while frames are coming.
     digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, config.storage.preview_bin)
-    return Prepared(plan, timeline, settings, timing, watch, _info(config, bench, plan))
+    return Prepared(plan, timeline, settings, timing, watch, _info(config, bench, plan, timeline))
 
 
 def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> Context:
-    views = next(block for block in timeline.blocks if block.kind is FrameKind.PROJECTION)
+    views = timeline.views
     starts = np.cumsum([0, *(train.n for train in views.trains)])[:-1]
     return Context(
         saturation=2**timing.bits - 1,
         pixels=math.prod(timing.shape),
-        period=plan.period if plan.mode is Mode.FLY else None,
+        period=views.period if plan.mode is Mode.FLY else None,
         pass_starts=frozenset(starts.tolist()),
     )
 
 
-def _info(config: Config, bench: Bench, plan: ScanPlan) -> ScanInfo:
+def _info(config: Config, bench: Bench, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
     optics, devices = config.optics, bench.devices
     asked = {
         "scheme": plan.scheme,
@@ -94,7 +93,7 @@ def _info(config: Config, bench: Bench, plan: ScanPlan) -> ScanInfo:
         energy_kev=optics.energy_kev,
         distance_mm=optics.distance_mm,
         exposure=plan.exposure,
-        period=plan.period,
+        period=timeline.views.period,
         axis_col=optics.axis_col,
         plan=json.dumps(asked),
         config=resolved_yaml(config),

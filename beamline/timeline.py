@@ -198,7 +198,7 @@ def describe(
             f"{block.first_row:>6}-{last:<6}  {block.kind.name.lower():<10}  {block.n:>6}  {block.mode:<6}  "
             f"{block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  {_angles(block.angles)}"
         )
-    views = next(block for block in timeline.blocks if block.kind is FrameKind.PROJECTION)
+    views = timeline.views
     rows, cols = camera.shape
     facts = [("views", f"{views.n}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:

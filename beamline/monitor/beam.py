@@ -8,7 +8,7 @@ import numpy as np
 
 from beamline.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
-from beamline.monitor.preview import edge_light, light
+from beamline.monitor.preview import edge_light, light, more_light
 from drivers.frame import Frame, FrameKind
 
 NAME = "beam"
@@ -43,14 +43,18 @@ class State:
 def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
     """Score: fraction of the light that is gone (negative: too much)."""
     if frame.kind is FrameKind.FLAT and context.flat is not None:
-        full = float(light(context.flat, context).mean())
+        full = float(light(context.flat, context).mean()) * more_light(context, frame.exposure)
         score = 1 - float(light(digest.preview, context).mean()) / full if full > 0 else 0.0
         return state, _judge(state.limits, frame.index, score, state.limits.warn, "than in the flats before")
     if frame.kind is not FrameKind.PROJECTION:
         return state, None
     left, right = edge_light(digest.preview, context)
-    if state.reference is None:
-        state = replace(state, reference=(left, right) if context.flat is None else edge_light(context.flat, context))
+    if state.reference is None and context.flat is not None:
+        scale = more_light(context, frame.exposure)
+        full_left, full_right = edge_light(context.flat, context)
+        state = replace(state, reference=(full_left * scale, full_right * scale))
+    elif state.reference is None:
+        state = replace(state, reference=(left, right))
     full_left, full_right = state.reference or (left, right)
     # The sample may cover one edge; the brighter one is the better witness of the beam.
     level = max(left / full_left if full_left > 0 else 0.0, right / full_right if full_right > 0 else 0.0)

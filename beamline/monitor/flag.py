@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -45,6 +46,7 @@ class Context:
         period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
         pass_starts: triggers at which a new pass of a fly scan begins, after any pause.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
+        flat_exposure: s of these flats, which may have an exposure of their own.
     """
 
     saturation: float
@@ -53,3 +55,4 @@ class Context:
     pass_starts: frozenset[int] = frozenset({0})
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
+    flat_exposure: float = math.nan

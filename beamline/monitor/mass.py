@@ -45,7 +45,7 @@ def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> 
     """Score: relative change of the mean line integral. Silent where the sample is cut off by the detector's edge."""
     if frame.kind is not FrameKind.PROJECTION:
         return state, None
-    through = transmission(digest.preview, context, thinned(digest.preview))
+    through = transmission(digest.preview, context, frame.exposure, thinned(digest.preview))
     if through is None:
         return state, None
     integrals = -np.log(np.clip(np.nan_to_num(through, nan=1.0), DARKEST, None))

@@ -26,11 +26,18 @@ def light(preview: NDArray[np.float32], context: Context, region: Region = WHOLE
     return preview[region] if context.dark is None else preview[region] - context.dark[region]
 
 
-def transmission(preview: NDArray[np.float32], context: Context, region: Region = WHOLE) -> NDArray[np.float32] | None:
+def more_light(context: Context, exposure: float) -> float:
+    """How many times the flats' light a frame of `exposure` s would get without a sample: flats may have their own."""
+    return exposure / context.flat_exposure
+
+
+def transmission(
+    preview: NDArray[np.float32], context: Context, exposure: float, region: Region = WHOLE
+) -> NDArray[np.float32] | None:
     """Light over the flats' light, or None before any flat. Blocks where the flat has no light are NaN."""
     if context.flat is None:
         return None
-    full = light(context.flat, context, region)
+    full = light(context.flat, context, region) * np.float32(more_light(context, exposure))
     return np.divide(light(preview, context, region), full, out=np.full_like(full, np.nan), where=full > 0)
 
 

@@ -82,7 +82,7 @@ def _remember(before: Watch, frame: Frame, digest: FrameDigest) -> Watch:
     if frame.kind is FrameKind.DARK:
         context = replace(context, dark=_mean(context.dark, digest.preview, counted))
     elif frame.kind is FrameKind.FLAT:
-        context = replace(context, flat=_mean(context.flat, digest.preview, counted))
+        context = replace(context, flat=_mean(context.flat, digest.preview, counted), flat_exposure=frame.exposure)
     return replace(before, context=context, counted=counted, kind=frame.kind)
 
 

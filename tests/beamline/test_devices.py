@@ -19,7 +19,6 @@ from beamline.plan import Block
 from beamline.timeline import block_seconds, pass_ends
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError, DeviceRefused
-from drivers.frame import FrameKind
 from drivers.manual import ManualSampleMover, ManualShutter
 from drivers.protocols import TriggerSource
 from recon.geometry import Geometry
@@ -84,7 +83,7 @@ def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
     settings = small(f"scan.angles={angles}", "scan.period_s=2", "devices.stage.low_deg=-20")
     worked = dry_run(settings)
     assert worked.timeline.violations == ()
-    block = next(b for b in worked.timeline.blocks if b.kind is FrameKind.PROJECTION)
+    block = worked.timeline.views
     with devices.connect(settings) as bench:
         assert isinstance(bench.clock, VirtualClock)
         bench.devices.shutter.open()

@@ -13,7 +13,6 @@ from beamline import config
 from beamline.config_models import Config
 from beamline.dry_run import dry_run, free_bytes, refuse_violations
 from beamline.errors import ConfigError
-from drivers.frame import FrameKind
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -28,7 +27,7 @@ def test_shipped_scans_may_start(name: str) -> None:
     assert [v for v in worked.timeline.violations if "disk" not in v] == []
     assert worked.timeline.blur_px < 1
     if name == "demo":
-        views = next(b for b in worked.timeline.blocks if b.kind is FrameKind.PROJECTION)
+        views = worked.timeline.views
         assert views.n == 180
         assert worked.timeline.duration < 25
 

@@ -253,6 +253,19 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
     ran.assert_safe()
 
 
+def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Path) -> None:
+    """Half a turn in 6 views is 3000 counts of the stage; a view every 2200 s would be 1.36 counts a second."""
+    ran = Ran(tmp_path, Instrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.result.flags == {}
+    with h5py.File(ran.result.path) as file:
+        times = file["entry/frame_log/time"][5:11]
+        assert file["entry/record/period"][()] == pytest.approx(3000)
+        assert json.loads(file["entry/record/plan"][()])["period_s"] == 2200
+    np.testing.assert_allclose(np.diff(times), 3000, atol=1e-3)
+
+
 def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
     ran = Ran(tmp_path, Instrument(Faults(repeats={9, 10, 11})))
     assert ran.error is None

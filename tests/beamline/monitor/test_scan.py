@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from beamline.errors import ConfigError
 from beamline.monitor import scan
 from beamline.monitor.flag import Context, Flag, Level
+from drivers.frame import Frame
 
 CONTEXT = Context(saturation=65535, pixels=100)
 
@@ -26,6 +27,19 @@ def test_a_clean_scan_in_jumping_order_raises_no_flag(bench: Any) -> None:
     for i in range(300):
         frames += [replace(frame, trigger=i) for frame in bench.views(1, first=i * 77 % 360)]
     assert bench.watch(frames, period=None) == []
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(bench: Any, factor: float) -> None:
+    def flats() -> list[Frame]:
+        return [replace(f, exposure=factor * f.exposure) for f in bench.flats(light=factor)]
+
+    clean = bench.darks() + flats() + bench.views(60) + flats() + bench.darks()
+    assert bench.watch(clean) == []
+    dimmed = bench.darks() + flats() + bench.views(20) + bench.views(2, first=20, light=0.9) + flats()
+    found = bench.watch(dimmed)
+    assert {flag.check for flag in found} == {"beam"}
+    assert [flag.score for flag in found] == pytest.approx([0.1, 0.1], abs=0.01)
 
 
 def test_a_frame_may_have_several_flags(bench: Any) -> None:
