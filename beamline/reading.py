@@ -45,18 +45,48 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
 
 
 def read_references(source: ScanSource, rows: slice, binning: int) -> References:
-    """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there."""
+    """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
+
+    The light of flats with an exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat,
+    where both are known. The dark is one for all: the file's rules tell where it was exposed otherwise.
+    """
     dark_frames = np.flatnonzero(source.image_key == FrameKind.DARK)
     flat_frames = np.flatnonzero(source.image_key == FrameKind.FLAT)
+    dark = _mean(source, dark_frames, rows, binning)
+    scale = light_scale(source.image_key, source.exposures)
     # Flats with no projection between them were taken together.
     views_before = np.cumsum(source.image_key == FrameKind.PROJECTION)[flat_frames]
     groups = np.split(flat_frames, np.flatnonzero(np.diff(views_before)) + 1)
-    flats = tuple((float(group.mean()), _mean(source, group, rows, binning)) for group in groups)
-    return References(_mean(source, dark_frames, rows, binning), flats)
+    flats = []
+    for group in groups:
+        mean = _mean(source, group, rows, binning, scale[group])
+        flats.append((float(group.mean()), (mean + (1 - scale[group].mean()) * dark).astype(np.float32)))
+    return References(dark.astype(np.float32), tuple(flats))
 
 
-def _mean(source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int) -> NDArray[np.float32]:
+def light_scale(image_key: NDArray[np.int32], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+    """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
+
+    Args:
+        exposures: [frame] s, NaN where unknown. Of projections that differ the median counts.
+    """
+    views = exposures[image_key == FrameKind.PROJECTION]
+    views = views[np.isfinite(views)]
+    if views.size == 0:
+        return np.ones(exposures.size)
+    return np.where(np.isfinite(exposures), np.median(views) / exposures, 1.0)
+
+
+def _mean(
+    source: ScanSource,
+    frames: NDArray[np.int64],
+    rows: slice,
+    binning: int,
+    weights: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Mean of the frames, each times its weight; float64 [row, col], binned."""
     total = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64)
-    for frame in frames:
-        total += read_binned(source, np.array([frame]), rows, binning)[0]
-    return (total / frames.size).astype(np.float32)
+    for i, frame in enumerate(frames):
+        image = read_binned(source, np.array([frame]), rows, binning)[0]
+        total += image if weights is None else weights[i] * image
+    return total / frames.size

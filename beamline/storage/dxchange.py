@@ -56,6 +56,7 @@ class DataExchangeSource:
             self.dtype: np.dtype[Any] = np.result_type(*(item.dtype for _, item in self._parts))
             self.image_key = np.repeat([kind for kind, _ in self._parts], sizes).astype(np.int32)
             self.angles = np.full(self.image_key.size, np.nan)
+            self.exposures = np.full(self.image_key.size, np.nan)
             if own_angles:
                 self.angles[-n_views:] = self._theta(n_views)
             kinds = {kind for kind, _ in self._parts}

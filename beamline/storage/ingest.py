@@ -144,6 +144,6 @@ def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
                 layout.Record(frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time),
             )
         return
-    keys, angles = source.image_key, source.angles
+    keys, angles, exposures = source.image_key, source.angles, source.exposures
     for i in range(keys.size):
-        yield source.read([i])[0], layout.Record(FrameKind(int(keys[i])), float(angles[i]))
+        yield source.read([i])[0], layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))

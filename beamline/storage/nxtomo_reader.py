@@ -83,6 +83,8 @@ class NXtomoSource:
         known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
         self.n, self.angles = n, angles[:n]
+        seconds = self._seconds(places.detector, "count_time")
+        self.exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
         return n
 
     @property
@@ -106,9 +108,8 @@ class NXtomoSource:
             number = hdf5.scalar(entry, where, units)
             if number is not None:
                 said[name] = number
-        exposures = self._seconds(self._places.detector, "count_time")
-        if "exposure_s" not in said and np.isfinite(exposures).any():
-            said["exposure_s"] = float(np.nanmedian(exposures))
+        if "exposure_s" not in said and np.isfinite(self.exposures).any():
+            said["exposure_s"] = float(np.nanmedian(self.exposures))
         position = hdf5.dataset(self._places.detector, "x_rotation_axis_pixel_position")
         if position is not None:
             said["x_rotation_axis_pixel_position"] = f"{position[()]} (not used: its origin is not defined)"
@@ -134,7 +135,6 @@ class NXtomoSource:
     def frames(self) -> Iterator[Frame]:
         """The frames one after the other, with all that the file knows about each."""
         require_counts(self)
-        exposure = self._seconds(self._places.detector, "count_time")
         time = self._seconds(self._places.entry, "frame_log/time")
         trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
         framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
@@ -147,7 +147,7 @@ class NXtomoSource:
                 framestamp=int(framestamp[i]),
                 angle=float(self.angles[i]),
                 time=float(time[i]),
-                exposure=float(exposure[i]),
+                exposure=float(self.exposures[i]),
             )
 
     def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
@@ -166,7 +166,9 @@ class NXtomoSource:
         if self._ours:
             item.refresh()
         values = np.ravel(item[()]).astype(np.float64) * factor
-        return np.broadcast_to(values, self.n) if values.size == 1 else values[: self.n]
+        if values.size == 1:
+            return np.full(self.n, values[0])
+        return values[: self.n] if values.size >= self.n else np.full(self.n, np.nan)
 
     def close(self) -> None:
         self._file.close()

@@ -91,6 +91,11 @@ class Overlay:
         )
 
     @property
+    def exposures(self) -> NDArray[np.float64]:
+        """References that are laid over come without an exposure."""
+        return np.concatenate([np.full(len(self._front), np.nan), self._base.exposures])
+
+    @property
     def pixel_size_mm(self) -> float | None:
         return self._base.pixel_size_mm
 

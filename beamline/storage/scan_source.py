@@ -30,6 +30,7 @@ class ScanSource(Protocol):
         quantity: what a pixel is. "unknown" where the file does not say and the caller did not.
         image_key: int32 [frame], values of drivers.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
+        exposures: float64 [frame] s, NaN where unknown.
         pixel_size_mm: at the sample.
         axis_col: rotation axis in 0-based pixel-centre columns.
         attributes: whatever else the file says, for the record.
@@ -50,6 +51,8 @@ class ScanSource(Protocol):
     def image_key(self) -> NDArray[np.int32]: ...
     @property
     def angles(self) -> NDArray[np.float64]: ...
+    @property
+    def exposures(self) -> NDArray[np.float64]: ...
     @property
     def pixel_size_mm(self) -> float | None: ...
     @property
@@ -103,12 +106,21 @@ def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def bare_frames(source: ScanSource) -> Iterator[Frame]:
-    """Frames of a source that knows no more than kinds and angles: no framestamps, times or exposures."""
+    """Frames of a source that knows no more than ScanSource tells: no framestamps and no times."""
     require_counts(source)
-    keys, angles = source.image_key, source.angles
+    keys, angles, exposures = source.image_key, source.angles, source.exposures
     triggers = count_in_blocks(keys)
     for i, key in enumerate(keys):
-        yield Frame(source.read([i])[0], FrameKind(int(key)), i, int(triggers[i]), -1, float(angles[i]), np.nan, np.nan)
+        yield Frame(
+            counts=source.read([i])[0],
+            kind=FrameKind(int(key)),
+            index=i,
+            trigger=int(triggers[i]),
+            framestamp=-1,
+            angle=float(angles[i]),
+            time=np.nan,
+            exposure=float(exposures[i]),
+        )
 
 
 def require_counts(source: ScanSource) -> None:

@@ -77,6 +77,7 @@ class TiffStack:
             raise DataError(f"{path} cannot be read whole: it is cut or damaged ({complaints.said[0]}).")
         self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
         self.angles = np.full(n, np.nan)
+        self.exposures = np.full(n, np.nan)
         self.attributes: dict[str, str | float | int] = {
             "pages": len(self._tif.pages),
             "bigtiff": "yes" if self._tif.is_bigtiff else "no",
@@ -165,6 +166,7 @@ class TiffSeries:
             self._files = order + series
             self.image_key = np.array([kinds[name] for name in self._files], np.int32)
             self.angles = np.full(len(self._files), np.nan)
+            self.exposures = np.full(len(self._files), np.nan)
             samples = [self._image(name) for name in (*order, series[0])]
             self.shape: tuple[int, int] = samples[-1].shape[0], samples[-1].shape[1]
             self.dtype: np.dtype[Any] = np.result_type(*(image.dtype for image in samples))

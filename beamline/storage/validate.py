@@ -24,6 +24,7 @@ from drivers.frame import FrameKind
 __all__ = ["Finding", "reconstruction_blockers", "source_findings", "validate"]
 
 SAMPLES = 4  # frames of a kind that are looked at
+EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 BEAM_SIGMA = 3.0  # a flat must stand this far above the dark, in noise of one dark pixel
 
 
@@ -148,6 +149,32 @@ def beam_present(source: ScanSource) -> Iterator[Finding]:
         )
 
 
+def exposures_agree(source: ScanSource) -> Iterator[Finding]:
+    """Darks are exposed as long as the projections, and the projections alike; flats may have an exposure of their own,
+    for their light is scaled to the projections'."""
+    exposures = source.exposures
+    views = exposures[(source.image_key == FrameKind.PROJECTION) & np.isfinite(exposures)]
+    if source.quantity != "counts" or views.size == 0:
+        return
+    usual = float(np.median(views))
+    if np.ptp(views) > EXPOSURE_TOLERANCE * usual:
+        yield Finding(
+            "warning",
+            "exposures",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; they are all corrected as if for "
+            f"{usual:g} s.",
+        )
+    darks = np.unique(exposures[(source.image_key == FrameKind.DARK) & np.isfinite(exposures)])
+    if (np.abs(darks - usual) > EXPOSURE_TOLERANCE * usual).any():
+        said = ", ".join(f"{dark:g}" for dark in darks[:4])
+        yield Finding(
+            "warning",
+            "exposures",
+            f"The darks were exposed for {said} s and the projections for {usual:g} s: hot pixels and dark current are "
+            "not the same. Take darks with the projections' exposure.",
+        )
+
+
 def pixels_measured(source: ScanSource) -> Iterator[Finding]:
     """Projections hold finite numbers that are not all the same."""
     views = _sample(source, FrameKind.PROJECTION)
@@ -187,6 +214,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     quantity_said,
     references_present,
     beam_present,
+    exposures_agree,
     pixels_measured,
     series_complete,
     scale_known,

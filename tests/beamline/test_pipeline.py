@@ -38,8 +38,15 @@ class ArraySource:
     attributes: dict[str, Any] = {}  # noqa: RUF012
     finished = True
 
-    def __init__(self, data: NDArray[Any], keys: list[int], angles: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        data: NDArray[Any],
+        keys: list[int],
+        angles: NDArray[np.float64],
+        exposures: NDArray[np.float64] | None = None,
+    ) -> None:
         self._data = data
+        self.exposures = np.full(len(data), np.nan) if exposures is None else exposures
         self.image_key, self.angles = np.array(keys, np.int32), angles
         self.shape, self.dtype = data.shape[1:], data.dtype
         self.was_read: list[tuple[list[int], int]] = []
@@ -178,6 +185,47 @@ def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
     source = ArraySource(data, [2, 1] + [0] * n + [1], angles)
     prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+
+
+def exposed(flats: list[float], dark: float = 0.1, views: float = 0.1) -> ArraySource:
+    """A dark, the flats, the views and the flats again, each with as much light as its exposure in s gives."""
+    n = SCAN.angles.size
+    light = [np.full((1, 4, 40), BEAM * seconds / 0.1) for seconds in flats]
+    images = [np.zeros((1, 4, 40)), *light, BEAM * views / 0.1 * np.exp(-SCAN.line_integrals()), *light]
+    keys = [2] + [1] * len(flats) + [0] * n + [1] * len(flats)
+    angles = np.full(len(keys), np.nan)
+    angles[np.array(keys) == 0] = SCAN.angles
+    exposures = np.array([dark, *flats, *[views] * n, *flats])
+    return ArraySource(DARK + np.concatenate(images), keys, angles, exposures)
+
+
+@pytest.mark.parametrize("flats", [[0.025], [0.3], [0.1, 0.02, 0.05]])
+@pytest.mark.parametrize("binning", [1, 2])
+def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(flats: list[float], binning: int) -> None:
+    """Without it every line integral would be off by log(flat exposure / view exposure)."""
+    selection = Selection(axis_col=20.7, correction=PLAIN, binning=binning)
+    prepared = prepare(exposed(flats), selection, pytest.fail)  # type: ignore[arg-type]
+    shape = (45, 4 // binning, binning, 40 // binning, binning)
+    expected = -np.log(np.exp(-SCAN.line_integrals()).reshape(shape).mean(axis=(2, 4)))
+    np.testing.assert_allclose(prepared.projections.data, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("unknown", ["flats", "views"])
+def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
+    source = exposed([0.1])
+    source.exposures[source.image_key == (1 if unknown == "flats" else 0)] = np.nan
+    source.exposures[source.image_key == (0 if unknown == "flats" else 1)] = 7.0
+    source.exposures[source.image_key == 2] = np.nan
+    prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
+
+
+def test_darks_of_another_exposure_are_told() -> None:
+    warnings: list[str] = []
+    selection = Selection(axis_col=20.7, correction=PLAIN)
+    prepare(exposed([0.1], dark=0.025), selection, warnings.append)  # type: ignore[arg-type]
+    assert len(warnings) == 1
+    assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warnings[0]
 
 
 def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:

@@ -19,12 +19,14 @@ from beamline.digest import FrameDigest
 from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
 from beamline.events import Event
 from beamline.ledger import LedgerError
+from beamline.pipeline import Selection, prepare
 from beamline.run import RunResult, State, create_run_folder, run_scan
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from beamline.storage.source import open_scan
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
+from recon.correct import CorrectionSettings
 from tests.beamline.fakes import COUNT, Faults, Instrument, decode
 
 SMALL = (
@@ -421,6 +423,31 @@ def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
         flats, darks = (source.read(np.flatnonzero(source.image_key == kind)).mean() for kind in (1, 2))
         assert flats > darks + 1000
+
+
+def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:
+    """A cylinder about the axis, Beer-Lambert without effects: 2 mu sqrt(r^2 - u^2) in each column, from every side."""
+    radius, attenuation, pitch = 0.05, 5.0, 4e-3
+    overrides = [
+        *SMALL,
+        "scan.mode=step",
+        "scan.flats.exposure_s=0.005",
+        "devices.camera.roi=[1148, 2028, 8, 40]",
+        f"optics.pixel_size_um={pitch * 1e3}",
+        "simulation.clock=virtual",
+        "simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.05, height: 9.0,"
+        " attenuation: 5.0}]}, beam: {photons_per_s: 3.0e+5}}",
+    ]
+    result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
+    assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
+    with open_scan(result.path) as source:
+        selection = Selection(axis_col=19.5, correction=CorrectionSettings(air="none"))
+        prepared = prepare(source, selection, pytest.fail)
+        assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
+    u = (np.arange(40) - 19.5) * pitch
+    expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))
+    # 14 000 counts in a flat of 5 ms, rounded to a half: 4e-5 of its light.
+    np.testing.assert_allclose(prepared.projections.data, np.broadcast_to(expected, (12, 8, 40)), atol=1e-4)
 
 
 @pytest.mark.parametrize("taken", [0, 1, 3])

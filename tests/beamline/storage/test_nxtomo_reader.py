@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -71,6 +72,23 @@ def test_what_the_file_says_about_the_scan(write: Write, frames: list[Frame]) ->
         assert source.attributes["sample"] == "battery"
         assert source.attributes["distance_mm"] == 100.0
         assert source.attributes["exposure_s"] == 0.05
+
+
+def test_each_frame_has_its_own_exposure(tmp_path: Path, write: Write, frames: list[Frame]) -> None:
+    own = [replace(frame, exposure=0.01 * (frame.index + 1)) for frame in frames]
+    with open_scan(write(own)) as source:
+        np.testing.assert_allclose(source.exposures, 0.01 * np.arange(1, 15))
+    with open_scan(tmp_path / "scan.h5", flats=np.ones((2, 12, 16), np.uint16)) as source:
+        np.testing.assert_allclose(source.exposures, [np.nan] * 2 + [frame.exposure for frame in own])
+    with open_scan(foreign(tmp_path / "ms.nxs")) as source:
+        np.testing.assert_allclose(source.exposures, np.full(6, 0.02))
+    for values, expected in (([20.0], [0.02] * 6), ([0, 0, 0, 20, 20, 20], [np.nan] * 3 + [0.02] * 3)):
+        with h5py.File(foreign(tmp_path / "f.nxs"), "r+") as file:
+            del file["entry1/tomo_entry/instrument/detector/count_time"]
+            file["entry1/tomo_entry/instrument/detector/count_time"] = values
+            file["entry1/tomo_entry/instrument/detector/count_time"].attrs["units"] = "ms"
+        with open_scan(tmp_path / "f.nxs") as source:
+            np.testing.assert_allclose(source.exposures, expected)
 
 
 def test_frames_come_in_the_order_asked_for(write: Write, frames: list[Frame]) -> None:

@@ -33,6 +33,23 @@ def test_a_good_scan_has_no_finding(write: Write, frames: list[Frame]) -> None:
     assert validate(write(frames)) == []
 
 
+def test_exposures_that_do_not_go_together_are_told(write: Write, frames: list[Frame]) -> None:
+    def told(seconds: dict[FrameKind, float], last: float = 0.05) -> list[str]:
+        changed = [replace(frame, exposure=seconds.get(frame.kind, 0.05)) for frame in frames]
+        changed[-1] = replace(changed[-1], exposure=last)
+        path = write(changed)
+        said = [finding.message for finding in validate(path) if finding.rule == "exposures"]
+        path.unlink()
+        return said
+
+    assert told({FrameKind.FLAT: 0.01}) == []
+    assert told({FrameKind.DARK: 0.05000001}) == []
+    (darks,) = told({FrameKind.DARK: 0.2})
+    assert "darks were exposed for 0.2 s and the projections for 0.05 s" in darks
+    (views,) = told({}, last=0.1)
+    assert "exposed for 0.05 to 0.1 s" in views
+
+
 def swap(file: h5py.File, path: str, values: object, **attributes: str) -> None:
     """Replace a dataset, also where NXdata links to it."""
     old = file[path]
