@@ -25,6 +25,7 @@ from recon.volume import Grid, Volume
 _NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _ROUND = 400.0  # steps over which the rates decay within a round
+_ROOM = 0.1  # of the first count that a round may add; the last one has what is left of the growth
 
 
 class StreamingFit:
@@ -62,7 +63,7 @@ class StreamingFit:
         self._angles: list[float] = []
         self._problem: fit.Problem | None = None
         self._state: fit.FitState | None = None
-        self._round_views, self._round_step = 0, 0
+        self._round_views, self._round_step, self._placed = 0, 0, 0
 
     @property
     def n_views(self) -> int:
@@ -106,8 +107,7 @@ class StreamingFit:
         """
         if not self._angles:
             raise ValueError("no view has arrived, there is nothing to finish")
-        if self._state is None or self._round_views < self.n_views:
-            self._begin_round(force=True)
+        self._begin_round(force=True)
         return self._advance(seconds, finishing=True, on_progress=on_progress)
 
     def snapshot(self) -> Volume:
@@ -168,6 +168,9 @@ class StreamingFit:
                 return
             self._place_first()
         assert self._state is not None
+        # Room is for what later views show: early ones span a narrow angle and would fill it with their streaks.
+        most = round(self._placed * fit.growth(self._settings))
+        self._state.limit = most if force else min(most, self._state.n + round(_ROOM * self._placed))
         self._round_views, self._round_step = self.n_views, self._state.step
         self._state.drawn = []  # draw from all views from now on
 
@@ -176,7 +179,8 @@ class StreamingFit:
         data = np.stack(self._data)
         placed = place(data, geometry, self._grid, self._count, self._rng)
         self._problem = fit.make_problem(data, geometry, self._grid, placed.density_unit, self._settings)
-        self._state = fit.init(placed, self._rng, fit.growth(self._settings))
+        self._state = fit.init(placed, self._rng)
+        self._placed = placed.n
         self._data = []  # the problem holds them from now on
 
 
