@@ -7,6 +7,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import asdict
+from queue import Full, Queue
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,12 +18,11 @@ from beamline.exposures import Emit
 from beamline.monitor import scan as monitor
 from beamline.monitor.flag import Flag, Level
 from beamline.plan import Timeline
-from beamline.ring import ConsumerFailed, ConsumerStalled, Policy, Ring
 from beamline.stop import StopRequest
 from drivers.frame import Frame
 
-RING_BYTES = 1_000_000_000
-RING_FRAMES = (4, 128)
+WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
+WAITING_FRAMES = (4, 128)  # at least and at most
 STALL = 60.0  # real s without a frame written, after which the disk is taken for dead
 SAY_EVERY = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
@@ -36,6 +36,8 @@ class Writer(Protocol):
 
 class Recorder:
     """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
+
+    Nothing is ever dropped: where the disk is behind, `put` waits.
 
     Args:
         stop_on_alarm: an alarm asks for a stop.
@@ -63,9 +65,9 @@ class Recorder:
         self._blind = False
         self.n_frames = 0
         self.flagged: Counter[str] = Counter()
-        low, high = RING_FRAMES
-        self._ring = Ring[Frame](min(max(RING_BYTES // timeline.frame_bytes, low), high))
-        self._reader = self._ring.reader(Policy.BLOCK)
+        self._failure: Exception | None = None
+        low, high = WAITING_FRAMES
+        self._waiting: Queue[Frame | None] = Queue(min(max(WAITING_BYTES // timeline.frame_bytes, low), high))
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -75,14 +77,8 @@ class Recorder:
         Raises:
             DataError: it could not be, or a frame before it could not be written.
         """
-        try:
-            self._ring.put(frame, timeout=STALL)
-        except ConsumerFailed as failed:
-            raise self._failure() from failed
-        except ConsumerStalled as error:
-            raise DataError(
-                f"The disk took no frame for {STALL:.0f} s. {self.n_frames} frames are in the file; check the disk."
-            ) from error
+        self._hand_over(frame)
+        self._heed_failure()
 
     def finish(self) -> None:
         """Wait until every frame that was put is written.
@@ -90,30 +86,48 @@ class Recorder:
         Raises:
             DataError: one could not be.
         """
-        self._ring.close()
+        self._hand_over(None)
         written = -1
         while self._thread.is_alive() and written != self.n_frames:
             written = self.n_frames
             self._thread.join(STALL)
         if self._thread.is_alive():
-            raise DataError(f"The disk took no frame for {STALL:.0f} s. {written} frames are in the file.")
-        if self._reader.failure is not None:
-            raise self._failure()
+            raise self._stalled()
+        self._heed_failure()
 
-    def _failure(self) -> BeamlineError:
-        cause = self._reader.failure
+    @property
+    def hangs(self) -> bool:
+        """A frame is still being written: after `finish`, a disk that does not answer."""
+        return self._thread.is_alive()
+
+    def _hand_over(self, item: Frame | None) -> None:
+        """A frame, or None as the last."""
+        try:
+            self._waiting.put(item, timeout=STALL)
+        except Full:
+            raise self._stalled() from None
+
+    def _stalled(self) -> DataError:
+        return DataError(
+            f"The disk took no frame for {STALL:g} s. {self.n_frames} frames are in the file; check the disk."
+        )
+
+    def _heed_failure(self) -> None:
+        cause = self._failure
         if isinstance(cause, BeamlineError):
-            return cause
-        error = DataError(f"A frame could not be written: {cause}. {self.n_frames} frames are in the file.")
-        error.__cause__ = cause
-        return error
+            raise cause
+        if cause is not None:
+            text = f"A frame could not be written: {cause}. {self.n_frames} frames are in the file."
+            raise DataError(text) from cause
 
     def _run(self) -> None:
-        try:
-            for frame in self._reader:
+        while (frame := self._waiting.get()) is not None:
+            if self._failure is not None:
+                continue  # frames after a failure are only taken, so that nobody waits for room
+            try:
                 self._record(frame)
-        except Exception as error:
-            self._reader.fail(error)
+            except Exception as error:
+                self._failure = error
 
     def _record(self, frame: Frame) -> None:
         found = digest(frame.counts, self._watch.context.saturation, self._preview_bin)

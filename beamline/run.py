@@ -172,7 +172,8 @@ class _Run:
         disk = _failure_of(recorder.finish)
         error = self._graver(error, disk)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
-        unfinished = _failure_of(lambda: writer.close(status, acquisition.missing))
+        # A write that does not return holds HDF5's lock: to close the file would be to wait for it.
+        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, acquisition.missing))
         error = self._graver(error, unfinished)
         for remark in writer.remarks:
             self.emit("warning", {"message": remark})

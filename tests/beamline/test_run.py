@@ -245,7 +245,7 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(module, "NXtomoWriter", Hanging)
     monkeypatch.setattr(recorder_module, "STALL", 0.05)
-    monkeypatch.setattr(recorder_module, "RING_FRAMES", (2, 2))
+    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))
     try:
         ran = Ran(tmp_path, Instrument())
     finally:
@@ -282,7 +282,7 @@ def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
 
 
 def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "RING_FRAMES", (2, 2))  # on a virtual clock the writer would be far behind
+    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))  # on a virtual clock the writer would be far behind
     ran = Ran(
         tmp_path, Instrument(Faults(repeats={9})), "monitor.on_alarm=stop", "scan.angles.views=60", "scan.period_s=0.1"
     )
