@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypedDict
 from uuid import uuid4
 
 import click
@@ -26,12 +26,22 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import DeviceError
 from drivers.manual import Ask, ManualSampleMover, ManualShutter
 from drivers.protocols import CameraSettings, CameraTiming, Devices, StageLimits, TriggerSource
-from drivers.stages.pm16c import PM16CStage, achievable_acceleration
+from drivers.stages.pm16c import PM16CStage, limits_of
 
 if TYPE_CHECKING:
     from recon.volume import Grid, Volume
     from simulators.camera import SimulatedOrcaQuest
     from simulators.scene import Scene
+
+
+class _StageFigures(TypedDict):
+    """As PM16CStage takes them: counts, rad/s, rad/s², rad."""
+
+    counts_per_turn: int
+    max_speed: float
+    acceleration: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True)
@@ -93,23 +103,15 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     if config.simulation is not None:
         _scene(config)
     try:
-        acceleration = achievable_acceleration(stage.counts_per_turn, math.radians(stage.acceleration_deg_s2))
+        limits = limits_of(**_figures(stage))
     except ValueError as error:
-        raise ConfigError(f"devices.stage.acceleration_deg_s2: {error}. Nothing was started.") from None
+        raise ConfigError(f"devices.stage: {error}. Nothing was started.") from None
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     link = config.devices.camera.link if isinstance(config.devices.camera, DcamOrca) else "usb3"
     try:
         timing = orca_quest.timing(settings, link)
     except ValueError as error:
         raise ConfigError(f"devices.camera: {error}. Nothing was started.") from None
-    limits = StageLimits(
-        counts_per_turn=stage.counts_per_turn,
-        max_speed=math.radians(stage.max_speed_deg_s),
-        acceleration=acceleration,
-        low=math.radians(stage.low_deg),
-        high=math.radians(stage.high_deg),
-        trigger_output=True,
-    )
     return limits, timing, lambda angle: round(angle * stage.counts_per_turn / (2 * math.pi))
 
 
@@ -133,7 +135,15 @@ def ask_operator(request: str) -> None:
             advice="Run it in a terminal, or configure a shutter and a sample mover that need no hand",
             state="What was acquired so far is in the file",
         )
-    click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ", err=True)
+    try:
+        click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ", err=True)
+    except click.Abort as error:  # the end of input
+        raise DeviceError(
+            "operator",
+            "the request was not confirmed",
+            request=request,
+            state="What was acquired so far is in the file",
+        ) from error
 
 
 def _instrument(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Devices:
@@ -183,16 +193,17 @@ def _scene(config: Config) -> Scene:
 
 
 def _stage(config: PM16CStageConfig, url: str, clock: Clock) -> PM16CStage:
-    return PM16CStage(
-        url,
-        channel=config.channel,
-        counts_per_turn=config.counts_per_turn,
-        clock=clock,
-        max_speed=math.radians(config.max_speed_deg_s),
-        acceleration=math.radians(config.acceleration_deg_s2),
-        low=math.radians(config.low_deg),
-        high=math.radians(config.high_deg),
-    )
+    return PM16CStage(url, channel=config.channel, clock=clock, **_figures(config))
+
+
+def _figures(config: PM16CStageConfig) -> _StageFigures:
+    return {
+        "counts_per_turn": config.counts_per_turn,
+        "max_speed": math.radians(config.max_speed_deg_s),
+        "acceleration": math.radians(config.acceleration_deg_s2),
+        "low": math.radians(config.low_deg),
+        "high": math.radians(config.high_deg),
+    }
 
 
 def _clock(kind: str | Speed) -> Clock:

@@ -12,7 +12,7 @@ import math
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import StageLimits, TriggerTrain
-from drivers.stages.pm16c_channel import PULSE_WIDTHS, RATES, ChannelStatus, PM16CChannel, steepest_code
+from drivers.stages.pm16c_channel import MAX_SPEED, PULSE_WIDTHS, RATES, ChannelStatus, PM16CChannel, steepest_code
 
 POLL = 0.02
 """s between looks at a moving stage."""
@@ -20,14 +20,21 @@ STOP_MARGIN = 2.0
 """s beyond the longest deceleration after which a stop has failed."""
 
 
-def achievable_acceleration(counts_per_turn: int, acceleration: float) -> float:
-    """The steepest acceleration (rad/s²) that the controller has and that is not above `acceleration`.
+def limits_of(counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float) -> StageLimits:
+    """What the controller makes of the figures configured for a stage (rad/s, rad/s², rad): its acceleration is the
+    steepest one that it has and that is not above `acceleration`.
 
     Raises:
-        ValueError: even its gentlest is above.
+        ValueError: a speed that it does not have, or even its gentlest acceleration is above.
     """
     radians = 2 * math.pi / counts_per_turn
-    return 1e6 / RATES[steepest_code(acceleration / radians)] * radians
+    fastest = round(max_speed / radians)
+    if not 1 <= fastest <= MAX_SPEED:
+        raise ValueError(
+            f"{math.degrees(max_speed):g} deg/s are {fastest} pulses/s, the controller gives 1 to {MAX_SPEED}"
+        )
+    acceleration = 1e6 / RATES[steepest_code(acceleration / radians)] * radians
+    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True)
 
 
 class PM16CStage:
@@ -69,17 +76,18 @@ class PM16CStage:
         if not 0 <= channel <= 15:
             raise DeviceRefused(name, f"there is no channel {channel}", expected="0 to 15", state="Nothing was sent")
         try:
-            acceleration = achievable_acceleration(counts_per_turn, acceleration)
+            self._limits = limits_of(counts_per_turn, max_speed, acceleration, low, high)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        self._limits = StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True)
         self._low, self._high = self.to_counts(low), self.to_counts(high)
         self._fastest = round(max_speed * counts_per_turn / (2 * math.pi))
         self._target: int | None = None
         self._closed = False
         self._channel = PM16CChannel(url, channel=channel, name=name, clock=clock, timeout=timeout, baudrate=baudrate)
         try:
-            self._version = self._channel.open(steepest_code(acceleration * counts_per_turn / (2 * math.pi)))
+            self._version = self._channel.open(
+                steepest_code(self._limits.acceleration * counts_per_turn / (2 * math.pi))
+            )
             self._check_own_limits()
         except DeviceError:
             self.close()

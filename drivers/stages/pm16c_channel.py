@@ -17,6 +17,8 @@ PROBE = Probe("STQ?", r"[RL][0-4]")
 STOPPED_NOTE = r"STOP[0-9A-F]"
 COUNT = r"([+-]\d{7,10})"
 STATUS = r"([RL])[0-9A-F]([PNS])(?:[0-9A-F]([0-9A-F]{2})|---)" + COUNT
+MAX_SPEED = 5_000_000
+"""pulses/s."""
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit"}
 PULSE_WIDTHS = {5: 1e-3, 4: 100e-6, 3: 10e-6, 2: 200e-9}
 """TMGM mode -> pulse width in s, the widest first."""

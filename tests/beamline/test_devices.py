@@ -201,7 +201,9 @@ def test_settings_that_a_device_would_refuse() -> None:
     for change, message in (
         ("devices.camera.roi=[0, 0, 30, 40]", "devices.camera: roi .* must be in steps of 4"),
         ("scan.exposure_s=1e-7", "devices.camera: exposure 1e-07 s lies outside"),
-        ("devices.stage.acceleration_deg_s2=0.001", "devices.stage.acceleration_deg_s2: .*gentl"),
+        ("devices.stage.acceleration_deg_s2=0.001", "devices.stage: .*gentl"),
+        ("devices.stage.max_speed_deg_s=5001", r"devices.stage: 5001 deg/s are 5001000 pulses/s, .* 1 to 5000000"),
+        ("devices.stage.max_speed_deg_s=0.0001", "devices.stage: 0.0001 deg/s are 0 pulses/s"),
     ):
         with pytest.raises(ConfigError, match=message):
             devices.describe(small(change))
@@ -269,6 +271,9 @@ def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         def isatty(self) -> bool:
             return True
 
+    monkeypatch.setattr(sys, "stdin", Terminal(""))
+    with pytest.raises(DeviceError, match="was not confirmed"):
+        devices.ask_operator("Open the beam shutter.")
     monkeypatch.setattr(sys, "stdin", Terminal("\n"))
     devices.ask_operator("Open the beam shutter.")
     captured = capsys.readouterr()

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
-from drivers.stages.pm16c import achievable_acceleration
+from drivers.stages.pm16c import limits_of
 from drivers.stages.pm16c_channel import RATES, steepest_code
 from tests.drivers.pm16c_rig import COUNTS, Rig
 from tests.drivers.stage_conformance import LONG, SPEED, StageBench, StageConformance
@@ -114,7 +114,10 @@ def test_the_steepest_code_not_above_an_acceleration(code: int) -> None:
 
 def test_the_acceleration_that_the_stage_names_is_the_one_that_it_has(rig: Rig) -> None:
     stage = rig.open()
-    assert stage.limits.acceleration == achievable_acceleration(COUNTS, math.radians(60)) <= math.radians(60)
+    assert stage.limits == limits_of(
+        COUNTS, stage.limits.max_speed, math.radians(60), stage.limits.low, stage.limits.high
+    )
+    assert 0.9 * math.radians(60) < stage.limits.acceleration <= math.radians(60)
     stage.start_move(math.radians(60), math.radians(30))
     begun = rig.clock.now()
     rig.clock.sleep(0.25)
