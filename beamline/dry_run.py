@@ -80,8 +80,16 @@ def refuse_violations(worked: Timeline) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk that holds `folder`, or will hold it once it is made."""
+    """Room on the disk that holds `folder`, or will hold it once it is made.
+
+    Raises:
+        ConfigError: a file stands in the way, or there is no such disk.
+    """
     folder = folder.absolute()
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
+    there = next((place for place in (folder, *folder.parents) if place.exists()), None)
+    if there is None or not there.is_dir():
+        problem = "no such disk" if there is None else f"a file at {there}"
+        raise ConfigError(
+            f"runs cannot go to {folder}: there is {problem}. Choose another folder; nothing was started."
+        )
+    return shutil.disk_usage(there).free

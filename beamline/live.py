@@ -93,6 +93,12 @@ class LiveReconstruction:
             return None
         return self._done
 
+    def close(self) -> None:
+        """End it where it still runs."""
+        if self._process is not None and self._process.poll() is None:
+            self._kill(self._process)
+            self._reader.join()
+
     def _kill(self, process: subprocess.Popen[str]) -> None:
         process.terminate()
         try:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,6 @@ EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
 class State(StrEnum):
     """What a run is doing, in this order; any but `done` may be followed by `failed`."""
 
-    IDLE = "idle"
     PREPARING = "preparing"
     ACQUIRING = "acquiring"
     STOPPING = "stopping"
@@ -93,7 +93,6 @@ def run_scan(
         stop: to end it from another thread or a signal handler.
         live: makes the command line of a live reconstruction; None: none.
         bench: connected devices, left open at the end; None: those that `config` names, opened and closed here.
-
         ask: puts a request to the operator, where the shutter or the sample is moved by hand.
 
     Raises:
@@ -123,15 +122,13 @@ def run_scan(
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
     """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
     stem = f"{time.strftime('%Y-%m-%dT%H-%M-%S', time.gmtime(seconds))}_{sample}"
-    folder, number = runs / stem, 1
-    while True:
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            number += 1
-            folder = runs / f"{stem}-{number}"
-        else:
-            return folder
+    runs.mkdir(parents=True, exist_ok=True)
+    for number in count(1):
+        folder = runs / (stem if number == 1 else f"{stem}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            break
+    return folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +160,17 @@ class _Run:
         command = None if live is None else live(path, self.folder / RECON)
         self.emit("run_started", self._facts(path))
         writer = self._writer(path)
+        with ExitStack() as ending:
+            follower = None
+            if command is not None:
+                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit)
+                ending.callback(follower.close)
+            return self._acquire_and_follow(writer, follower, release)
+
+    def _acquire_and_follow(
+        self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
+    ) -> RunResult:
         recorder = self._recorder(writer)
-        follower = None if command is None else LiveReconstruction(command, self.folder / RECON_LOG, self.emit)
         acquisition = self._acquisition()
         self._enter(State.ACQUIRING)
         error = _failure_of(lambda: _acquire(acquisition, recorder))
@@ -177,14 +183,14 @@ class _Run:
         error = self._graver(error, unfinished)
         for remark in writer.remarks:
             self.emit("warning", {"message": remark})
-        release()
+        error = self._graver(error, _failure_of(release))
         result = RunResult(
-            path=path,
+            path=writer.path,
             n_frames=writer.committed,
             missing=tuple(acquisition.missing),
             flags=dict(recorder.flagged),
             seconds=time.monotonic() - self.began,
-            bytes=path.stat().st_size,
+            bytes=writer.path.stat().st_size,
             recon=None,
         )
         self.emit("scan_done", {**asdict(result), "status": status})

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -19,6 +22,7 @@ from beamline.digest import FrameDigest
 from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
 from beamline.events import Event
 from beamline.ledger import LedgerError
+from beamline.live import LiveReconstruction
 from beamline.pipeline import Selection, prepare
 from beamline.run import RunResult, State, create_run_folder, run_scan
 from beamline.stop import ScanAborted, StopRequest
@@ -380,6 +384,42 @@ def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
     assert any("it was ended" in event.data["message"] for event in ran.of("warning"))
 
 
+def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[str]] = []
+
+    class Kept(LiveReconstruction):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            assert self._process is not None
+            started.append(self._process)
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(module, "LiveReconstruction", Kept)
+    monkeypatch.setattr(module, "Recorder", broken)
+    ran = Ran(tmp_path, Instrument(), live=script("import time; time.sleep(100)"))
+    assert isinstance(ran.error, ZeroDivisionError)
+    assert [process.poll() is None for process in started] == [False]
+
+
+def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise DeviceError("stage", "its port does not close")
+
+    bench = replace(Instrument().bench(), close=fail)
+    monkeypatch.setattr(module, "connect", lambda config, ask: bench)
+    events: list[Event] = []
+    with pytest.raises(DeviceError, match="does not close"):
+        run_scan(small(), tmp_path, [events.append])
+    done = [event.data for event in events if event.event == "scan_done"]
+    assert [(data["status"], data["n_frames"]) for data in done] == [("complete", 19)]
+
+
 def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path) -> None:
     stop = StopRequest()
     instrument = Instrument()
@@ -456,6 +496,17 @@ def test_a_folder_is_never_used_twice(tmp_path: Path, taken: int) -> None:
     assert len(set(made)) == taken + 1
     assert made[0].name == "2026-11-20T05-32-33_cell"
     assert all(folder.is_dir() for folder in made)
+
+
+@pytest.mark.parametrize("below", ["", "deeper/still"])
+def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> None:
+    (tmp_path / "runs").write_text("a file")
+    instrument = Instrument()
+    with pytest.raises(ConfigError, match="there is a file at"):
+        run_scan(small(), tmp_path / "runs" / below, bench=instrument.bench())
+    assert instrument.log == []
+    with pytest.raises(FileExistsError):
+        create_run_folder(tmp_path / "runs", "cell", 0.0)
 
 
 @pytest.mark.parametrize(
