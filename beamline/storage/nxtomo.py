@@ -70,16 +70,21 @@ class NXtomoWriter:
             ) from error
         except OSError as error:
             raise DataError(f"{self.path} cannot be created ({error}). Is its folder there and writable?") from error
-        layout.create(
-            self._file,
-            info,
-            self._shape,
-            np.dtype("<u2"),
-            quantity="counts",
-            preview_bin=preview_bin,
-            start=clock.now(),
-        )
-        self._file.swmr_mode = True  # from here on nothing may be created: Rows holds datasets and can only grow them
+        try:
+            layout.create(
+                self._file,
+                info,
+                self._shape,
+                np.dtype("<u2"),
+                quantity="counts",
+                preview_bin=preview_bin,
+                start=clock.now(),
+            )
+            self._file.swmr_mode = True  # from here on nothing may be created: Rows can only grow what it holds
+        except BaseException:  # without a frame in it, it is no use to anybody
+            self._file.close()
+            self.path.unlink()
+            raise
         self._table = layout.Rows(self._file)
         self._progress = self._file[layout.COMMITTED]
 

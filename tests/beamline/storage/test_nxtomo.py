@@ -95,6 +95,14 @@ def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: StandingCl
     writer.close()
 
 
+def test_a_file_that_cannot_be_laid_out_is_not_left_half_made(tmp_path: Path, clock: StandingClock) -> None:
+    info = replace(INFO, devices={"stage": {"model": object()}})  # type: ignore[dict-item]
+    with pytest.raises(TypeError):
+        NXtomoWriter(tmp_path / "s.h5", info, SHAPE, clock=clock)
+    assert list(tmp_path.iterdir()) == []
+    NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock).close()
+
+
 def test_digest_and_preview_are_stored_beside_the_frame(write: Write, frames: list[Frame]) -> None:
     with h5py.File(write(frames)) as file:
         for i, frame in enumerate(frames):
