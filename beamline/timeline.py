@@ -31,8 +31,8 @@ def work_out(
     Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, rounded to whole
     counts a second (the views' block has the period that comes of it); it starts far enough before the first pulse to
     reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return
-    at full speed between them. The duration counts from the moment the stage stands at its zero to its return to the
-    first view, without shutter and sample moves.
+    at full speed between them. The duration is that of a stage that stands at its zero and goes back there at the end,
+    without shutter and sample moves.
 
     Args:
         to_counts: the stage's conversion of radians to whole counts.
@@ -176,7 +176,7 @@ def _reach(views: Block, scale: Scale) -> tuple[float, float]:
 
 def _return(views: Block, stage: StageLimits) -> float:
     last = pass_ends(views)[-1][1] if views.trains else float(views.angles[-1])
-    return move_seconds(float(views.angles[0]) - last, stage.max_speed, stage.acceleration)
+    return move_seconds(last, stage.max_speed, stage.acceleration)
 
 
 def describe(

@@ -74,23 +74,18 @@ class TrapezoidMove:
         return (self.target > self.start) - (self.target < self.start)
 
     def position(self, time: float) -> float:
-        seconds = time - self.begin
-        if seconds <= 0:
-            return self.start
-        phase = self._phase(seconds)
+        phase = self._phase(time)
         if phase is None:
-            return self.target
+            return self.start if time < self.begin else self.target
         low, high = sorted((self.start, self.target))
-        return min(max(phase.position_after(seconds - phase.begin), low), high)
+        return min(max(phase.position_after(time - self.begin - phase.begin), low), high)
 
     def velocity(self, time: float) -> float:
-        seconds = time - self.begin
-        phase = self._phase(seconds) if seconds >= 0 else None
-        return 0.0 if phase is None else phase.velocity_after(seconds - phase.begin)
+        phase = self._phase(time)
+        return 0.0 if phase is None else phase.velocity_after(time - self.begin - phase.begin)
 
     def acceleration(self, time: float) -> float:
-        seconds = time - self.begin
-        phase = self._phase(seconds) if seconds >= 0 else None
+        phase = self._phase(time)
         return 0.0 if phase is None else phase.acceleration
 
     def time_at(self, position: float) -> float:
@@ -126,9 +121,11 @@ class TrapezoidMove:
         """
         return TrapezoidMove(self.begin, self.start, position, self._until(self.time_at(position)))
 
-    def _phase(self, seconds: float) -> Phase | None:
-        """The phase at `seconds` after the beginning; None once it stands."""
-        return next((phase for phase in self.phases if seconds < phase.end), None)
+    def _phase(self, time: float) -> Phase | None:
+        """The phase at `time`; None while it stands: before, and from `end` on as that number is rounded."""
+        if not self.begin <= time < self.end:
+            return None
+        return next((phase for phase in self.phases if time - self.begin < phase.end), None)
 
     def _until(self, time: float) -> tuple[Phase, ...]:
         seconds = time - self.begin

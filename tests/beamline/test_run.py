@@ -18,6 +18,7 @@ import pytest
 from beamline import recorder as recorder_module
 from beamline import run as module
 from beamline.config import Config, config_folder, load
+from beamline.devices import connect
 from beamline.digest import FrameDigest
 from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
 from beamline.events import Event
@@ -463,6 +464,23 @@ def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
         flats, darks = (source.read(np.flatnonzero(source.image_key == kind)).mean() for kind in (1, 2))
         assert flats > darks + 1000
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_the_duration_foretold_is_what_it_takes(tmp_path: Path, mode: str) -> None:
+    """From the stage's zero through a quarter turn away from it and back, with darks and flats at both ends."""
+    angles = "scan.angles={scheme: sector, views: 12, first_deg: 200, last_deg: 290}"
+    overrides = [*SMALL, f"scan.mode={mode}", angles, "simulation.clock=virtual", "scan.darks.at=both"]
+    overrides += ["devices.camera.roi=[1148, 2028, 8, 40]", "scan.flats.exposure_s=0.5"]
+    config = load(config_folder() / "simulated.yaml", overrides, environment={})
+    with connect(config) as bench:
+        began = bench.clock.now()
+        events: list[Event] = []
+        run_scan(config, tmp_path, [events.append], bench=bench)
+        seconds = bench.clock.now() - began
+        assert bench.devices.stage.position() == 0.0
+    foretold = next(event.data["duration"] for event in events if event.event == "run_started")
+    assert foretold == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
 
 
 def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:

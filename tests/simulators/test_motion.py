@@ -52,6 +52,16 @@ def test_it_starts_at_the_start_ends_at_the_target_and_never_turns_back(move: Tr
     assert np.all(np.diff(path) * (move.direction or 1) >= -1e-6)
 
 
+@given(POSITIONS, POSITIONS, SPEEDS, ACCELERATIONS, st.floats(1.7e9, 1.9e9))
+def test_it_stands_at_the_target_from_the_very_end_on_though_epoch_seconds_are_coarse(
+    a: float, b: float, speed: float, accel: float, begin: float
+) -> None:
+    move = TrapezoidMove.between(a, b, speed, accel, begin)
+    assert (move.position(move.end), move.velocity(move.end), move.acceleration(move.end)) == (b, 0.0, 0.0)
+    stopped = move.braked(begin + 0.3 * move.duration, accel)
+    assert stopped.position(stopped.end) == stopped.target
+
+
 @given(POSITIONS, POSITIONS, SPEEDS, ACCELERATIONS, FRACTIONS)
 def test_neither_speed_nor_acceleration_is_exceeded(a: float, b: float, speed: float, accel: float, at: float) -> None:
     move = TrapezoidMove.between(a, b, speed, accel, begin=0.0)
