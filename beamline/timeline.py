@@ -118,11 +118,11 @@ def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle
             seconds += move_seconds(stop - start, block.speed, stage.acceleration)
             at = stop
         return seconds + tail
-    for angle in block.angles:
-        move = move_seconds(float(angle) - at, stage.max_speed, stage.acceleration)
-        seconds += max(block.period, move + settle + camera.min_period)
-        at = float(angle)
-    return seconds
+    for i, angle in enumerate(block.angles.tolist()):
+        ready = move_seconds(angle - at, stage.max_speed, stage.acceleration) + settle
+        seconds += max(block.period, camera.min_period, tail + ready) if i else ready
+        at = angle
+    return seconds + tail
 
 
 def _blocks(
