@@ -80,6 +80,8 @@ class Acquisition:
         try:
             yield from self._blocks()
             calm = True
+        except ScanAborted as aborted:
+            raise ScanAborted(f"{aborted}{self._unbalanced()}") from None
         except GeneratorExit:  # the caller gave up; the devices are well
             calm = True
             raise
@@ -168,24 +170,25 @@ class Acquisition:
     def _verdict(self) -> None:
         views = sum(done.taken.frames for done in self._done if done.block.kind is FrameKind.PROJECTION)
         planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
-        unbalanced = [done for done in self._done if done.taken.missing or done.taken.extra]
         if self._stop.aborting:
-            raise ScanAborted(f"Aborted: {self._stop.reason}.")
+            raise ScanAborted(f"Aborted: {self._stop.reason}.{self._unbalanced()}")
         if self._stop.stopping:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before anything was acquired: {self._stop.reason}.")
-            lost = "".join(f" {_account(done)}" for done in unbalanced)
             raise ScanStopped(
                 f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file is complete as far as "
-                f"it goes.{lost}"
+                f"it goes.{self._unbalanced()}"
             )
-        if unbalanced:
+        if unbalanced := self._unbalanced():
             raise LedgerError(
-                " ".join(_account(done) for done in unbalanced)
-                + " Every other frame is in the file with its own angle. Repeat these views, or reconstruct without "
-                "them; a longer period_s leaves the camera more time.",
+                f"{unbalanced.strip()} Every other frame is in the file with its own angle. Repeat these views, or "
+                "reconstruct without them; a longer period_s leaves the camera more time.",
                 self.missing,
             )
+
+    def _unbalanced(self) -> str:
+        """What is missing, extra or doubtful so far, a sentence after another, each after a space."""
+        return "".join(f" {text}" for done in self._done if (text := _account(done)))
 
 
 def _account(done: Done) -> str:

@@ -49,17 +49,13 @@ class Taken:
     extra: int = 0
     shift: int = 0
 
-    def enter(self, account: Account, first: int, cut_short: bool, last: int) -> None:
-        """Add a pass that began at trigger `first`.
-
-        Where it was cut short, triggers beyond the `last` one seen were not waited for: they were not taken, rather
-        than missed.
-        """
-        self.missing += [first + i for i in account.missing if not (cut_short and i > last)]
+    def enter(self, account: Account, first: int) -> None:
+        """Add a pass that began at trigger `first`."""
+        self.missing += [first + i for i in account.missing]
         self.lost += account.lost
         self.ignored += account.ignored
         self.extra += len(account.extra)
-        self.shift = max(self.shift, 0 if cut_short else account.shift)
+        self.shift = max(self.shift, account.shift)
 
 
 @dataclass
@@ -154,7 +150,7 @@ class Exposures:
                 yield from self._until_standing(block, flight)
                 cut_short = self._stop.stopping
             finally:
-                taken.enter(settle(flight.ledger), first, cut_short, flight.ledger.last)
+                taken.enter(settle(flight.ledger, cut_short), first)
             self._stage.disarm()
             self._camera.disarm()
             if flight.ledger.last < 0 and not self._stop.stopping:

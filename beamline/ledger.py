@@ -105,10 +105,9 @@ class Ledger:
 
 @dataclass(frozen=True)
 class Account:
-    """A settled ledger: it balances when every trigger has its frame and no frame is without a trigger.
+    """A settled ledger: nothing is missing or extra where every trigger has its frame and every frame its trigger.
 
     Attributes:
-        triggers: expected.
         missing: triggers without a frame, ascending.
         lost: of these, exposed but not delivered (framestamp gap).
         ignored: of these, not exposed (time gap). The remaining ones came after the last frame, and nobody can tell.
@@ -117,16 +116,11 @@ class Account:
             missing at the other; 0 where nothing is missing there or the time of the first trigger was known.
     """
 
-    triggers: int
     missing: tuple[int, ...]
     lost: int
     ignored: int
     extra: tuple[int, ...]
     shift: int
-
-    @property
-    def balanced(self) -> bool:
-        return not self.missing and not self.extra
 
 
 def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
@@ -177,16 +171,19 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
     return matched, Entry(trigger, float(train.angles[trigger]))
 
 
-def settle(ledger: Ledger) -> Account:
-    """Close the account: every trigger after the last frame is missing."""
-    at_the_end = range(ledger.last + 1, ledger.train.n)
+def settle(ledger: Ledger, cut_short: bool = False) -> Account:
+    """Close the account: every trigger after the last frame is missing.
+
+    Args:
+        cut_short: triggers after the last frame were not waited for: they were not taken, rather than missed.
+    """
+    at_the_end = range(0 if cut_short else ledger.last + 1, 0 if cut_short else ledger.train.n)
     return Account(
-        triggers=ledger.train.n,
         missing=(*ledger.missing, *at_the_end),
         lost=ledger.lost,
         ignored=ledger.ignored,
         extra=ledger.extra,
-        shift=_shift(ledger, len(at_the_end)),
+        shift=_shift(ledger, None if cut_short else len(at_the_end)),
     )
 
 
@@ -221,12 +218,19 @@ def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int
     return position, trigger, max(0.0, abs(position - trigger) - train.tolerance / train.period)
 
 
-def _shift(ledger: Ledger, at_the_end: int) -> int:
-    """The largest shift of all angles that the time of the first frame allows."""
+def _shift(ledger: Ledger, at_the_end: int | None) -> int:
+    """The largest shift of all angles that the time of the first frame allows.
+
+    Args:
+        at_the_end: triggers without a frame there; None where it is not known, and only as many count as the first
+            frame's time speaks for.
+    """
     if ledger.last < 0:
         return 0
     framestamp, trigger, position = ledger.first
     window = _window(ledger.train)
+    if at_the_end is None:
+        at_the_end = max(0, round(position - trigger))
     shifts = range(framestamp - trigger, at_the_end + 1)
     if math.isinf(window):
         return max((abs(j) for j in shifts), default=0)

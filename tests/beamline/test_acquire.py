@@ -171,6 +171,18 @@ def test_where_the_start_is_too_vague_the_error_says_how_far_the_angles_may_be_o
     assert "may all be wrong by up to 1 steps" in str(run.error)
 
 
+@pytest.mark.parametrize("abort", [False, True])
+def test_a_scan_cut_short_says_that_its_first_frame_came_a_trigger_late(abort: bool) -> None:
+    """The start is as vague as above, and nothing but that frame's time tells that the first trigger was ignored."""
+    stop = StopRequest()
+    wish = stop.abort if abort else stop.stop
+    bench = Instrument(Faults(ignored={5}), on_frame=lambda number: wish() if number == 40 else None)
+    bench.stage.limits = replace(bench.stage.limits, acceleration=np.radians(60).item())
+    run = Run(bench, bench.timeline(n=140, speed=55), stop)
+    assert type(run.error) is (ScanAborted if abort else ScanStopped)
+    assert "may all be wrong by up to 1 steps" in str(run.error)
+
+
 def test_frames_that_no_trigger_made_become_invalid_rows() -> None:
     bench = Instrument(Faults(extra_after={9, 16}))
     run = Run(bench, bench.timeline(n=12))
