@@ -122,13 +122,17 @@ def _choices(branch: Schema) -> list[Any]:
     return branch.get("enum", [branch["const"]] if "const" in branch else [])
 
 
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
 def _words(branch: Schema) -> str:
     """What a value that is not one of a few choices may be."""
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"
         bounds = [("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<=")]
-        limits = [f"{sign} {branch[name]:g}" for name, sign in bounds if name in branch]
+        limits = [f"{sign} {_number(branch[name])}" for name, sign in bounds if name in branch]
         return " ".join([text, " and ".join(limits)]).strip()
     if kind == "array":
         return f"a list of {branch.get('minItems')}: {branch.get('description')}"

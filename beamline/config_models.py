@@ -30,11 +30,14 @@ class Sample(Section):
     description: str = ""
 
 
+Views = Annotated[int, Field(gt=0, le=1_000_000)]
+
+
 class FixedAngles(Section):
     """Equal steps from start_deg over span_deg; the end itself is excluded (180 views over 180 deg: 0 ... 179)."""
 
     scheme: Literal["fixed"]
-    views: PositiveInt
+    views: Views
     start_deg: FiniteFloat = 0.0
     span_deg: FiniteFloat = 180.0
 
@@ -43,7 +46,7 @@ class SectorAngles(Section):
     """Equal steps from first_deg to last_deg, both included (a limited-angle scan)."""
 
     scheme: Literal["sector"]
-    views: PositiveInt
+    views: Views
     first_deg: FiniteFloat
     last_deg: FiniteFloat
 
@@ -52,7 +55,7 @@ class RandomAngles(Section):
     """Uniformly random over span_deg, sorted; step scans only."""
 
     scheme: Literal["random"]
-    views: PositiveInt
+    views: Views
     start_deg: FiniteFloat = 0.0
     span_deg: FiniteFloat = 180.0
     seed: int = 0
@@ -62,7 +65,7 @@ class InterlacedAngles(Section):
     """The fixed angles taken in several passes, each pass in the gaps that the earlier ones left."""
 
     scheme: Literal["interlaced"]
-    views: PositiveInt
+    views: Views
     passes: PositiveInt
     start_deg: FiniteFloat = 0.0
     span_deg: FiniteFloat = 180.0
@@ -72,7 +75,7 @@ class GoldenAngles(Section):
     """Golden-ratio steps modulo span_deg: well spread after any number of views; step scans only."""
 
     scheme: Literal["golden"]
-    views: PositiveInt
+    views: Views
     start_deg: FiniteFloat = 0.0
     span_deg: FiniteFloat = 180.0
 
@@ -94,7 +97,7 @@ Angles = Annotated[
 class Fields(Section):
     """Darks or flats: how many at each place, and their own exposure (null: the scan's)."""
 
-    count: Annotated[int, Field(ge=0)] = 10
+    count: Annotated[int, Field(ge=0, le=1_000_000)] = 10
     at: Place = Place.START
     exposure_s: PositiveFloat | None = None
 

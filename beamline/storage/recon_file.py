@@ -66,6 +66,9 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     Args:
         path: the file to make. Without `replace` it must not exist.
         replace: put it in place of an older one, in one step; a reader sees either the old or the new file, whole.
+
+    Raises:
+        DataError: `path` is in the way, or the system does not let it be replaced.
     """
     if not replace:
         refuse_existing(path)
@@ -74,7 +77,10 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         yield partial
         if not replace:
             refuse_existing(path)
-        partial.replace(path)
+        try:
+            partial.replace(path)
+        except OSError as error:  # Windows replaces no file that another program holds open
+            raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
     finally:
         partial.unlink(missing_ok=True)
 

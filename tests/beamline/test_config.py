@@ -165,6 +165,10 @@ FAULTS = {
     "not a number": (("exposure_s: 0.01", "exposure_s: short"), "scan.exposure_s is 'short'; expected a number > 0"),
     "truth": (("views: 12", "views: yes"), "my.yaml:3: scan.angles: views is true (YAML reads yes, no, on and off"),
     "fraction": (("views: 12", "views: 12.5"), "scan.angles.views is 12.5; expected a whole number > 0"),
+    "views without end": (
+        ("views: 12", "views: 1000000000"),
+        "my.yaml:3: scan.angles.views is 1000000000; expected a whole number > 0 and <= 1000000",
+    ),
     "list": (
         ("[0, 0, 8, 8]", "[0, 0, 8]"),
         "my.yaml:8: devices.camera.roi is [0, 0, 8]; expected a list of 4: row0, col0",

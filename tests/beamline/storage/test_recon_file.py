@@ -106,6 +106,23 @@ def test_replaces_in_one_step_when_asked(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_file_that_the_system_does_not_let_go_of_is_left_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows, where nothing replaces a file that a viewer holds open."""
+    path = tmp_path / "snapshot.h5"
+    write_reconstruction(path, _record())
+
+    def held(self: Path, target: Path) -> Path:
+        raise PermissionError(13, "it is being used by another process")
+
+    monkeypatch.setattr(Path, "replace", held)
+    with pytest.raises(DataError, match=r"another process.*untouched"):
+        write_reconstruction(path, replace(_record(), title="newer"), replace=True)
+    assert read_reconstruction(path).title == _record().title
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(entry: h5py.Group, record: ReconRecord) -> None:
         entry["definition"] = "NXtomoproc"
