@@ -25,6 +25,7 @@ class Facts:
     flight: Flight | None
     stage: StageLimits
     camera: CameraTiming
+    axis_col: float | None
     reach: tuple[float, float]
     blur_px: float
     skew_px: float
@@ -41,6 +42,12 @@ def violations(facts: Facts) -> Iterator[str]:
         if not facts.stage.trigger_output:
             yield "the stage has no trigger output, which a fly scan needs; use scan.mode: step"
     yield from _limits(facts)
+    cols = facts.camera.shape[1]
+    if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
+        yield (
+            f"optics.axis_col {facts.axis_col:g} lies outside the frame's columns 0 ... {cols - 1}; it counts the columns "
+            "of the region that is read, after binning"
+        )
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
             yield f"no {name}: scan.{name}.count is 0; take at least one, or say at: none where that is meant"
@@ -83,8 +90,8 @@ def remarks(facts: Facts) -> Iterator[str]:
             f"{plan.angles.size} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: "
             "filtered back-projection will show streaks towards the edge"
         )
-    for name, field in (("flats", plan.flats), ("darks", plan.darks)):
-        yield from _reference(name, field, plan.exposure)
+    yield from _reference("flats", plan.flats, plan.exposure, "their light will be scaled")
+    yield from _reference("darks", plan.darks, plan.exposure, "their hot pixels and dark current are not the views'")
 
 
 def _timing(facts: Facts) -> Iterator[str]:
@@ -142,11 +149,11 @@ def _rounding(facts: Facts) -> Iterator[str]:
     )
 
 
-def _reference(name: str, field: FieldPlan, exposure: float) -> Iterator[str]:
+def _reference(name: str, field: FieldPlan, exposure: float, otherwise: str) -> Iterator[str]:
     if field.at is Place.NONE:
         yield f"no {name} will be taken (scan.{name}.at: none)"
     elif field.exposure != exposure:
-        yield f"{name} are exposed for {field.exposure:g} s and views for {exposure:g} s"
+        yield f"{name} are exposed for {field.exposure:g} s and views for {exposure:g} s; {otherwise}"
 
 
 def _up(seconds: float) -> float:

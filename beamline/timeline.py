@@ -58,6 +58,7 @@ def work_out(
         flight=flight,
         stage=stage,
         camera=camera,
+        axis_col=axis_col,
         reach=_reach(views, scale),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),

@@ -232,6 +232,13 @@ def test_no_trigger_output_and_no_room() -> None:
     assert worked(free_bytes=33_000_000).violations == ()
 
 
+@pytest.mark.parametrize(("axis_col", "legal"), [(-0.5, True), (-0.6, False), (251.5, True), (251.6, False)])
+def test_an_axis_outside_the_frame_is_refused(axis_col: float, legal: bool) -> None:
+    violations = worked(axis_col=axis_col).violations
+    assert (violations == ()) is legal
+    assert legal or "lies outside the frame's columns 0 ... 251" in violations[0]
+
+
 REMARKS = {
     "rounding": (
         {"angles": angles.fixed(181), "period": 0.2},
@@ -246,7 +253,14 @@ REMARKS = {
     "few views": ({"angles": angles.fixed(180)}, "180 views are fewer than pi/2 x 252 columns = 396"),
     "no flats": ({"flats": FieldPlan(0, Place.NONE, 0.05)}, "no flats will be taken"),
     "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),
-    "exposure": ({"flats": FieldPlan(5, Place.END, 0.1)}, "flats are exposed for 0.1 s and views for 0.05 s"),
+    "exposure": (
+        {"flats": FieldPlan(5, Place.END, 0.1)},
+        "flats are exposed for 0.1 s and views for 0.05 s; their light",
+    ),
+    "darks' exposure": (
+        {"darks": FieldPlan(5, Place.END, 0.1)},
+        "darks are exposed for 0.1 s and views for 0.05 s; th",
+    ),
     "blur": ({"exposure": 0.09, "angles": angles.fixed(360, 0, 2 * math.pi)}, "motion blur is 1.98 px"),
 }
 
