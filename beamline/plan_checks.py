@@ -45,8 +45,8 @@ def violations(facts: Facts) -> Iterator[str]:
     cols = facts.camera.shape[1]
     if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
         yield (
-            f"optics.axis_col {facts.axis_col:g} lies outside the frame's columns 0 ... {cols - 1}; it counts the columns "
-            "of the region that is read, after binning"
+            f"optics.axis_col {facts.axis_col:g} lies outside the frame's columns 0 ... {cols - 1}; it counts "
+            "columns of the region that is read, after binning"
         )
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
