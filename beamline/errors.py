@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+
+from drivers.errors import DeviceError
+
 
 class BeamlineError(Exception):
     """A failure the operator can act on: what happened, what was expected, what to do, what is untouched."""
@@ -40,3 +44,25 @@ class QualityError(BeamlineError):
 
 
 INTERRUPTED = 130
+
+
+def exit_code(error: BaseException) -> int:
+    """The code that a command ends with for `error`; 1 is a defect, whose traceback is wanted."""
+    if isinstance(error, BeamlineError):
+        return error.exit_code
+    if isinstance(error, DeviceError):
+        return InstrumentError.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    # A closed pipe (`beamline info x | head`) is click's to handle; an OSError without a number is a defect.
+    if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
+        return DataError.exit_code
+    return BeamlineError.exit_code
+
+
+def in_words(error: BaseException) -> str:
+    """What the operator is told of `error`."""
+    if isinstance(error, OSError) and error.strerror:
+        where = "" if error.filename is None else f"{error.filename}: "
+        return f"{where}{error.strerror}. Check the path, the permissions and the disk."
+    return "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or repr(error)

@@ -15,7 +15,7 @@ from beamline.acquire import Acquisition
 from beamline.announce import Announcer
 from beamline.config import Config, resolved_yaml
 from beamline.devices import Bench, connect
-from beamline.errors import INTERRUPTED, BeamlineError, InstrumentError, ScanStopped
+from beamline.errors import ScanStopped, exit_code, in_words
 from beamline.events import JsonLines, Sink
 from beamline.exposures import Emit
 from beamline.ledger import LedgerError
@@ -26,7 +26,6 @@ from beamline.recorder import Recorder
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
-from drivers.errors import DeviceError
 from drivers.manual import Ask
 
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
@@ -148,8 +147,7 @@ class _Run:
             result = self._scan(live, release)
         except BaseException as error:
             self._enter(State.FAILED)
-            message = str(error) or repr(error)
-            self.emit("failed", {"message": message, "exit_code": exit_code(error), "folder": self.folder})
+            self.emit("failed", {"message": in_words(error), "exit_code": exit_code(error), "folder": self.folder})
             raise
         self._enter(State.DONE)
         self.emit("done", {**asdict(result), "folder": self.folder})
@@ -257,15 +255,6 @@ class _Run:
             "total_bytes": timeline.total_bytes,
             "remarks": timeline.remarks,
         }
-
-
-def exit_code(error: BaseException) -> int:
-    """The code that the command will end with."""
-    if isinstance(error, BeamlineError):
-        return error.exit_code
-    if isinstance(error, DeviceError):
-        return InstrumentError.exit_code
-    return INTERRUPTED if isinstance(error, KeyboardInterrupt) else BeamlineError.exit_code
 
 
 def _acquire(acquisition: Acquisition, recorder: Recorder) -> None:

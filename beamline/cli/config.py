@@ -17,7 +17,7 @@ def config() -> None:
     """Make, show and describe configurations."""
 
 
-@config.command()
+@config.command(short_help="Print a configuration to edit.")
 @click.option("--instrument", is_flag=True, help="For the real instrument instead of simulated devices.")
 def init(instrument: bool) -> None:
     """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
@@ -25,7 +25,7 @@ def init(instrument: bool) -> None:
     click.echo((config_folder() / name).read_text(encoding="utf-8"), nl=False)
 
 
-@config.command()
+@config.command(short_help="Print a configuration with everything filled in.")
 @click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=OVERRIDE_HELP)
 def show(file: Path, overrides: tuple[str, ...]) -> None:
@@ -33,7 +33,7 @@ def show(file: Path, overrides: tuple[str, ...]) -> None:
     click.echo(resolved_yaml(load(file, overrides)), nl=False)
 
 
-@config.command("schema")
+@config.command("schema", short_help="Print the JSON schema of a configuration.")
 def print_schema() -> None:
     """Print the JSON schema of a configuration, for editors that complete and check while one types."""
     click.echo(json.dumps(schema(), indent=2))

@@ -9,7 +9,8 @@ from pathlib import Path
 import click
 
 from beamline.cli.narrate import results
-from beamline.cli.scan import stop_signals, told_as_json
+from beamline.cli.scan import stop_signals
+from beamline.cli.told import told_as_json
 from beamline.config import config_folder, load
 from beamline.demo import run_demo
 from beamline.events import Event

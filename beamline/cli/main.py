@@ -6,16 +6,14 @@ Exit codes: 0 done; 1 defect (with a traceback); 2 usage or configuration; 3 dev
 
 from __future__ import annotations
 
-import errno
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
-from beamline.errors import INTERRUPTED, BeamlineError, DataError, InstrumentError
+from beamline.errors import BeamlineError, exit_code, in_words
 from beamline.version import version
-from drivers.errors import DeviceError
 
 
 @dataclass(frozen=True)
@@ -38,11 +36,6 @@ _COMMANDS = {
 }
 
 
-def _fail(ctx: click.Context, message: str, exit_code: int) -> NoReturn:
-    click.echo(f"beamline: {message}", err=True)
-    ctx.exit(exit_code)
-
-
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is used."""
 
@@ -63,17 +56,12 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
-        except BeamlineError as error:
-            _fail(ctx, str(error), error.exit_code)
-        except DeviceError as error:
-            _fail(ctx, str(error), InstrumentError.exit_code)
-        except KeyboardInterrupt:
-            _fail(ctx, "interrupted.", INTERRUPTED)
-        except OSError as error:
-            # A closed pipe (`beamline info x | head`) is click's to handle; an OSError without a number is a defect.
-            if error.errno is None or error.errno == errno.EPIPE:
-                raise
-            _fail(ctx, f"{error}. Check the path, the permissions and the disk.", DataError.exit_code)
+        except (Exception, KeyboardInterrupt) as error:
+            code = exit_code(error)
+            if code == BeamlineError.exit_code and not isinstance(error, BeamlineError):
+                raise  # a defect, or click's own
+            click.echo(f"beamline: {in_words(error)}", err=True)
+            ctx.exit(code)
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

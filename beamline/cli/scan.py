@@ -12,17 +12,16 @@ from types import FrameType
 import click
 
 from beamline.cli.config import OVERRIDE_HELP
+from beamline.cli.told import told_as_json
 from beamline.config import Config, load
 from beamline.devices import ask_operator
 from beamline.dry_run import dry_run, refuse_violations
-from beamline.errors import BeamlineError
-from beamline.events import Event, JsonLines, Sink
+from beamline.events import Event, Sink
 from beamline.live import LiveCommand, follow_command
-from beamline.run import RECON, RunResult, exit_code, run_scan
+from beamline.run import RECON, RunResult, run_scan
 from beamline.stop import StopRequest
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock
-from drivers.errors import DeviceError
 
 
 @click.command()
@@ -75,28 +74,6 @@ def _live(config: Config, no_live: bool) -> LiveCommand | None:
         )
         return None
     return follow_command(config)
-
-
-@contextmanager
-def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
-    """The sinks for stdout. With JSON its last line is `done` or `failed`, also where the run never began."""
-    if not wanted:
-        yield []
-        return
-    lines = JsonLines(sys.stdout)
-    last = ""
-
-    def remember(event: Event) -> None:
-        nonlocal last
-        last = event.event
-        lines(event)
-
-    try:
-        yield [remember]
-    except (BeamlineError, DeviceError) as error:
-        if last != "failed":
-            lines(Event("failed", SystemClock().now(), {"message": str(error), "exit_code": exit_code(error)}))
-        raise
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 
 from beamline import errors
 from beamline.cli import main as module
+from beamline.errors import in_words
 from drivers.errors import DeviceError, DeviceTimeout
 
 
@@ -56,7 +57,8 @@ def test_each_failure_has_its_code_and_one_sentence(
     assert result.stdout == ""
     assert result.stderr.strip()
     if str(error) and not isinstance(error, click.ClickException):
-        assert str(error) in result.stderr
+        assert in_words(error) in result.stderr
+        assert "Errno" not in result.stderr
 
 
 def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
