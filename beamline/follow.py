@@ -123,7 +123,7 @@ def _watch(growing: _Growing, clock: Clock, rhythm: Rhythm) -> None:
         if clock.now() - last_frame > rhythm.patience:
             raise DataError(
                 f"{growing.source.path} has not grown for {rhythm.patience:.0f} s and is not finished: the scan died. "
-                f"It holds {growing.n_views} views."
+                f"Run without --follow and with --unfinished to use the {growing.n_views} views that are there."
             )
         if not growing.advance(rhythm.slice):
             clock.sleep(rhythm.poll)
@@ -207,7 +207,13 @@ class _Growing:
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)
         template = geometry_of(self.source, self._options.selection, axis_col, np.zeros(1))
-        data = {"file": self.source.path, "method": "r2", "n_views": self.n_views, "axis_col": axis_col}
+        data = {
+            "file": self.source.path,
+            "method": "r2",
+            "n_views": self.n_views,
+            "axis_col": axis_col,
+            "again": bool(self._history),
+        }
         self._sink(Event("recon_started", self._clock.now(), data))
         options = self._options
         return StreamingFit(template, seed=options.seed, gaussians=options.gaussians, now=self._clock.now)
@@ -223,6 +229,8 @@ class _Growing:
         return True
 
     def _say(self, progress: Progress) -> None:
+        # A fit that begins anew counts from its own beginning; the history has one time, that of the snapshots.
+        progress = replace(progress, seconds=self._clock.now() - self._begin)
         self._history.append(progress)
         progress_events(self._sink, self._clock)(progress)
 

@@ -28,9 +28,11 @@ def sentence(event: Event) -> str | None:
         case "flag":
             return f"{str(data['level']).capitalize()} ({data['check']}, row {data['view']}): {data['advice']}"
         case "recon_started":
-            return "Live reconstruction started"
+            again = " again, from the start" if data.get("again") else ""
+            axis = f"rotation axis at column {data['axis_col']:.2f}"
+            return f"{data['method']}{again}: {data['n_views']} views, {axis}"
         case "snapshot":
-            return f"Volume from {data['n_views']} views: {data['path']}"
+            return f"Volume so far, from {data['n_views']} views: {data['path']}"
         case "scan_done":
             return (
                 f"Scan {data['status']}: {data['n_frames']} frames, {size(data['bytes'])}, {data['seconds']:.1f} s: "

@@ -61,6 +61,7 @@ class ReconOptions:
         filter: of the FBP.
         seed: of everything random.
         truth: FILE or FILE:first:end to compare with.
+        unfinished: take the frames that there are, where the scan still runs or died.
         command: that repeats this, for the record.
     """
 
@@ -74,6 +75,7 @@ class ReconOptions:
     filter: Filter = "ram-lak"
     seed: int = 0
     truth: str | None = None
+    unfinished: bool = False
     command: str = ""
 
 
@@ -102,7 +104,13 @@ def run(options: ReconOptions, sink: Sink, clock: Clock) -> dict[str, float]:
     warn = Warnings(sink, clock)
     with options.source.open() as source:
         if not source.finished:
-            raise DataError(f"{source.path} is still being written. Follow it with --follow, or wait for its end.")
+            n = source.image_key.size
+            if not options.unfinished:
+                raise DataError(
+                    f"{source.path} is still being written, or its scan died. Follow it with --follow, or take the {n} "
+                    "frames that are there with --unfinished."
+                )
+            warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
         facts = facts_of(source)
         prepared = prepare(source, options.selection, warn)
     grid = Grid.matching(prepared.geometry)

@@ -1,4 +1,4 @@
-"""Terminal: a scan's events for the operator: a bar where a terminal is, plain lines where there is none."""
+"""Terminal: events for the operator: a bar where a terminal is, plain lines where there is none."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ class Terminal:
         )
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, float] = {}
+        self._last_text = ""
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
 
@@ -70,7 +71,8 @@ class Terminal:
             self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
         elif event.event not in ("failed", "done"):  # the command has the last word
             text = sentence(event)
-            if text:
+            if text and text != self._last_text:  # a snapshot of the same views takes the place of the one before
+                self._last_text = text
                 self._console.print(text)
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
@@ -90,12 +92,22 @@ class Terminal:
 
 def rates(data: Mapping[str, Any]) -> str:
     """n/N, frames/s, MB/s and the time left, of a `frame` event."""
-    left = round(data["eta_s"])
-    eta = f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
-    return f"{data['n']}/{data['of']}  {data['frames_per_s']:.1f} frames/s  {data['mb_per_s']:.1f} MB/s  {eta} left"
+    speed = f"{data['frames_per_s']:.1f} frames/s  {data['mb_per_s']:.1f} MB/s"
+    return f"{data['n']}/{data['of']}  {speed}  {_clock_time(data['eta_s'])} left"
 
 
 def fit(data: Mapping[str, Any]) -> str:
-    """Views, Gaussians and residual, of a live reconstruction's `progress` event."""
-    residual = "" if data["residual"] is None else f", residual {data['residual']:.4f}"
-    return f"{data['n_views']} views, {data['n_gaussians']} Gaussians{residual}"
+    """Steps, views, Gaussians, residual and, where the end is known, the time left, of a fit's `progress` event."""
+    step, steps = data["step"], data["steps"]
+    parts = [f"{step}/{steps} steps"] if steps else []
+    parts += [f"{data['n_views']} views", f"{data['n_gaussians']} Gaussians"]
+    if data["residual"] is not None:
+        parts.append(f"residual {data['residual']:.4f}")
+    if steps and step:
+        parts.append(f"{_clock_time(data['seconds'] / step * (steps - step))} left")
+    return ", ".join(parts)
+
+
+def _clock_time(seconds: float) -> str:
+    left = round(seconds)
+    return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"

@@ -5,23 +5,21 @@ from __future__ import annotations
 import math
 import re
 import shlex
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
-from beamline.cli.narrate import Narrator
+from beamline.cli.narrate import results
 from beamline.cli.scan_options import scan_options
+from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.deliver import Target
-from beamline.errors import INTERRUPTED, BeamlineError
-from beamline.events import Event, JsonLines, Sink
+from beamline.events import Event, fan_out
 from beamline.follow import follow as follow_scan
 from beamline.offline import Method, ReconOptions, SourceOptions, run
 from beamline.pipeline import Selection
+from beamline.terminal import Terminal
 from drivers.clock import SystemClock
 from recon.correct import CorrectionSettings
 from recon.fbp import Filter
@@ -60,35 +58,23 @@ def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str |
     return value
 
 
-@contextmanager
-def telling(as_json: bool, clock: SystemClock) -> Iterator[Sink]:
-    """The sink that the user asked for; with JSON a failure is its last line."""
-    if not as_json:
-        with Narrator() as narrator:
-            yield narrator
-        return
-    sink = JsonLines(sys.stdout)
-    try:
-        yield sink
-    except (BeamlineError, KeyboardInterrupt) as error:
-        code = error.exit_code if isinstance(error, BeamlineError) else INTERRUPTED
-        sink(Event("failed", clock.now(), {"message": str(error) or "interrupted", "exit_code": code}))
-        raise
-
-
-@contextmanager
-def terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM ends the command as Ctrl-C does, so that no half-written file stays behind."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+    """A file that can be told from its report."""
+    if value is not None and (not value.name or value.suffix.lower() in (".html", ".htm")):
+        raise click.BadParameter(f"{str(value)!r} cannot hold a volume; name an HDF5 file, such as volume.h5")
+    return value
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("-m", "--method", type=click.Choice(["r2", "fbp"]), default="r2", show_default=True)
+@click.option(
+    "-m",
+    "--method",
+    type=click.Choice(["r2", "fbp"]),
+    default="r2",
+    show_default=True,
+    help="r2: Gaussians fitted to the views; fbp: filtered back-projection.",
+)
 @click.option(
     "--views",
     default="all",
@@ -126,13 +112,25 @@ def terminated_like_interrupted() -> Iterator[None]:
 )
 @click.option("--gaussians", type=click.IntRange(min=1), help="How many to start from (r2).")
 @click.option(
-    "--filter", "ramp", type=click.Choice(["ram-lak", "shepp-logan", "hann"]), default="ram-lak", show_default=True
+    "--filter",
+    "ramp",
+    type=click.Choice(["ram-lak", "shepp-logan", "hann"]),
+    default="ram-lak",
+    show_default=True,
+    help="Of the fbp, also of the one that r2 is compared with.",
 )
-@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
 @click.option("--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5), slices A to B.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Default: FILE's stem + _METHOD.h5, here.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    callback=whole_output,
+    help="Default: FILE's stem + _METHOD.h5, here.",
+)
 @click.option("--report/--no-report", default=True, show_default=True, help="An HTML page beside the output.")
 @click.option("--follow", is_flag=True, help="The scan is still running: reconstruct while its file grows.")
+@click.option("--unfinished", is_flag=True, help="Take the frames there are, of a scan that died or still runs.")
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def recon(
     file: Path,
@@ -152,6 +150,7 @@ def recon(
     output: Path | None,
     report: bool,
     follow: bool,
+    unfinished: bool,
     as_json: bool,
     **said: Any,
 ) -> None:
@@ -162,6 +161,8 @@ def recon(
     """
     if steps is not None and seconds is not None:
         raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
+    if method != "r2" and any(value is not None for value in (steps, seconds, gaussians)):
+        raise click.UsageError(f"--steps, --seconds and --gaussians are of the r2 fit; {method} has none.")
     output = output or Path(f"{file.stem}_{method}.h5")
     options = ReconOptions(
         source=SourceOptions(file, **said),
@@ -182,14 +183,19 @@ def recon(
         filter=ramp,
         seed=seed,
         truth=truth,
+        unfinished=unfinished,
         command=repeated(sys.argv[1:]),
     )
     clock = SystemClock()
-    with terminated_like_interrupted(), telling(as_json, clock) as sink:
+    last: list[Event] = []
+    with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        sink = fan_out(last.append, *(json_sinks or [terminal]))
         if follow:
             follow_scan(options, sink, clock)
         else:
             run(options, sink, clock)
+    if not as_json:
+        click.echo(results(last[-1].data))
 
 
 def report_beside(output: Path) -> Path:

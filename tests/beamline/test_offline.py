@@ -11,6 +11,7 @@ import pytest
 
 from beamline import deliver
 from beamline.deliver import Target
+from beamline.digest import digest
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event
 from beamline.offline import ReconOptions, SourceOptions, run
@@ -21,7 +22,7 @@ from drivers.clock import SystemClock
 from recon.geometry import Geometry
 from recon.metrics import psnr
 from recon.volume import Grid
-from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -173,6 +174,25 @@ def test_a_scan_still_being_written_is_not_taken_for_a_finished_one(tmp_path: Pa
         run(_options(tmp_path), lambda e: None, SystemClock())
     writer.close()
     assert _names(tmp_path) == {"scan.h5"}
+
+
+def test_what_a_dead_scan_left_is_reconstructed_when_asked_for(tmp_path: Path) -> None:
+    """The writer never closes its file, as when its process was killed."""
+    warnings: list[str] = []
+
+    def listen(event: Event) -> None:
+        if event.event == "warning":
+            warnings.append(event.data["message"])
+
+    writer = NXtomoWriter(tmp_path / "scan.h5", ScanInfo(sample="s"), SCAN.shape, clock=SystemClock())
+    for frame in frames_of(SCAN)[:-5]:
+        writer.append(frame, digest(frame.counts))
+    options = _options(tmp_path, unfinished=True)
+    run(options, listen, SystemClock())
+    writer.close("failed")
+    record = read_reconstruction(options.target.output)
+    assert record.parameters["n_views"] == SCAN.angles.size - 5
+    assert "unfinished" in warnings[0]
 
 
 def test_the_same_seed_gives_the_same_volume(tmp_path: Path) -> None:

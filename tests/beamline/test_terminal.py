@@ -11,7 +11,7 @@ import pytest
 
 from beamline.events import Event
 from beamline.narration import UserLog, sentence
-from beamline.terminal import Terminal, rates
+from beamline.terminal import Terminal, fit, rates
 
 FRAME = {
     "n": 90,
@@ -90,6 +90,19 @@ def test_the_fit_has_a_bar_of_its_own() -> None:
     assert "90/360" in text
 
 
+def test_a_fit_with_an_end_says_how_far_it_is() -> None:
+    progress = {"step": 500, "steps": 2000, "seconds": 25.0, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344}
+    assert fit(progress) == "500/2000 steps, 91 views, 2000 Gaussians, residual 0.1234, 0:01:15 left"
+    assert shown(io.StringIO(), ("progress", progress)) == f"volume: {fit(progress)}\n"
+
+
+def test_the_same_snapshot_is_said_once() -> None:
+    snapshot = ("snapshot", {"n_views": 40, "path": "v.h5"})
+    text = shown(io.StringIO(), snapshot, ("frame", FRAME), snapshot, ("snapshot", {"n_views": 60, "path": "v.h5"}))
+    assert text.count("from 40 views") == 1
+    assert text.count("from 60 views") == 1
+
+
 EVENTS = [
     ("run_started", {"folder": "runs/x", "n_frames": 390, "total_bytes": 18e6, "duration": 44.5}, "390 frames, 18 MB"),
     ("state", {"state": "done", "message": "Finished"}, "Finished"),
@@ -101,8 +114,17 @@ EVENTS = [
     ("progress", {}, None),
     ("flag", {"check": "beam", "level": "alarm", "view": 7, "advice": "The beam is lost."}, "Alarm (beam, row 7)"),
     ("warning", {"message": "hot"}, "Warning: hot"),
-    ("recon_started", {"source": "recon"}, "Live reconstruction started"),
-    ("snapshot", {"n_views": 40, "path": "v.h5"}, "Volume from 40 views: v.h5"),
+    (
+        "recon_started",
+        {"method": "r2", "n_views": 26, "axis_col": 81.987, "source": "recon"},
+        "r2: 26 views, rotation axis at column 81.99",
+    ),
+    (
+        "recon_started",
+        {"method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
+        "r2 again, from the start: 40 views, rotation axis at column 82.50",
+    ),
+    ("snapshot", {"n_views": 40, "path": "v.h5"}, "Volume so far, from 40 views: v.h5"),
     (
         "scan_done",
         {"status": "complete", "n_frames": 3, "bytes": 2e3, "seconds": 1, "path": "s.h5"},
