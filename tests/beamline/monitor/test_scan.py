@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beamline.digest import digest
 from beamline.errors import ConfigError
 from beamline.monitor import scan
 from beamline.monitor.flag import Context, Flag, Level
-from drivers.frame import Frame
+from drivers.frame import Frame, FrameKind
 
 CONTEXT = Context(saturation=65535, pixels=100)
 
@@ -40,6 +42,19 @@ def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(bench: An
     found = bench.watch(dimmed)
     assert {flag.check for flag in found} == {"beam"}
     assert [flag.score for flag in found] == pytest.approx([0.1, 0.1], abs=0.01)
+
+
+def test_checks_compare_with_the_mean_of_the_latest_group_of_references(bench: Any) -> None:
+    groups = [bench.darks(3), bench.flats(4), bench.views(5), bench.flats(3, light=0.9), bench.darks(2)]
+    state = scan.start(CONTEXT)
+    for frames in groups:
+        for frame in frames:
+            state, _ = scan.watch(state, frame, digest(frame.counts, 65535, 4))
+        kind = frames[0].kind
+        if kind is not FrameKind.PROJECTION:
+            mean = np.mean([digest(frame.counts, 65535, 4).preview for frame in frames], axis=0)
+            found = state.context.dark if kind is FrameKind.DARK else state.context.flat
+            np.testing.assert_allclose(found, mean, rtol=1e-5)
 
 
 def test_a_frame_may_have_several_flags(bench: Any) -> None:
