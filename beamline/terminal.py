@@ -67,6 +67,8 @@ class Terminal:
     def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
+        elif event.event == "progress" and event.data.get("stage") == "ingest":
+            self._show("frames", event.data["n"], event.data["of"], copied(event.data))
         elif event.event == "progress":
             self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
         elif event.event not in ("failed", "done"):  # the command has the last word
@@ -94,6 +96,11 @@ def rates(data: Mapping[str, Any]) -> str:
     """n/N, frames/s, MB/s and the time left, of a `frame` event."""
     speed = f"{data['frames_per_s']:.1f} frames/s  {data['mb_per_s']:.1f} MB/s"
     return f"{data['n']}/{data['of']}  {speed}  {_clock_time(data['eta_s'])} left"
+
+
+def copied(data: Mapping[str, Any]) -> str:
+    """n/N, frames/s and the time left, of an ingest's `progress` event."""
+    return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
 
 
 def fit(data: Mapping[str, Any]) -> str:

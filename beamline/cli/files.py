@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from beamline.cli.scan_options import scan_options
+from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.errors import DataError
-from beamline.events import Event, JsonLines
+from beamline.events import Event, Sink, fan_out
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest as ingest_scan
+from beamline.storage.recon_file import refuse_existing
 from beamline.storage.validate import validate as findings_of
-from drivers.clock import SystemClock
+from beamline.terminal import Terminal
+from drivers.clock import Clock, SystemClock
 
 _PATH = click.Path(path_type=Path)
+_SAY_EVERY = 0.2  # s between words on how far an ingest is
 
 
 @click.command()
@@ -28,9 +31,11 @@ _PATH = click.Path(path_type=Path)
 @click.option("--json", "as_json", is_flag=True, help="One event on stdout.")
 def info(file: Path, as_json: bool, **said: Any) -> None:
     """Say what the scan in FILE holds; nothing is guessed."""
-    facts = dict(describe(file, **said))
+    with told_as_json(as_json) as sinks:
+        facts = dict(describe(file, **said))
+        for sink in sinks:
+            sink(Event("done", SystemClock().now(), facts))
     if as_json:
-        JsonLines(sys.stdout)(Event("done", SystemClock().now(), facts))
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
     width = max(len(name) for name in (*facts, *attributes)) + 2
@@ -61,19 +66,25 @@ def _text(value: Any) -> str:
 @click.option("--json", "as_json", is_flag=True, help="One event a finding on stdout, then the verdict.")
 def validate(file: Path, as_json: bool, **said: Any) -> None:
     """Check the scan in FILE against the rules that readers rely on. Errors give exit code 5, warnings do not."""
-    findings = findings_of(file, **said)
-    counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
-    if as_json:
-        sink, now = JsonLines(sys.stdout), SystemClock().now()
-        for finding in findings:
-            sink(Event("flag", now, vars(finding)))
-        sink(Event("done", now, {"file": file, **counts}))
-    else:
+    now = SystemClock().now()
+    with told_as_json(as_json) as sinks:
+        findings = findings_of(file, **said)
+        counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
+        for sink in sinks:
+            for finding in findings:
+                sink(Event("flag", now, vars(finding)))
+            sink(Event("done", now, {"file": file, **counts}))
+    errors = _count(counts["error"], "error")
+    if not as_json:
         for finding in findings:
             click.echo(f"{finding.severity:<9}{finding.rule:<16}{finding.message}")
-        click.echo(f"{file}: {counts['error']} errors, {counts['warning']} warnings")
+        click.echo(f"{file}: {errors}, {_count(counts['warning'], 'warning')}")
     if counts["error"]:
-        raise DataError(f"{file} breaks {counts['error']} of the rules that readers rely on; they are listed above.")
+        raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
+
+
+def _count(n: int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 @click.command()
@@ -100,11 +111,9 @@ def ingest(
     One frame is in memory at a time; each gets its statistics and a preview. Nothing is overwritten.
     """
     clock = SystemClock()
-    console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("frames", total=None)
-        began = clock.now()
+    began = clock.now()
+    with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        refuse_existing(output)
         done = ingest_scan(
             source,
             output,
@@ -112,13 +121,32 @@ def ingest(
             energy_kev=energy_kev,
             sample=sample,
             no_data=no_data,
-            progress=lambda n, total: bar.update(task, completed=n, total=total),
+            progress=_progress(fan_out(*(json_sinks or [terminal])), clock),
             **said,
         )
-    seconds = clock.now() - began
+        seconds = clock.now() - began
+        for sink in json_sinks:
+            sink(Event("done", clock.now(), {**vars(done), "output": done.path, "seconds": seconds}))
     if as_json:
-        JsonLines(sys.stdout)(Event("done", clock.now(), {**vars(done), "output": done.path, "seconds": seconds}))
         return
     click.echo(f"output   {done.path} ({done.definition})")
     click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
     click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")
+
+
+def _progress(sink: Sink, clock: Clock) -> Callable[[int, int], None]:
+    """A listener that says how far the frames are, a few times a second."""
+    began, said = clock.now(), -math.inf
+
+    def listen(n: int, total: int) -> None:
+        nonlocal said
+        now = clock.now()
+        if now - said < _SAY_EVERY and n < total:
+            return
+        said = now
+        rate = n / max(now - began, 1e-9)
+        sink(
+            Event("progress", now, {"stage": "ingest", "n": n, "of": total, "per_s": rate, "eta_s": (total - n) / rate})
+        )
+
+    return listen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import h5py
@@ -88,7 +89,7 @@ def test_validate_names_each_fault(folder: Path) -> None:
     result = _beamline("validate", "scan.h5")
     assert result.exit_code == 5
     assert "error    angles" in result.stdout
-    assert "beamline: scan.h5 breaks 1" in result.stderr
+    assert "beamline: scan.h5: 1 error against" in result.stderr
     events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--json").stdout.splitlines()]
     assert [event["event"] for event in events][-1] == "done"
     assert events[-1]["error"] == 1
@@ -132,10 +133,45 @@ def test_ingest_for_machines(folder: Path) -> None:
     assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
 
 
+@pytest.mark.parametrize("command", [("info", "no.h5"), ("validate", "text.h5"), ("ingest", "no.tif", "out.h5")])
+def test_a_failure_is_the_last_json_event(folder: Path, command: tuple[str, ...]) -> None:
+    (folder / "text.h5").write_text("no scan")
+    result = _beamline(*command, "--json")
+    assert result.exit_code == 5
+    last = json.loads(result.stdout.splitlines()[-1])
+    assert (last["event"], last.get("exit_code", 5)) == ("done" if command[0] == "validate" else "failed", 5)
+
+
+def test_ingest_says_how_far_it_is(folder: Path) -> None:
+    _stack(folder)
+    options = ("--angles", "angles.txt", "--quantity", "line-integrals")
+    events = [
+        json.loads(line) for line in _beamline("ingest", "in.tif", "a.h5", *options, "--json").stdout.splitlines()
+    ]
+    progress = [event for event in events if event["event"] == "progress"]
+    assert (progress[-1]["n"], progress[-1]["of"], progress[-1]["eta_s"]) == (18, 18, 0.0)
+    result = _beamline("ingest", "in.tif", "b.h5", *options)
+    assert "frames: 18/18" in result.stderr
+    assert "18/18" not in result.stdout
+
+
+def test_sigterm_leaves_no_part_of_an_ingest(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    _stack(folder)
+    monkeypatch.setattr("beamline.storage.ingest.digest", interrupted)
+    before = {path.name for path in folder.iterdir()}
+    result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt")
+    assert result.exit_code == 130
+    assert {path.name for path in folder.iterdir()} == before
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("in.tif", "out.h5"), "angles"),
+        (("in.tif", "no/out.h5", "--angles", "angles.txt"), "does not exist"),
         (("in.tif", "scan.h5", "--angles", "angles.txt"), "exists"),
         (("missing.tif", "out.h5"), "missing.tif"),
         (("in.tif", "out.h5", "--angles", "angles.txt", "--angle-rows", "0:99"), "0:99"),
