@@ -129,11 +129,11 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
 
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
-    """The figure of merit of the rotation axis over its candidates (columns), and the one chosen."""
+    """The mismatch of the views with each candidate for the rotation axis (columns), and the one chosen."""
     figure, axes = _figure((_WIDTH, 2.8))
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
-    axes.set(xlabel="axis candidate (column, px)", ylabel="score (arb. units)")
+    axes.set(xlabel="axis candidate (column, px)", ylabel="mismatch")
     axes.set_title("Rotation axis: " + ("a clear optimum" if confident else "NOT a clear optimum"))
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)

@@ -50,6 +50,9 @@ def _read_hdf5(path: Path) -> NDArray[np.generic]:
 
 
 def _read_numpy(path: Path) -> NDArray[np.generic]:
+    with path.open("rb") as file:
+        if not file.read(6).startswith((b"PK", b"\x93NUMPY")):
+            raise ValueError("it is neither .npz, .npy nor HDF5")
     loaded = np.load(path, allow_pickle=False)
     if isinstance(loaded, np.ndarray):
         volumes = {path.name: loaded}

@@ -202,7 +202,7 @@ def choose_views(source: ScanSource, frames: NDArray[np.int64], selection: Selec
     try:
         chosen = parse_views(selection.views, source.angles[frames], selection.seed)
     except ValueError as error:
-        raise ConfigError(f"--views {selection.views}: {error}") from error
+        raise ConfigError(f"--views: {error}") from error
     if chosen.size < 2:
         raise ConfigError(
             f"--views {selection.views} leaves {chosen.size} of the {frames.size} views of {source.path}; a volume "
@@ -268,7 +268,7 @@ def check_axis(source: ScanSource, axis_col: float) -> None:
     """Raises ConfigError where the axis lies outside the detector."""
     if not -0.5 <= axis_col <= source.shape[1] - 0.5:
         raise ConfigError(
-            f"The rotation axis, column {axis_col}, lies outside the detector's 0 to {source.shape[1] - 1}."
+            f"The rotation axis, column {axis_col:g}, lies outside the detector's columns 0 to {source.shape[1] - 1}."
         )
 
 

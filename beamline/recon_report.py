@@ -97,7 +97,7 @@ def facts_of(source: ScanSource) -> ScanFacts:
         "energy": "not known" if energy is None else f"{energy:g} keV",
         "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
     }
-    table |= {str(k): str(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
+    table |= {str(k): _text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n = int(source.image_key.size)
     remarks = [f"The monitor flagged {flagged} frames while they were taken."] if flagged else []
     return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks)
@@ -122,11 +122,15 @@ def compose(
     )
     if "fbp" in metrics and made.method != "fbp":
         summary += f" (FBP of the same views: {formatted(best, metrics['fbp'][best])})"
-    settings = {k: str(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
+    settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
         f"SNR, CNR: between the two classes that k-means makes of {'the truth' if truth else 'this volume'}'s values.",
     ]
+    if _grew(made):
+        footnotes.append(
+            "Time of R²-Gaussian: from the first look at the growing file to the volume, the scan included."
+        )
     if truth is not None:
         footnotes.append(
             "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
@@ -162,7 +166,7 @@ def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Map
         pictures.append(
             Picture(
                 "Quality against time",
-                "Misfit of the model to the views while it was fitted, in the time since the fit began.",
+                _told_by_history(made),
                 figures.quality_against_time(history_arrays(made.history), made.psnr),
             )
         )
@@ -179,11 +183,31 @@ def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Map
         pictures.append(
             Picture(
                 "Rotation axis",
-                f"Score of each candidate for the rotation axis ({axis.method}); columns of the binned detector.",
+                f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 is perfect "
+                "agreement, about 1 is none. Columns as reconstructed, after binning.",
                 figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
             )
         )
     return pictures
+
+
+def _grew(made: Made) -> bool:
+    """The views came while the volume was fitted."""
+    return len({progress.n_views for progress in made.history}) > 1
+
+
+def _told_by_history(made: Made) -> str:
+    parts = ["Misfit of the model to the views it had"]
+    parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
+    parts += ["growth of views and Gaussians"] if _grew(made) else []
+    return f"{'; '.join(parts)}; in the time since {'the scan was followed' if _grew(made) else 'the fit began'}."
+
+
+def _text(value: object) -> str:
+    """A value as people read it; the file keeps it exactly."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -75,8 +76,10 @@ METRICS = {
 
 
 def formatted(name: str, value: float) -> str:
-    """A metric's value as people read it, with its unit."""
+    """A metric's value as people read it, with its unit; a decibel of nothing is not a number."""
     metric = METRICS[name]
+    if not math.isfinite(value):
+        return "undefined"
     return f"{value:.{metric.digits}f} {metric.unit}".rstrip()
 
 

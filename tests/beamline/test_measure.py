@@ -45,6 +45,8 @@ def test_truths_that_are_none(tmp_path: Path) -> None:
     for name in ("two.npz", "flat.npz", "text.npz", "other.h5", "objects.npy"):
         with pytest.raises(DataError, match="holds no volume"):
             read_truth(str(tmp_path / name))
+    with pytest.raises(DataError, match="neither"):
+        read_truth(str(tmp_path / "text.npz"))
     np.save(tmp_path / "good.npy", DATA)
     with pytest.raises(ConfigError, match=r"slices 2:9 do not lie in 0:4"):
         read_truth(f"{tmp_path / 'good.npy'}:2:9")

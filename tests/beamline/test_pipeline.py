@@ -289,7 +289,7 @@ def test_empty_field_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "said"),
     [
-        (Selection(views="nonsense"), "--views nonsense"),
+        (Selection(views="nonsense"), "--views: .*'nonsense'.*fixed:N"),
         (Selection(views="first:1"), "at least 2"),
         (Selection(rows=(2, 9), axis_col=20.0), "--rows 2:9"),
         (Selection(binning=5, axis_col=20.0), "--bin 5"),

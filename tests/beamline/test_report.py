@@ -108,6 +108,7 @@ def test_flags_are_counted_and_listed() -> None:
 def test_every_metric_formats() -> None:
     for name, metric in METRICS.items():
         assert formatted(name, 1.0).endswith(metric.unit)
+    assert formatted("snr", -np.inf) == "undefined"
 
 
 def test_report_is_whole_and_never_overwrites(tmp_path: Path) -> None:
