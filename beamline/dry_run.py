@@ -66,7 +66,15 @@ def dry_run(settings: Config) -> DryRun:
     stage, camera, to_counts = devices.describe(settings)
     start_monitor(Context(2**camera.bits - 1, math.prod(camera.shape)), settings.monitor.thresholds)
     free = free_bytes(Path(settings.storage.folder))
-    worked = timeline.work_out(plan, stage, to_counts, camera, axis_col=settings.optics.axis_col, free_bytes=free)
+    worked = timeline.work_out(
+        plan,
+        stage,
+        to_counts,
+        camera,
+        axis_col=settings.optics.axis_col,
+        preview_bin=settings.storage.preview_bin,
+        free_bytes=free,
+    )
     return DryRun(plan, worked, stage, camera, free)
 
 

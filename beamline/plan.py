@@ -96,7 +96,8 @@ class Timeline:
     Attributes:
         blocks: in the order of acquisition.
         duration: s, with taxi, settling, moves and reference frames.
-        frame_bytes, total_bytes: uint16 pixels, per frame and for the whole file.
+        frame_bytes: of one frame's uint16 pixels.
+        total_bytes: of the whole file, pixels and previews.
         step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
         step: radians that these counts are.
         blur_px: how far a point at the detector's edge moves during an exposure, in pixels.

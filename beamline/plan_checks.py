@@ -11,7 +11,7 @@ from beamline.triggers import Flight
 from drivers.protocols import CameraTiming, StageLimits
 
 ROOM = 1.1
-"""Free disk asked for, times the pixels: previews, per-frame values and what else grows meanwhile."""
+"""Free disk asked for, times pixels and previews: per-frame values and what else grows meanwhile."""
 MARGIN = 1.01
 """Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
 

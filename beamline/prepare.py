@@ -55,11 +55,20 @@ def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, free = camera.timing, free_bytes(runs)
     axis_col = config.optics.axis_col
-    timeline = work_out(plan, stage.limits, stage.to_counts, timing, axis_col=axis_col, free_bytes=free)
+    preview_bin = config.storage.preview_bin
+    timeline = work_out(
+        plan,
+        stage.limits,
+        stage.to_counts,
+        timing,
+        axis_col=axis_col,
+        preview_bin=preview_bin,
+        free_bytes=free,
+    )
     refuse_violations(timeline)
     watch = monitor.start(_context(plan, timeline, timing), config.monitor.thresholds)
     # The first call compiles, which must not happen while frames are coming.
-    digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, config.storage.preview_bin)
+    digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, preview_bin)
     return Prepared(plan, timeline, settings, timing, watch, _info(config, bench, plan, timeline))
 
 

@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.digest import preview_shape
 from beamline.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan_checks import Facts, degrees, remarks, size, violations
 from beamline.triggers import Flight, Scale, plan_flight
 from drivers.frame import FrameKind
 from drivers.protocols import CameraTiming, StageLimits
 
-BYTES_PER_PIXEL = 2
+BYTES_PER_PIXEL, BYTES_PER_BLOCK = 2, 4  # uint16 frames, float32 previews
 
 
 def work_out(
@@ -24,6 +25,7 @@ def work_out(
     camera: CameraTiming,
     *,
     axis_col: float | None = None,
+    preview_bin: int = 4,
     free_bytes: int | None = None,
 ) -> Timeline:
     """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
@@ -38,6 +40,7 @@ def work_out(
         to_counts: the stage's conversion of radians to whole counts.
         camera: its timing with the views' exposure.
         axis_col: column of the rotation axis (None: the middle), for blur and skew at the farther edge.
+        preview_bin: pixels per side of the previews that the file holds beside the frames.
         free_bytes: of the disk; None leaves it unchecked.
     """
     scale = Scale.of(to_counts)
@@ -52,6 +55,7 @@ def work_out(
     views = next(block for block in blocks if block.kind is FrameKind.PROJECTION)
     speed = views.speed * _half_width(camera, axis_col)
     frame_bytes = camera.shape[0] * camera.shape[1] * BYTES_PER_PIXEL
+    preview_bytes = math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
     facts = Facts(
         plan=plan,
         views=views,
@@ -62,7 +66,7 @@ def work_out(
         reach=_reach(views, scale),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
-        total_bytes=frame_bytes * sum(block.n for block in blocks),
+        total_bytes=(frame_bytes + preview_bytes) * sum(block.n for block in blocks),
         free_bytes=free_bytes,
     )
     step_counts = flight.interval if flight else 0
@@ -213,11 +217,12 @@ def describe(
         ]
     else:
         facts.append(("moves", f"at {degrees(stage.max_speed)}/s, then {plan.settle:g} s to settle"))
+    total = size(timeline.total_bytes)
     free = "" if free_bytes is None else f"; {size(free_bytes)} free"
     facts += [
         ("camera", f"{rows} x {cols} px of {camera.bits} bits, least time between triggers {camera.min_period:.6g} s"),
         ("duration", f"{_clock(timeline.duration)} (without shutter and sample moves)"),
-        ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} = {size(timeline.total_bytes)}{free}"),
+        ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} and previews = {total}{free}"),
     ]
     lines += ["", *(f"{name:<10}{text}" for name, text in facts)]
     lines += [f"{'remark':<10}{text}" for text in timeline.remarks]

@@ -466,6 +466,16 @@ def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
         assert flats > darks + 1000
 
 
+@pytest.mark.parametrize("preview_bin", [1, 3])
+def test_the_bytes_foretold_are_what_the_file_takes(tmp_path: Path, preview_bin: int) -> None:
+    overrides = [*SMALL, "simulation.clock=virtual", "devices.stage.low_deg=-60", f"storage.preview_bin={preview_bin}"]
+    config = load(config_folder() / "simulated.yaml", overrides, environment={})
+    events: list[Event] = []
+    result = run_scan(config, tmp_path, [events.append])
+    foretold = next(event.data["total_bytes"] for event in events if event.event == "run_started")
+    assert 0 < result.bytes - foretold < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
+
+
 @pytest.mark.parametrize("mode", ["fly", "step"])
 def test_the_duration_foretold_is_what_it_takes(tmp_path: Path, mode: str) -> None:
     """From the stage's zero through a quarter turn away from it and back, with darks and flats at both ends."""

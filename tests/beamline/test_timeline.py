@@ -63,7 +63,7 @@ def test_a_fly_scan_worked_by_hand() -> None:
     # Half the detector is 126 px: 5 deg/s * 0.05 s = 0.00436 rad.
     assert timeline.blur_px == pytest.approx(126 * 0.25 * DEG)
     assert timeline.skew_px == pytest.approx(126 * 5 * DEG * 3.6e-6 * 143)
-    assert (timeline.frame_bytes, timeline.total_bytes) == (72_576, 72_576 * 410)
+    assert (timeline.frame_bytes, timeline.total_bytes) == (72_576, (72_576 + 36 * 63 * 4) * 410)
     assert timeline.n_frames == 410
     # To -0.5 deg: 2 sqrt(0.5/60); the pass: 180.5 deg at 5 deg/s and one ramp's 1/12 s; back to zero: 180/30 + 1/2 s.
     pass_and_moves = 2 * math.sqrt(0.5 / 60) + 180.5 / 5 + 5 / 60 + (180 / 30 + 0.5)
@@ -227,9 +227,12 @@ def test_advice_works_when_followed() -> None:
 def test_no_trigger_output_and_no_room() -> None:
     (violation,) = worked(stage=replace(STAGE, trigger_output=False)).violations
     assert "no trigger output" in violation
-    (violation,) = worked(free_bytes=30_000_000).violations
-    assert "needs 29.8 MB and a tenth more, the disk has 30 MB free" in violation
-    assert worked(free_bytes=33_000_000).violations == ()
+    # 410 frames of 144 x 252 px, 2 bytes a pixel and 4 a block of 4 x 4 pixels, or for each pixel.
+    (violation,) = worked(free_bytes=36_000_000).violations
+    assert "needs 33.5 MB and a tenth more, the disk has 36 MB free" in violation
+    assert worked(free_bytes=37_000_000).violations == ()
+    (violation,) = worked(free_bytes=90_000_000, preview_bin=1).violations
+    assert "needs 89.3 MB and a tenth more" in violation
 
 
 @pytest.mark.parametrize(("axis_col", "legal"), [(-0.5, True), (-0.6, False), (251.5, True), (251.6, False)])
@@ -311,7 +314,7 @@ def test_describe_says_everything() -> None:
         "0.5° before the first and after the last trigger",
         "0.55 px",
         "144 x 252 px",
-        "410 frames of 72.6 kB = 29.8 MB; 5 GB free",
+        "410 frames of 72.6 kB and previews = 33.5 MB; 5 GB free",
         "0:00:4",
         "remark",
     ):

@@ -38,7 +38,7 @@ def test_json_is_one_event() -> None:
     event = json.loads(line)
     assert event["event"] == "done"
     assert (event["n_frames"], event["step_counts"]) == (210, 1000)
-    assert event["total_bytes"] == 210 * 144 * 160 * 2
+    assert event["total_bytes"] == 210 * (144 * 160 * 2 + 36 * 40 * 4)
     assert sum(block["n"] for block in event["blocks"]) == 210
     assert event["free_bytes"] > 0
 
