@@ -121,10 +121,6 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
         self._wire.receive(sent)
         return len(sent)
 
-    def reset_input_buffer(self) -> None:
-        self._take()
-        self._received.clear()
-
     def _take(self) -> None:
         if not self.is_open:
             raise PortNotOpenError()

@@ -48,6 +48,17 @@ def test_a_dimming_beam_is_no_band(bench: Any) -> None:
     assert only(bench.watch(frames)) == []
 
 
+@pytest.mark.parametrize("band", [False, True])
+def test_a_sample_with_an_upper_and_a_lower_edge_is_no_band(bench: Any, band: bool) -> None:
+    """Half of the rows get a fifth of the light, always: the rows of a frame are compared with their own past."""
+    frames = bench.references() + bench.views(20)
+    for view in frames[10:]:
+        view.counts[32:] = 200 + (view.counts[32:].clip(200) - 200) // 5
+    if band:
+        black(frames[25], 40, 4)
+    assert [f.view for f in only(bench.watch(frames))] == [25] * band
+
+
 def test_a_sample_seen_from_the_other_side_is_no_band(bench: Any) -> None:
     frames = bench.references()
     for i in range(20):  # an angle plan that jumps

@@ -252,6 +252,11 @@ def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Fr
     """Interlaced passes arm the camera once each: the count starts again at 0 within the projections."""
     again = [replace(frame, framestamp=(frame.framestamp % 4)) for frame in frames]
     assert validate(write(again)) == []
+    lost = [replace(frame, index=i) for i, frame in enumerate(again[:9] + again[10:])]  # the first of the second pass
+    assert [frame.framestamp for frame in lost[5:]] == [0, 1, 2, 3, 1, 2, 3, 0]
+    assert validate(write(lost, "lost.h5")) == []  # type: ignore[call-arg]
+    back = [replace(frame, trigger=0, framestamp=0) if frame.index == 12 else frame for frame in frames]
+    assert ("error", "framestamps") in found(write(back, "back.h5"))  # type: ignore[call-arg]
 
 
 def test_degrees_that_are_radians(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
