@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from beamline import angles
+from beamline.config_checks import faults
 from beamline.config_errors import explain
 from beamline.config_models import (
     Config,
@@ -55,20 +56,29 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read as UTF-8 text ({error}).") from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not UTF-8 text ({error}). Nothing was started.") from None
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment)
     _locate(tree.data, Path())
     try:
-        return Config.model_validate(tree.data)
+        config = Config.model_validate(tree.data)
     except ValidationError as error:
-        faults = explain(error, tree, schema())
-        if len(faults) == 1:
-            raise ConfigError(f"{faults[0]}. Nothing was started.") from None
-        lines = "".join(f"\n  {fault}" for fault in faults)
-        raise ConfigError(f"{path} has {len(faults)} faults, nothing was started:{lines}") from None
+        _refuse(path, explain(error, tree, schema()))
+        raise
+    _refuse(path, [f"{tree.origin(at)}: {what}" for at, what in faults(config, config_folder())])
+    return config
+
+
+def _refuse(path: Path, found: Sequence[str]) -> None:
+    if len(found) == 1:
+        raise ConfigError(f"{found[0]}. Nothing was started.") from None
+    if found:
+        lines = "".join(f"\n  {fault}" for fault in found)
+        raise ConfigError(f"{path} has {len(found)} faults, nothing was started:{lines}") from None
 
 
 def resolved_yaml(config: Config) -> str:

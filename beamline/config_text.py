@@ -55,6 +55,8 @@ def read(text: str, name: str) -> Tree:
         raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
     except yaml.YAMLError as error:
         raise ConfigError(f"{name}: this is not YAML ({error}). Nothing was started.") from None
+    except RecursionError:
+        raise ConfigError(f"{name}: a value holds itself, or is nested beyond reason. Nothing was started.") from None
     finally:
         loader.dispose()
     return Tree(data, origins)

@@ -105,10 +105,8 @@ def test_precedence_flags_environment_file_defaults(tmp_path: Path) -> None:
     path = write(tmp_path)
     assert load(path).scan.settle_s == 0.1
     assert load(path, BEAMLINE_SCAN__SETTLE_S="0.5").scan.settle_s == 0.5
-    both = load(
-        path, "scan.settle_s=0.7", "recon.axis=80.5", BEAMLINE_SCAN__SETTLE_S="0.5", BEAMLINE_SCAN__PERIOD_S="1"
-    )
-    assert (both.scan.settle_s, both.scan.period_s, both.recon.axis) == (0.7, 1.0, 80.5)
+    both = load(path, "scan.settle_s=0.7", "recon.axis=4.5", BEAMLINE_SCAN__SETTLE_S="0.5", BEAMLINE_SCAN__PERIOD_S="1")
+    assert (both.scan.settle_s, both.scan.period_s, both.recon.axis) == (0.7, 1.0, 4.5)
     whole = load(path, "scan.angles={scheme: interlaced, views: 12, passes: 3}", "scan.darks.at=none")
     assert whole.scan.angles.scheme == "interlaced"
     assert whole.scan.darks.at is Place.NONE
@@ -299,5 +297,38 @@ def test_scenes_inline_beside_and_installed(tmp_path: Path, monkeypatch: pytest.
     assert config.scene_mapping(named) == {"from": "installed"}
     assert named.simulation is not None
     assert named.simulation.scene == "scenes/a.yaml"
-    with pytest.raises(ConfigError, match=r"simulation\.scene: .*absent\.yaml cannot be read"):
-        config.scene_mapping(load(path, "simulation.scene=absent.yaml"))
+    with pytest.raises(
+        ConfigError, match=r"--set .*: simulation\.scene: there is no file absent\.yaml; .*scenes/a\.yaml"
+    ):
+        load(path, "simulation.scene=absent.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[0, 0, 8, 8]", "[0, 0, 8, 9]", r"my\.yaml:\d+: devices\.camera: roi .* steps of 4"),
+        (
+            "simulation: {}",
+            "simulation: {scene: no.yaml}",
+            r"my\.yaml:\d+: simulation\.scene: there is no file no\.yaml",
+        ),
+        (
+            "simulation: {}",
+            "simulation: {}\nrecon: {axis: 8.5}",
+            r"my\.yaml:\d+: recon\.axis 8\.5 .* columns 0 \.\.\. 7",
+        ),
+        ("simulation: {}", "simulation: &a {scene: {x: *a}}", "holds itself"),
+        ("simulation: {}", "simulation: " + 3000 * "[", "nested beyond reason"),
+    ],
+)
+def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in GOOD
+    with pytest.raises(ConfigError, match=said):
+        load(write(tmp_path, GOOD.replace(old, new)))
+    with pytest.raises(ConfigError, match=r"--set .*: scan\.angles\.path: there is no file .*no\.txt"):
+        load(write(tmp_path), "scan.angles={scheme: file, path: no.txt}")
+
+
+def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot be read: Is a directory|denied"):
+        load(tmp_path)
