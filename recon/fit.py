@@ -25,7 +25,7 @@ NAMES = ("means", "log_scales", "quaternions", "raw")
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a fit runs; weights and rates are the published ones (Zha et al. 2024, sec. 5.1) where not said otherwise.
+    """How a fit runs; weights and rates are the published ones (Zha et al. 2024) where not said otherwise.
 
     Attributes:
         ssim_weight, tv_weight: of 1 - SSIM and of total variation beside L1.
@@ -77,12 +77,13 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The data of a fit, in normalised units: lengths in half fields, densities in density units.
+    """The data of a fit: images in half fields times density units, geometry and grid in mm.
 
     Attributes:
         images: a float32 [row, col] each view, projections / (half_field * unit).
         target_maps: a float32 [2, row, col] each view, blurred for SSIM.
-        geometry, grid: of the views and of the volume.
+        geometry: of the views.
+        grid: the box that Gaussians live in; it should hold all that the views see, whatever volume is wanted later.
         half_field: mm.
         unit: 1/mm.
         loss: the projection loss with its scratch memory.
@@ -159,15 +160,21 @@ def growth(settings: FitSettings) -> float:
 
 
 def init(gaussians: Gaussians, seed: int | np.random.Generator, growth: float = 1.0) -> FitState:
-    """A fresh state; the Gaussians are copied, in an order that keeps neighbours together in memory."""
-    order = morton_order(gaussians.means.numpy(), float(gaussians.scales.median()) * 4)
-    arrays = gaussians.select(torch.from_numpy(order)).arrays()
-    parameters = {
-        "means": arrays["means"],
-        "log_scales": arrays["log_scales"],
-        "quaternions": arrays["quaternions"],
-        "raw": arrays["raw_densities"],
-    }
+    """A fresh state; the Gaussians are copied as float32, in an order that keeps neighbours together in memory.
+
+    Raises:
+        ValueError: for no Gaussians, or parameters that are not finite.
+    """
+    if gaussians.n == 0:
+        raise ValueError("there are no Gaussians to start a fit from")
+    arrays = gaussians.arrays()
+    named = zip(NAMES, ("means", "log_scales", "quaternions", "raw_densities"), strict=True)
+    parameters = {name: np.array(arrays[source], np.float32) for name, source in named}
+    for name, values in parameters.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} of the Gaussians hold {int((~np.isfinite(values)).sum())} values not finite")
+    order = _order(parameters)
+    parameters = {name: values[order] for name, values in parameters.items()}
     return FitState(
         parameters,
         {k: np.zeros_like(v) for k, v in parameters.items()},
@@ -246,6 +253,11 @@ def volume_of(state: FitState, grid: Grid, settings: FitSettings) -> Volume:
     return Volume(voxelize(gaussians_of(state), grid, truncation=settings.truncation).numpy(), grid)
 
 
+def _order(parameters: dict[str, F32]) -> NDArray[np.int64]:
+    """An order of the Gaussians in which neighbours in space follow each other."""
+    return morton_order(parameters["means"], 4 * float(np.exp(np.median(parameters["log_scales"]))))
+
+
 def _draw(state: FitState, n_views: int) -> int:
     if not state.drawn:
         state.drawn = state.rng.permutation(n_views).tolist()
@@ -292,21 +304,23 @@ def _update(
 def _grow(state: FitState, problem: Problem, policy: DensityPolicy) -> None:
     p = state.parameters
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)
-    z, y, x = (n * problem.grid.voxel_size / 2 for n in problem.grid.shape)
     statistic = state.statistic / np.float32(max(1, state.seen))
     change = control(
         p["means"], p["log_scales"], active.rotations, p["raw"], statistic, policy,
-        2 * problem.half_field, state.limit, (x, y, z), state.rng,
+        2 * problem.half_field, state.limit, problem.grid.edges, state.rng,
     )  # fmt: skip
     origin = np.concatenate((change.keep, change.parents))
     fresh = change.keep.size
-    order = morton_order(change.means, float(np.exp(np.median(change.log_scales))) * 4)
-    state.parameters = {
-        "means": change.means[order],
-        "log_scales": change.log_scales[order],
-        "quaternions": p["quaternions"][origin][order],
-        "raw": change.raw[order],
+    if origin.size == 0:
+        return  # all are faint, as in views of nothing: later views may need them
+    grown = {
+        "means": change.means,
+        "log_scales": change.log_scales,
+        "quaternions": p["quaternions"][origin],
+        "raw": change.raw,
     }
+    order = _order(grown)
+    state.parameters = {name: values[order] for name, values in grown.items()}
     for moments in (state.first, state.second):
         for name in NAMES:
             values = moments[name][origin]

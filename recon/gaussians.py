@@ -13,7 +13,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ   (Zha et al. 2024, eq. 1).
+    """σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ   (Zha et al. 2024).
 
     Attributes:
         means: [n, 3] mm, (x, y, z).
@@ -41,8 +41,8 @@ class Gaussians:
         for name, (found, expected) in shapes.items():
             if tuple(found) != expected:
                 raise ValueError(f"{name} has shape {tuple(found)}, expected {expected}")
-        if not self.density_unit > 0:
-            raise ValueError(f"density_unit must be positive, got {self.density_unit}")
+        if not 0 < self.density_unit < float("inf"):
+            raise ValueError(f"density_unit must be positive and finite, got {self.density_unit}")
 
     @classmethod
     def from_physical(

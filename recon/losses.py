@@ -29,11 +29,11 @@ def ssim(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2
 
 
 def projection_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """mean |image - target| + ssim_weight (1 - SSIM)   (Zha et al. 2024, eq. 8)."""
+    """mean |image - target| + ssim_weight (1 - SSIM)   (Zha et al. 2024)."""
     return (image - target).abs().mean() + ssim_weight * (1 - ssim(image, target))
 
 
 def total_variation(volume: Tensor) -> Tensor:
-    """Mean absolute difference of neighbours over the three axes of [z, y, x] (Zha et al. 2024, eq. 9)."""
+    """Mean absolute difference of neighbours over the three axes of [z, y, x] (Zha et al. 2024)."""
     steps = [volume.diff(dim=axis).abs() for axis in range(3)]
     return torch.stack([step.sum() for step in steps]).sum() / sum(step.numel() for step in steps)

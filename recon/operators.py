@@ -14,7 +14,7 @@ def joseph_matrix(angle: float, geometry: Geometry, grid: Grid) -> sparse.csr_ar
     """Line integrals through one slice as a matrix [col, y * x]: `matrix @ slice.ravel()`, mm times the slice's unit.
 
     Each ray is sampled once in every row of voxels (or column, whichever it crosses more steeply) with linear
-    interpolation between the two neighbours (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192, eqs 7-10).
+    interpolation between the two neighbours (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192).
     """
     _, ny, nx = grid.shape
     _, cy, cx = grid.centre

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import operator
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -9,7 +11,8 @@ from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from recon import fit
 from recon.fbp import Filter, fbp
@@ -44,7 +47,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    projections: NDArray[np.floating],
+    projections: ArrayLike | Tensor,
     geometry: Geometry,
     grid: Grid | None = None,
     method: Method = "r2",
@@ -63,12 +66,13 @@ def reconstruct(
     """Line integrals to a volume.
 
     Args:
-        projections: [view, row, col], -log of the transmission, finite.
+        projections: [view, row, col], -log of the transmission, finite; any real type (a CPU tensor too).
         geometry: of these views.
-        grid: of the volume; None gives one voxel a detector pixel.
+        grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
+            small box holds what the whole volume holds there.
         method: "r2" (R²-Gaussian fit) or "fbp".
-        steps: of the fit, one view each; None takes 2000, or as many as fit into `seconds`.
-        gaussians: how many to start from, or the Gaussians to start from; None derives a number from the grid.
+        steps: of the fit, one view each; 0 gives the starting point; None takes 2000, or as many as fit into `seconds`.
+        gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         densify: the fit may clone, split and prune.
         seed: of every random choice; the same seed gives the same volume on the same machine.
         filter: of "fbp" ("ram-lak", "shepp-logan" or "hann").
@@ -79,18 +83,11 @@ def reconstruct(
         now: a clock in s.
 
     Raises:
-        ValueError: for shapes that disagree, values that are not finite, a single view, or data without matter.
+        ValueError: for shapes that disagree, values that are not finite, views from one side only, numbers out of
+            range, or data without matter.
     """
-    if method not in get_args(Method):
-        raise ValueError(f"method must be one of {get_args(Method)}, got {method!r}")
-    data = np.ascontiguousarray(projections, np.float32)
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if data.shape != expected:
-        raise ValueError(f"projections have shape {data.shape}, the geometry says {expected} [view, row, col]")
-    if not np.isfinite(data).all():
-        raise ValueError(f"{int((~np.isfinite(data)).sum())} of {data.size} projection values are not finite")
-    if geometry.n_views < 2:
-        raise ValueError("one view does not determine a volume; give at least two, at different angles")
+    _check(method, filter, geometry, steps, seconds)
+    data = _line_integrals(projections, geometry)
     begin = now()
     target = grid or Grid.matching(geometry)
     if method == "fbp":
@@ -100,17 +97,20 @@ def reconstruct(
     chosen = settings or fit.FitSettings()
     if settings is None and not densify:
         chosen = replace(chosen, policy=None)
+    field = Grid.of_field(geometry, max(geometry.pixel_pitch, target.voxel_size))
     start = (
         gaussians
         if isinstance(gaussians, Gaussians)
-        else place(data, geometry, target, gaussians, np.random.default_rng(seed))
+        else place(data, geometry, field, gaussians, np.random.default_rng(seed))
     )
     state = fit.init(start, seed, fit.growth(chosen))
-    problem = fit.make_problem(data, geometry, target, start.density_unit, chosen)
-    planned = steps if steps is not None else (0 if seconds is not None else DEFAULT_STEPS)
+    problem = fit.make_problem(data, geometry, field, start.density_unit, chosen)
+    if steps is None and seconds is None:
+        steps = DEFAULT_STEPS
+    planned = steps or 0  # 0 in a history: no number of steps was planned
     history: list[fit.Progress] = []
     fit_begin = said = now()
-    while planned == 0 or state.step < planned:
+    while steps is None or state.step < steps:
         spent = now() - fit_begin
         if seconds is not None and spent >= seconds and state.step > 0:
             break
@@ -131,6 +131,36 @@ def reconstruct(
     return Reconstruction(
         volume, now() - begin, tuple(history), method, fit.gaussians_of(state), MappingProxyType(used)
     )
+
+
+def _check(method: str, filter: str, geometry: Geometry, steps: int | None, seconds: float | None) -> None:
+    for name, value, legal in (("method", method, get_args(Method)), ("filter", filter, get_args(Filter))):
+        if value not in legal:
+            raise ValueError(f"{name} must be one of {legal}, got {value!r}")
+    # Views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
+    if np.abs(np.sin(geometry.angles - geometry.angles[0])).max() < 1e-6:
+        raise ValueError(
+            f"{geometry.n_views} views from one side ({np.rad2deg(geometry.angles[0]):g} degrees): one view does not "
+            "determine a volume; give at least two, at different angles"
+        )
+    if steps is not None and operator.index(steps) < 0:
+        raise ValueError(f"steps must be 0 or more, got {steps}")
+    if seconds is not None and not (math.isfinite(seconds) and seconds >= 0):
+        raise ValueError(f"seconds must be a time of 0 or more, got {seconds}")
+
+
+def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:
+    given = np.asarray(projections.detach() if isinstance(projections, Tensor) else projections)
+    if given.dtype.kind not in "fiub":
+        raise ValueError(f"projections must be real numbers, got {given.dtype}")
+    expected = (geometry.n_views, *geometry.detector_shape)
+    if given.shape != expected:
+        raise ValueError(f"projections have shape {given.shape}, the geometry says {expected} [view, row, col]")
+    with np.errstate(over="ignore"):  # what float32 cannot hold is told as not finite
+        data = np.ascontiguousarray(given, np.float32)
+    if not np.isfinite(data).all():
+        raise ValueError(f"{int((~np.isfinite(data)).sum())} of {data.size} projection values are not finite")
+    return data
 
 
 def _progress(state: fit.FitState, planned: int, seconds: float, n_views: int) -> fit.Progress:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon import fit
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.initialise import default_count, place
+from recon.initialise import place
 from recon.kernels.activation import F32
 from recon.volume import Grid, Volume
 
@@ -33,9 +33,9 @@ class StreamingFit:
 
     Args:
         template: geometry of the views to come; its angles are ignored.
-        grid: of the snapshots; None matches the detector.
+        grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
         seed: of every random choice.
-        gaussians: how many at the first placement; None derives it from the volume (see `default_count`).
+        gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
         settings: of the fit.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
         now: a clock in s.
@@ -54,8 +54,11 @@ class StreamingFit:
         now: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._template, self._grid = template, grid or Grid.matching(template)
+        self._field = Grid.of_field(template, max(template.pixel_pitch, self._grid.voxel_size))
         self._rng = np.random.default_rng(seed)
-        self._count = gaussians or default_count(self._grid)
+        if gaussians is not None and gaussians < 1:
+            raise ValueError(f"a model needs at least one Gaussian, got {gaussians}")
+        self._count = gaussians
         self._settings = settings or fit.FitSettings()
         self._first_views, self._first_span = first_views, first_span
         self._now, self._start = now, now()
@@ -82,11 +85,12 @@ class StreamingFit:
         """
         theta = np.atleast_1d(np.asarray(angles, np.float64))
         expected = (theta.size, *self._template.detector_shape)
-        if np.shape(data) != expected:
+        if theta.ndim != 1 or np.shape(data) != expected:
             raise ValueError(f"{theta.size} angles need projections of shape {expected}, got {np.shape(data)}")
-        if not (np.isfinite(data).all() and np.isfinite(theta).all()):
+        with np.errstate(over="ignore"):  # what float32 cannot hold is told as not finite
+            images = np.array(data, np.float32)
+        if not (np.isfinite(images).all() and np.isfinite(theta).all()):
             raise ValueError("new views hold values or angles that are not finite; nothing was added")
-        images = np.array(data, np.float32)
         self._angles.extend(theta.tolist())
         if self._problem is None:
             self._data.extend(images)
@@ -177,8 +181,8 @@ class StreamingFit:
     def _place_first(self) -> None:
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        placed = place(data, geometry, self._grid, self._count, self._rng)
-        self._problem = fit.make_problem(data, geometry, self._grid, placed.density_unit, self._settings)
+        placed = place(data, geometry, self._field, self._count, self._rng)
+        self._problem = fit.make_problem(data, geometry, self._field, placed.density_unit, self._settings)
         self._state = fit.init(placed, self._rng)
         self._placed = placed.n
         self._data = []  # the problem holds them from now on

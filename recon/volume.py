@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,12 +31,37 @@ class Grid:
             raise ValueError(f"grid shape must be (nz, ny, nx) >= 1, got {self.shape}")
         if not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
             raise ValueError(f"voxel_size must be a positive length in mm, got {self.voxel_size}")
+        if len(self.centre) != 3 or not np.isfinite(self.centre).all():
+            raise ValueError(f"centre must be three finite lengths (z, y, x) in mm, got {self.centre}")
+        # A shape from a list or an array is the same box.
+        object.__setattr__(self, "shape", tuple(operator.index(n) for n in self.shape))
+        object.__setattr__(self, "centre", tuple(float(c) for c in self.centre))
 
     @classmethod
     def matching(cls, geometry: Geometry) -> Grid:
         """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis."""
         rows, cols = geometry.detector_shape
         return cls((rows, cols, cols), geometry.pixel_pitch)
+
+    @classmethod
+    def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
+        """A box around the rotation axis that holds all that any view sees, however far from the middle the axis is.
+
+        An axis off the detector counts as one at its edge.
+        """
+        rows, cols = geometry.detector_shape
+        axis = min(max(geometry.axis_col, -0.5), cols - 0.5)
+        per_voxel = geometry.pixel_pitch / voxel_size
+        across, along = 2 * max(axis + 0.5, cols - axis - 0.5) * per_voxel, rows * per_voxel
+        nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error is no voxel
+        return cls((nz, nx, nx), voxel_size)
+
+    @property
+    def edges(self) -> NDArray[np.float64]:
+        """Lower and upper corner of the box, [2, 3] mm, each (x, y, z)."""
+        half = np.asarray(self.shape[::-1]) * self.voxel_size / 2
+        middle = np.asarray(self.centre[::-1])
+        return np.stack((middle - half, middle + half))
 
     def coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Voxel centres along each axis: (z [nz], y [ny], x [nx]) in mm."""

@@ -165,7 +165,7 @@ def _total_variation(volume: F32, weight: float, gradient: F32, sums: NDArray[np
 def total_variation(volume: F32, gradient: F32, weight: float) -> float:
     """weight * mean |difference of neighbours| over the three axes; `gradient` [z, y, x] receives its derivative.
 
-    The mean runs over all differences of the box (Zha et al. 2024, eq. 9).
+    The mean runs over all differences of the box (Zha et al. 2024).
     """
     nz, ny, nx = volume.shape
     count = (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)

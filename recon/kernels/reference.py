@@ -1,7 +1,7 @@
 """The readable twin: projection and voxelisation of Gaussians as dense float64 sums, the oracle of every fast kernel.
 
-    density   σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),   Σ = R S² Rᵀ          (Zha et al. 2024, eq. 1)
-    ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))                    (eq. 6, parallel beam: exact)
+    density   σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),   Σ = R S² Rᵀ          (Zha et al. 2024)
+    ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))                    (parallel beam: exact)
 
 With the covariance in view coordinates split as [[Σ₂, v], [vᵀ, f]] (f along the ray), the corrected factor is
 μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)): the Schur complement, never negative, with no difference of large determinants.

@@ -13,16 +13,18 @@ from hypothesis import strategies as st
 from recon.density_control import Change, DensityPolicy, control
 from recon.gaussians import Gaussians
 from recon.kernels.reference import covariances, rotation_matrices
+from recon.volume import Grid
 from tests.recon.conftest import Make
 
 FIELD = 20.0
+BOX = Grid((20, 20, 20)).edges
 
 
 def _control(g: Gaussians, statistic: np.ndarray, policy: DensityPolicy, limit: int = 1000) -> Change:
     rotations = rotation_matrices(g.quaternions).reshape(-1, 9).numpy()
     return control(
         g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy(), statistic.astype(np.float32),
-        policy, FIELD, limit, (FIELD / 2,) * 3, np.random.default_rng(1),
+        policy, FIELD, limit, BOX, np.random.default_rng(1),
     )  # fmt: skip
 
 
@@ -61,6 +63,17 @@ def test_pruning_takes_the_faint_and_the_lost() -> None:
     change = _control(g, np.zeros(3), DensityPolicy())
     assert change.keep.tolist() == [0]
     assert change.parents.size == 0
+
+
+def test_the_box_may_lie_anywhere() -> None:
+    g = Gaussians.from_physical([[12.0, 0, 0], [-7.0, 0, 0], [0, 3.0, 0], [0, 0, -4.0]], [1.0] * 4, [1.0] * 4)
+    box = Grid((6, 10, 20), centre=(-1.5, 0.0, 4.0)).edges  # x -6..14, y -5..5, z -4.5..1.5
+    rotations = rotation_matrices(g.quaternions).reshape(-1, 9).numpy()
+    change = control(
+        g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy(), np.zeros(4, np.float32),
+        DensityPolicy(), FIELD, 10, box, np.random.default_rng(1),
+    )  # fmt: skip
+    assert change.keep.tolist() == [0, 2, 3]
 
 
 def test_the_limit_keeps_the_most_wanted(random_gaussians: Make) -> None:

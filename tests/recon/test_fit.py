@@ -17,7 +17,7 @@ from recon.losses import total_variation as twin_tv
 from recon.splat import Truncation, project, voxelize
 from recon.volume import Grid
 from tests.recon.conftest import Make
-from tests.recon.helpers import gradients, in_double
+from tests.recon.helpers import as_leaves, gradients, in_double
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (22, 26), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
@@ -104,6 +104,34 @@ def test_bad_data_are_refused(random_gaussians: Make) -> None:
     data[2, 3, 4] = np.nan
     with pytest.raises(ValueError, match="1 of"):
         fit.make_problem(data, VIEWS, GRID, 1.0, PLAIN)
+
+
+def test_a_model_without_gaussians_or_with_bad_ones_is_refused(random_gaussians: Make) -> None:
+    g = random_gaussians(3)
+    with pytest.raises(ValueError, match="no Gaussians"):
+        fit.init(g.select(torch.zeros(3, dtype=torch.bool)), 0)
+    with pytest.raises(ValueError, match=r"means .* 9 values"):
+        fit.init(replace(g, means=g.means * torch.nan), 0)
+
+
+def test_any_kind_of_tensor_starts_a_fit(random_gaussians: Make) -> None:
+    g = random_gaussians(5)
+    for other in (in_double(g), as_leaves(g)):
+        state = fit.init(other, 0)
+        for name, values in fit.init(g, 0).parameters.items():
+            assert state.parameters[name].dtype == np.float32
+            np.testing.assert_allclose(state.parameters[name], values, rtol=1e-6)
+
+
+def test_views_of_nothing_leave_a_model_to_go_on_with(random_gaussians: Make) -> None:
+    # All Gaussians fade below the pruning limit; the fit goes on, and no array becomes empty.
+    g = random_gaussians(10, extent=6.0)
+    policy = DensityPolicy(start=0, stop=2, every=10, prune_below=1e3)
+    settings = fit.FitSettings(policy=policy)
+    empty = np.zeros((VIEWS.n_views, *VIEWS.detector_shape), np.float32)
+    state = fit.run(fit.init(g, 0), fit.make_problem(empty, VIEWS, GRID, 1.0, settings), settings, 25)
+    assert state.n == 10 and state.step == 25
+    assert all(np.isfinite(values).all() for values in state.parameters.values())
 
 
 def replace_unit(g: Gaussians, factor: float) -> Gaussians:

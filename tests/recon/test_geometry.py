@@ -68,6 +68,44 @@ def test_voxel_centres_are_symmetric_about_the_grids_centre() -> None:
     np.testing.assert_allclose(np.diff(x), 0.5)
 
 
+def test_the_edges_are_half_a_voxel_beyond_the_centres() -> None:
+    grid = Grid((3, 4, 5), 0.5, centre=(1.0, 2.0, 3.0))
+    low, high = grid.edges
+    for axis, centres in zip((2, 1, 0), grid.coordinates(), strict=True):
+        assert (low[axis], high[axis]) == pytest.approx((centres[0] - 0.25, centres[-1] + 0.25))
+
+
+@given(
+    rows=st.integers(1, 9), cols=st.integers(1, 40), axis=st.floats(-60, 60), pitch=st.floats(1e-3, 1e3),
+    coarser=st.floats(1, 5),
+)  # fmt: skip
+def test_the_field_holds_every_ray_and_no_more(rows: int, cols: int, axis: float, pitch: float, coarser: float) -> None:
+    views = Geometry.parallel([0.0], (rows, cols), pitch, axis)
+    field = Grid.of_field(views, pitch * coarser)
+    (_, _, low), (x, y, high) = field.edges
+    on = min(max(axis, -0.5), cols - 0.5)
+    reach = max(on + 0.5, cols - on - 0.5) * pitch
+    assert x == y and reach * (1 - 1e-5) <= x < reach + pitch * coarser
+    assert -low == high and rows * pitch / 2 * (1 - 1e-5) <= high < rows * pitch / 2 + pitch * coarser
+
+
+def test_the_field_of_a_centred_axis_is_the_matching_grid() -> None:
+    for cols, pitch in ((7, 0.1), (160, 0.0046), (2048, 1.0)):
+        views = Geometry.parallel([0.0], (5, cols), pitch)
+        assert Grid.of_field(views, pitch) == Grid.matching(views)
+
+
+def test_a_grid_takes_any_list_of_whole_numbers() -> None:
+    assert Grid([2, 3, 4], centre=np.zeros(3)) == Grid((2, 3, 4))  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        Grid((2.5, 3, 4))  # type: ignore[arg-type]
+    for arguments, message in (
+        ({"shape": (0, 3, 4)}, "shape"), ({"voxel_size": 0.0}, "voxel_size"), ({"centre": (0, np.nan, 0)}, "centre"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            Grid(**({"shape": (2, 3, 4)} | arguments))  # type: ignore[arg-type]
+
+
 def test_a_volume_fits_its_grid() -> None:
     with pytest.raises(ValueError, match="shape"):
         Volume(np.zeros((2, 2, 2), np.float32), Grid((2, 2, 3)))

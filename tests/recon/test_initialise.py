@@ -7,7 +7,7 @@ import pytest
 
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.initialise import morton_order, sample_gaussians, scale_to_data
+from recon.initialise import morton_order, place, sample_gaussians, scale_to_data
 from recon.splat import project
 from recon.volume import Grid, Volume
 from tests.recon.conftest import Make
@@ -35,6 +35,19 @@ def test_nothing_is_placed_outside_the_field(rng: np.random.Generator) -> None:
 
 def test_fewer_voxels_give_fewer_gaussians(rng: np.random.Generator) -> None:
     assert sample_gaussians(_ball(2.0), 10**6, rng, field_radius=6.0, smooth=0).n < 40
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_very_few_gaussians_are_a_model_too(rng: np.random.Generator, n: int) -> None:
+    placed = sample_gaussians(_ball(), n, rng, field_radius=6.0)
+    assert placed.n == n and bool((placed.scales > 0).all()) and bool(placed.scales.isfinite().all())
+
+
+@pytest.mark.parametrize("count", [0, -5])
+def test_no_gaussians_are_refused(count: int, rng: np.random.Generator) -> None:
+    views = Geometry.parallel([0.0, 1.0], (4, 6))
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        place(np.ones((2, 4, 6), np.float32), views, Grid.matching(views), count, rng)
 
 
 def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:

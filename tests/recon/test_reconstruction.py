@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+import torch
 
 import recon
 from recon.metrics import psnr
@@ -57,6 +60,51 @@ def test_a_model_can_be_continued(noisy: np.ndarray) -> None:
     assert second.history[-1].n_gaussians == first.history[-1].n_gaussians
 
 
+def test_a_small_box_holds_what_the_whole_volume_holds_there(noisy: np.ndarray) -> None:
+    # The matter outside the box is in the views, so it must be in the model.
+    z, y, x = GRID.coordinates()
+    box = recon.Grid((6, 12, 10), PITCH, centre=(float(z[9:15].mean()), float(y[20:32].mean()), float(x[5:15].mean())))
+    whole, part = (recon.reconstruct(noisy, VIEWS, grid, steps=60).volume.data for grid in (GRID, box))
+    np.testing.assert_allclose(part, whole[9:15, 20:32, 5:15], atol=1e-3 * whole.max())
+
+
+def test_matter_beyond_the_default_grid_is_explained() -> None:
+    # A full turn with the axis near the edge: the detector sees a sample wider than itself.
+    sample = Phantom.of((Cylinder(2.6, 1.6, 0.2), Ellipsoid((0.5, 0.4, 0.4), 0.6, centre=(-0.6, 0.4, 0.1))))
+    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    detector = Detector(SHAPE, PITCH, 32.0, (SHAPE[0] - 1) / 2)
+    views = recon.Geometry.parallel(turn, SHAPE, PITCH, axis_col=32.0)
+    data = np.stack([sample.line_integrals(a, detector) for a in turn])
+    grid = recon.Grid.of_field(views, PITCH)
+    result = recon.reconstruct(data, views, grid, steps=400, gaussians=2500)
+    assert result.history[-1].residual < 0.06
+    assert psnr(sample.attenuation(grid), result.volume.data) > 25
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        lambda a: torch.from_numpy(a.astype(np.float64)).requires_grad_(),
+        lambda a: np.asfortranarray(a),
+        lambda a: np.repeat(a, 2, axis=2)[:, :, ::2],
+        lambda a: a.astype(np.float64).tolist(),
+    ],
+)
+def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callable[[np.ndarray], object]) -> None:
+    expected = recon.reconstruct(noisy, VIEWS, steps=5, gaussians=300).volume.data
+    found = recon.reconstruct(kind(noisy), VIEWS, steps=5, gaussians=300).volume.data  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_no_step_gives_the_starting_point(noisy: np.ndarray) -> None:
+    result = recon.reconstruct(noisy, VIEWS, steps=0, gaussians=300)
+    assert [p.step for p in result.history] == [0] and result.history[0].n_gaussians == 300
+    assert result.gaussians is not None and result.volume.data.max() > 0
+    # Scaled to the data: the sum of the volume is that of the line integrals.
+    mass = float(result.volume.data.sum()) * PITCH
+    assert mass == pytest.approx(float(noisy.sum(axis=(1, 2)).mean()), rel=0.1)
+
+
 def test_it_can_be_stopped_and_watched(noisy: np.ndarray) -> None:
     seen: list[int] = []
     result = recon.reconstruct(
@@ -79,7 +127,15 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
         ({"method": "magic"}, "method must be one of"),
         ({"projections": np.zeros((3, 20, 40))}, "geometry says"),
         ({"projections": np.full((24, 20, 40), np.nan)}, "not finite"),
+        ({"projections": np.full((24, 20, 40), 1e300)}, "not finite"),
+        ({"projections": np.ones((24, 20, 40), complex)}, "real numbers"),
         ({"projections": np.zeros((24, 20, 40))}, "no matter"),
+        ({"filter": "magic"}, "filter must be one of"),
+        ({"steps": -1}, "steps must be"),
+        ({"seconds": -1.0}, "seconds must be"),
+        ({"seconds": float("nan")}, "seconds must be"),
+        ({"gaussians": 0}, "at least one Gaussian"),
+        ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
     ],
 )
 def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], message: str) -> None:

@@ -94,7 +94,11 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
     bad[0, 3, 3] = np.nan
     with pytest.raises(ValueError, match="nothing was added"):
         model.add_views(bad, ANGLES[:1])
+    with pytest.raises(ValueError, match="nothing was added"):
+        model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])  # type: ignore[arg-type]
     assert model.n_views == 0
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        StreamingFit(VIEWS, GRID, gaussians=0)
     with pytest.raises(ValueError, match="no view"):
         model.finish(0.1)
 
