@@ -6,9 +6,11 @@ Exit codes: 0 done; 1 defect (with a traceback); 2 usage or configuration; 3 dev
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
@@ -73,5 +75,26 @@ def main() -> None:
     """
 
 
+def run() -> NoReturn:
+    """The command as a process: what ends it is its exit code, whatever state a full disk left HDF5 in.
+
+    HDF5 crashes at the end of a process that holds a file which could not be closed; that code would be -11, not 5.
+    """
+    try:
+        main(prog_name="beamline")
+    except SystemExit as end:
+        if end.code and _holds_hdf5_files():
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(end.code if isinstance(end.code, int) else BeamlineError.exit_code)
+        raise
+    sys.exit(0)
+
+
+def _holds_hdf5_files() -> bool:
+    h5py = sys.modules.get("h5py")
+    return h5py is not None and h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL) > 0
+
+
 if __name__ == "__main__":
-    main(prog_name="beamline")
+    run()

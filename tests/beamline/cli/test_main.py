@@ -5,10 +5,13 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 
 import click
+import h5py
 import pytest
 from click.testing import CliRunner
 
@@ -98,3 +101,28 @@ def test_version() -> None:
     result = CliRunner().invoke(module.main, ["--version"])
     assert result.exit_code == 0
     assert result.stdout.startswith("beamline, version ")
+
+
+def test_a_file_that_hdf5_cannot_close_does_not_cost_the_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a full disk such a file stays open, and HDF5 would crash at the end of the process."""
+    ended: list[int] = []
+
+    def failing(**_: object) -> None:
+        raise SystemExit(5)
+
+    monkeypatch.setattr(module, "main", failing)
+    monkeypatch.setattr(module.os, "_exit", ended.append)
+    with h5py.File(tmp_path / "open.h5", "w"), pytest.raises(SystemExit):
+        module.run()
+    assert ended == [5]
+    monkeypatch.setattr(module, "main", lambda **_: None)
+    with h5py.File(tmp_path / "other.h5", "w"), pytest.raises(SystemExit) as done:
+        module.run()
+    assert (done.value.code, ended) == (0, [5])
+
+
+def test_the_installed_command_is_the_process() -> None:
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))
+    assert project["project"]["scripts"] == {"beamline": f"{module.__name__}:{module.run.__name__}"}
