@@ -208,6 +208,7 @@ def test_a_camera_error_once_is_survived_twice_is_not() -> None:
     assert len(run.frames) == 10
     assert run.scan.missing == []  # what was never reached is not missing
     assert_safe(for_good, home=False)
+    assert f"move {HOME}" not in for_good.log  # with a device that failed nothing moves that need not
 
 
 def test_a_camera_without_triggers_is_an_instrument_error_that_says_what_to_check() -> None:
@@ -308,6 +309,7 @@ def test_an_abort_leaves_everything_where_it_is_but_safe(mode: Mode) -> None:
     assert run.error.exit_code == 130
     assert len(run.frames) == 12
     assert "abort stage" in bench.log
+    assert f"move {HOME}" not in bench.log
     assert_safe(bench, home=False)
     assert bench.stage.position() != pytest.approx(HOME * COUNT)
 
@@ -390,6 +392,7 @@ def test_a_stage_that_cannot_be_made_safe_is_said_though_the_data_are_good() -> 
     assert "shutter: does not answer" in str(run.error)
     assert len(run.frames) == 12
     assert not bench.camera.armed
+    assert f"move {HOME}" not in bench.log
 
 
 def test_a_defect_in_one_driver_does_not_leave_the_other_devices_unsafe() -> None:
