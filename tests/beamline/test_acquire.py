@@ -67,7 +67,7 @@ def assert_safe(bench: Instrument, home: bool = True) -> None:
     assert not bench.is_open
     assert not bench.camera.armed
     assert not bench.stage.moving()
-    assert bench.stage.train is None
+    assert (bench.stage.train, bench.stage.pulses) == (None, [])  # disarmed
     if home:
         assert bench.stage.position() == pytest.approx(HOME * COUNT)
         assert bench.is_in
@@ -93,6 +93,9 @@ def test_a_scan_is_its_plan_frame_by_frame(mode: Mode, at: Place) -> None:
     assert run.scan.missing == []
     assert_safe(bench)
     assert [e for e, _ in run.events] == ["block_started", "block_done"] * len(timeline.blocks)
+    done = [data for event, data in run.events if event == "block_done"]
+    assert [data["frames"] for data in done] == [block.n for block in timeline.blocks]
+    assert {(data["lost"], data["ignored"], data["extra"], len(data["missing"])) for data in done} == {(0, 0, 0, 0)}
 
 
 def test_the_frame_that_leaves_owns_its_memory() -> None:
