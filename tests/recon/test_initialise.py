@@ -28,6 +28,14 @@ def test_gaussians_sit_in_the_matter(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(placed.means.numpy().mean(0), [1.0, 0.0, 1.0], atol=0.3)
 
 
+def test_more_sit_where_the_density_changes(rng: np.random.Generator) -> None:
+    # Half of the weight is gradient: without it the shell would hold its share of the volume, 1 - (2/3)³ = 0.70.
+    volume = _ball()
+    placed = sample_gaussians(volume, 400, rng, field_radius=6.0, smooth=0.5)
+    away = np.linalg.norm(placed.means.numpy() - [1.0, 0.0, 1.0], axis=1)
+    assert (away > 2.0).mean() > 0.8
+
+
 def test_nothing_is_placed_outside_the_field(rng: np.random.Generator) -> None:
     placed = sample_gaussians(_ball(), 400, rng, field_radius=2.0)
     assert np.hypot(*placed.means.numpy()[:, :2].T).max() < 2.0 + 0.5

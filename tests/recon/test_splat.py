@@ -153,6 +153,18 @@ def test_default_truncation_loses_little(random_gaussians: Make) -> None:
     assert float((whole - cut).abs().max()) < 0.01 * float(whole.max())
 
 
+@pytest.mark.parametrize(("above", "seen"), [(1.5, True), (0.7, False)])
+def test_what_is_faint_is_left_out(above: float, seen: bool) -> None:
+    # A projection's limit is the fraction times the field times the density unit, a volume's times the unit alone.
+    cut, unit, sigma = Truncation(3.5, 1e-3), 0.7, 0.8
+    views = geometry()
+    peak = above * cut.faint * unit * SHAPE[1] * views.pixel_pitch
+    one = Gaussians.from_physical([[0.0, 0, 0]], [sigma], [peak / (sigma * math.sqrt(2 * math.pi))], density_unit=unit)
+    assert bool(project(one, views, truncation=cut).any()) == seen
+    one = Gaussians.from_physical([[0.0, 0, 0]], [sigma], [above * cut.faint * unit], density_unit=unit)
+    assert bool(voxelize(one, Grid((5, 5, 5), 0.5), truncation=cut).any()) == seen
+
+
 @settings(deadline=None, max_examples=40)
 @given(
     exponent=st.floats(-3, 3),

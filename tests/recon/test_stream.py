@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from recon import Geometry, Grid
+from recon import Geometry, Grid, fit
+from recon.density_control import DensityPolicy
 from recon.initialise import default_count
 from recon.metrics import psnr
 from recon.stream import StreamingFit
@@ -84,6 +87,42 @@ def test_it_waits_for_views_that_are_apart(data: np.ndarray) -> None:
     assert not model.snapshot().data.any()
     model.add_views(data[20:22], ANGLES[20:22])
     assert model.advance(0.1).n_gaussians > 0 and model.started
+
+
+def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_end(
+    data: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[tuple[int | None, float]] = []
+    step = fit.step
+
+    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
+        taken.append((view, fraction))
+        return step(state, problem, settings, fraction, view)
+
+    monkeypatch.setattr(fit, "step", spy)
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=StepClock())
+    model.add_views(data, ANGLES)
+    model.advance(6.0)
+    newest = [view for view, _ in taken if view is not None]
+    assert len(taken) > 150 and 0.22 < len(newest) / len(taken) < 0.45
+    assert set(newest) == set(range(32, 40))  # the last fifth of forty
+    assert all(0 <= fraction <= 0.5 for _, fraction in taken)
+    taken.clear()
+    model.finish(3.0)
+    fractions = [fraction for _, fraction in taken]
+    assert fractions == sorted(fractions) and fractions[0] < 0.05 and fractions[-1] > 0.95
+    assert all(view is None for view, _ in taken)
+
+
+def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
+    greedy = fit.FitSettings(policy=DensityPolicy(start=0, every=1, threshold=0, prune_below=0))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=500, settings=greedy, now=StepClock())
+    counts = []
+    for first, last in ((0, 16), (16, 24), (24, 36)):  # each half as many again
+        model.add_views(data[first:last], ANGLES[first:last])
+        counts.append(model.advance(0.3).n_gaussians)
+    assert counts == [550, 600, 650]
+    assert model.finish(0.3).n_gaussians == 750
 
 
 def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> None:
