@@ -197,10 +197,12 @@ def _grew(made: Made) -> bool:
 
 
 def _told_by_history(made: Made) -> str:
+    gaussians = {progress.n_gaussians for progress in made.history}
+    growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit of the model to the views it had"]
     parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
-    parts += ["growth of views and Gaussians"] if _grew(made) else []
-    return f"{'; '.join(parts)}; in the time since {'the scan was followed' if _grew(made) else 'the fit began'}."
+    parts += [f"how many {' and '.join(growing)} there were"] if growing else []
+    return f"{', '.join(parts)}, in the time since {'the file was first seen' if _grew(made) else 'the fit began'}."
 
 
 def _text(value: object) -> str:
