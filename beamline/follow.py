@@ -31,6 +31,7 @@ from drivers.frame import FrameKind
 from recon.align import AxisEstimate
 from recon.fit import Progress
 from recon.stream import StreamingFit
+from recon.warm_up import warm_up
 
 _FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
 _BATCH = 32  # views corrected before the fit goes on
@@ -78,6 +79,8 @@ def follow(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm | Non
     wanted = None if options.truth is None else read_truth(options.truth)
     started = clock.now()
     warn = Warnings(sink, clock)
+    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    warm_up()
     with _open(options, sink, clock, rhythm) as source:
         growing = _Growing(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
@@ -188,7 +191,8 @@ class _Growing:
     def _settle_axis(self, corrector: Corrector, views: NDArray[np.int64], ended: bool) -> None:
         """Look for the axis each time the views have grown by half, and once more when all are there.
 
-        While views come only a clear optimum counts. Where it moves, the fit begins anew with all views.
+        While views come only a clear optimum counts. Where it moves by much, the fit begins anew with all views; by
+        little, it goes on.
         """
         if views.size < self._next_axis and not ended:
             return
@@ -200,9 +204,16 @@ class _Growing:
             if last_chance:
                 raise
             return  # the views do not cover enough angles yet
-        moved = self.axis_col is None or abs(found - self.axis_col) > _AXIS_MOVES
-        if moved and (estimate.confident or last_chance):
-            self.axis_col, self.axis, self._fit, self._taken = found, estimate, None, 0
+        if not (estimate.confident or last_chance):
+            return
+        if self.axis_col is None or abs(found - self.axis_col) > _AXIS_MOVES:
+            self._fit, self._taken = None, 0
+        elif self._fit is not None:
+            self._fit.move_axis(self._binned(found))
+        self.axis_col, self.axis = found, estimate
+
+    def _binned(self, axis_col: float) -> float:
+        return geometry_of(self.source, self._options.selection, axis_col, np.zeros(1)).axis_col
 
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)

@@ -72,7 +72,7 @@ class ReconOptions:
     steps: int | None = None
     seconds: float | None = None
     gaussians: int | None = None
-    filter: Filter = "ram-lak"
+    filter: Filter = "hann"
     seed: int = 0
     truth: str | None = None
     unfinished: bool = False

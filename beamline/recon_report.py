@@ -62,7 +62,7 @@ class Made:
     seconds: float
     history: Sequence[Progress]
     settings: Mapping[str, Any]
-    filter: Filter = "ram-lak"
+    filter: Filter = "hann"
     psnr: Sequence[tuple[float, float]] = ()
 
 

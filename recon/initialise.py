@@ -18,6 +18,10 @@ from recon.volume import Grid, Volume
 # Voxels below this fraction of the density unit hold no matter worth a Gaussian (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
 
+# Standard deviation of a new Gaussian in distances to its neighbours. Zha et al. take 1; narrower ones start sharper
+# and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3; 0.55 is worse on the walnut).
+_SPREAD = 0.8
+
 
 def density_unit(volume: Volume) -> float:
     """A typical high density of the volume: the 99.5th percentile of its positive part, 1/mm."""
@@ -93,7 +97,7 @@ def sample_gaussians(
     k, j, i = np.unravel_index(chosen, data.shape)
     jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.voxel_size
     means = np.stack((x[i], y[j], z[k]), 1) + jitter
-    scales = neighbour_distance(means)
+    scales = _SPREAD * neighbour_distance(means)
     scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))
     return Gaussians.from_physical(means, scales, data.ravel()[chosen].astype(np.float64) * unit, density_unit=unit)
 

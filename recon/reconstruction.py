@@ -56,7 +56,7 @@ def reconstruct(
     densify: bool = True,
     seed: int = 0,
     *,
-    filter: Filter = "ram-lak",
+    filter: Filter = "hann",
     settings: fit.FitSettings | None = None,
     seconds: float | None = None,
     on_progress: Callable[[fit.Progress], None] | None = None,
@@ -75,7 +75,7 @@ def reconstruct(
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         densify: the fit may clone, split and prune.
         seed: of every random choice; the same seed gives the same volume on the same machine.
-        filter: of "fbp" ("ram-lak", "shepp-logan" or "hann").
+        filter: of "fbp" ("ram-lak", "shepp-logan" or "hann"). The smooth one is best for few or noisy views.
         settings: of the fit, in full; overrides `densify`.
         seconds: a time budget for the fit; the rates decay along it.
         on_progress: called about ten times a second.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,6 +97,16 @@ class StreamingFit:
             self._data.extend(images)
         else:
             self._problem = fit.extend(self._problem, images, theta)
+
+    def move_axis(self, axis_col: float) -> None:
+        """Say that the rotation axis lies elsewhere. The model stays: a fraction of a pixel is soon learnt again.
+
+        Begin a new fit where the axis moves by so much that edges in the model are doubled.
+        """
+        self._template = replace(self._template, axis_col=float(axis_col))
+        if self._problem is not None:
+            moved = replace(self._problem.geometry, axis_col=float(axis_col))
+            self._problem = replace(self._problem, geometry=moved)
 
     def advance(self, seconds: float) -> fit.Progress:
         """Fit for about `seconds` s (at least one step once there is a model) and say where it stands."""

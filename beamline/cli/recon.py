@@ -6,6 +6,7 @@ import math
 import re
 import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from beamline.cli.narrate import results
 from beamline.cli.scan_options import scan_options
 from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.deliver import Target
+from beamline.errors import QualityError
 from beamline.events import Event, fan_out
 from beamline.follow import follow as follow_scan
 from beamline.offline import Method, ReconOptions, SourceOptions, run
@@ -115,9 +117,15 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     "--filter",
     "ramp",
     type=click.Choice(["ram-lak", "shepp-logan", "hann"]),
-    default="ram-lak",
+    default="hann",
     show_default=True,
-    help="Of the fbp, also of the one that r2 is compared with.",
+    help="Of the fbp, also of the one that r2 is compared with. hann is best for few or noisy views.",
+)
+@click.option(
+    "--max-residual",
+    type=click.FloatRange(min=0),
+    metavar="X",
+    help="Exit with code 6 where the data residual (of views held out, if there are any) is larger.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
 @click.option("--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5), slices A to B.")
@@ -145,6 +153,7 @@ def recon(
     seconds: float | None,
     gaussians: int | None,
     ramp: Filter,
+    max_residual: float | None,
     seed: int,
     truth: str | None,
     output: Path | None,
@@ -190,12 +199,22 @@ def recon(
     last: list[Event] = []
     with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         sink = fan_out(last.append, *(json_sinks or [terminal]))
-        if follow:
-            follow_scan(options, sink, clock)
-        else:
-            run(options, sink, clock)
+        metrics = (follow_scan if follow else run)(options, sink, clock)
     if not as_json:
         click.echo(results(last[-1].data))
+    if max_residual is not None:
+        require(metrics, max_residual)
+
+
+def require(metrics: Mapping[str, float], max_residual: float) -> None:
+    """Raises QualityError where a finished volume explains the data less well than asked for."""
+    name = "residual_held_out" if "residual_held_out" in metrics else "residual"
+    if not metrics[name] <= max_residual:
+        views = "held out" if name == "residual_held_out" else "used"
+        raise QualityError(
+            f"The data residual of views {views} is {metrics[name]:.4g}, more than --max-residual {max_residual:g}. "
+            "The volume and its report were written; look at them, at the axis, and at the flags of the scan."
+        )
 
 
 def report_beside(output: Path) -> Path:

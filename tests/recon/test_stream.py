@@ -146,3 +146,20 @@ def test_the_count_follows_the_grid() -> None:
     assert default_count(Grid((4, 4, 4))) == 2000
     assert default_count(Grid((100, 200, 200))) == pytest.approx(np.pi / 4 * 4e6 / 60, rel=0.01)
     assert default_count(Grid((2048, 2048, 2048))) == 200_000
+
+
+def test_a_moved_axis_is_learnt_without_beginning_anew(data: np.ndarray, phantom: Phantom) -> None:
+    truth = phantom.attenuation(GRID)
+    off = Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=VIEWS.axis_col + 0.4)
+
+    def run(corrected: bool) -> float:
+        model = StreamingFit(off, GRID, 0, gaussians=1500, now=StepClock())
+        model.add_views(data, ANGLES)
+        model.advance(2.0)
+        before = model.progress().step
+        if corrected:
+            model.move_axis(VIEWS.axis_col)
+        assert model.finish(4.0).step > before > 0
+        return psnr(truth, model.snapshot().data)
+
+    assert run(corrected=True) > run(corrected=False) + 1

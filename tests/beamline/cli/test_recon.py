@@ -229,6 +229,15 @@ def test_a_measured_scan_from_hdf5_and_from_its_tiffs(folder: Path, shared_data:
     assert float(np.sqrt(np.mean((a.volume.data - b.volume.data) ** 2))) < 0.05 * spread
 
 
+@pytest.mark.parametrize(("limit", "code"), [("1.0", 0), ("1e-6", 6)])
+def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path, limit: str, code: int) -> None:
+    result = _beamline("recon", "scan.h5", "-m", "fbp", "--views", "fixed:15", "--max-residual", limit, "--json")
+    assert result.exit_code == code, result.output
+    assert _left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html"}
+    assert json.loads(result.stdout.splitlines()[-1])["event"] == "done"
+    assert ("views held out" in result.stderr) is (code == 6)
+
+
 def test_names() -> None:
     assert report_beside(Path("runs/x/recon.h5")) == Path("runs/x/report.html")
     assert report_beside(Path("walnut_r2.h5")) == Path("walnut_r2.html")
