@@ -19,7 +19,7 @@ from recon.volume import Grid, Volume
 MATTER = 0.05
 
 # Standard deviation of a new Gaussian in distances to its neighbours. Zha et al. take 1; narrower ones start sharper
-# and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3; 0.55 is worse on the walnut).
+# and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3; 0.55 loses on the walnut).
 _SPREAD = 0.8
 
 
