@@ -83,7 +83,10 @@ def axis_from_pair(
 
 
 def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
-    """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows."""
+    """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows.
+
+    1 where these columns hold next to nothing of what the views hold: air alone always matches.
+    """
     rows, cols = a.shape
     a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
     total = (2 * candidates).astype(int)  # i + j of the pixels compared
@@ -98,7 +101,8 @@ def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     count, sum_a, sum_b = last - first, sums(a), sums(b)
     covariance = (product - sum_a * sum_b / count).sum(axis=0)
     variance = (sums(a * a) - sum_a**2 / count).sum(axis=0) * (sums(b * b) - sum_b**2 / count).sum(axis=0)
-    return 1 - covariance / np.sqrt(np.maximum(variance, 1e-30))
+    told = variance > 1e-6 * (a * a).sum() * (b * b).sum()
+    return np.where(told, 1 - covariance / np.sqrt(np.where(told, variance, 1)), 1)
 
 
 def axis_from_sinogram(

@@ -96,6 +96,8 @@ def _plan_fill(mask: Mask) -> _Fill:
         nr, nc = np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)
         valid = inside & known[nr, nc]
         ready = valid.any(axis=1)
+        if not ready.any():
+            raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
         plan.append((r[ready], c[ready], nr[ready], nc[ready], valid[ready]))
         known[r[ready], c[ready]] = True
         r, c = r[~ready], c[~ready]
@@ -244,6 +246,9 @@ def correct(
     """
     settings = CorrectionSettings() if settings is None else settings
     _check(counts, positions, references, settings)
+    for name, given, shape in (("view_ids", view_ids, counts.shape[:1]), ("masked", masked, counts.shape[1:])):
+        if given is not None and np.shape(given) != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {np.shape(given)}")
     dead = dead_pixels(references, settings.hot_threshold) if masked is None else masked
     data, replaced = _transmission(counts, positions, references, dead)
     left, right = air_columns(data) if settings.air == "auto" else (0, 0) if settings.air == "none" else settings.air
@@ -309,6 +314,10 @@ def _check(
     views, shape, cols = counts.shape[0], counts.shape[1:], counts.shape[2]
     if np.shape(positions) != (views,):
         raise ValueError(f"positions must hold one number for each of {views} views, got shape {np.shape(positions)}")
+    if not np.isfinite(positions).all():
+        raise ValueError(
+            f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
+        )
     if not references.flats:
         raise ValueError("there is no flat: without one, counts cannot become line integrals")
     for name, image in [("dark", references.dark), *((f"flat at {p:g}", flat) for p, flat in references.flats)]:

@@ -22,7 +22,7 @@ from recon.volume import Grid
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
-_GAP_LIMIT = 8.0  # an angular gap this many times the median is missing data, not coarse sampling
+_GAP_LIMIT = 8.0  # an angular gap this many times the median may be missing data, not coarse sampling
 _SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
 
 
@@ -30,13 +30,18 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
     """Quadrature weight of each view: its Voronoi cell on the half circle, in radians.
 
     Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
-    where the half circle is covered. A gap of more than 8 median steps is a missing wedge: the views beside it weigh
-    as if the sampling went on, and the sum is the angle that was measured.
+    where the half circle is covered. A gap of more than 8 median steps, and wider than random angles leave by chance,
+    is a missing wedge: the views beside it weigh as if the sampling went on, and the sum is the angle measured.
 
     Args:
         angles: [view], radians, any order and range.
+
+    Raises:
+        ValueError: for no angles, or some that are not finite.
     """
     theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
+    if theta.size == 0 or not np.isfinite(theta).all():
+        raise ValueError(f"weights need at least one angle, all finite, got {theta.size}")
     if theta.size == 1:
         return np.full(1, np.pi)
     order = np.argsort(theta, kind="stable")
@@ -52,7 +57,9 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
         return np.full(theta.size, np.pi / theta.size)
     gaps = np.diff(starts, append=starts[0] + np.pi)
     typical = float(np.median(gaps))
-    gaps = np.where(gaps > _GAP_LIMIT * typical, typical, gaps)
+    # The widest of n random gaps of mean g exceeds g (ln n + 3) once in e³ = 20 times.
+    by_chance = np.pi / gaps.size * (math.log(gaps.size) + 3)
+    gaps = np.where(gaps > max(_GAP_LIMIT * typical, by_chance), typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)
     weights[order] = (cells / np.bincount(group))[group]

@@ -12,6 +12,7 @@ centre of the first column; row j has its centre at v = (j - (rows - 1) / 2) * p
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -49,7 +50,7 @@ class Geometry:
             ValueError: for no views, non-finite angles, an empty detector, or a pitch that is not positive.
         """
         theta = np.atleast_1d(np.asarray(angles, dtype=np.float64)).copy()
-        rows, cols = (int(n) for n in detector_shape)
+        rows, cols = (operator.index(n) for n in detector_shape)
         if theta.ndim != 1 or theta.size == 0:
             raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
         if not np.isfinite(theta).all():
@@ -70,8 +71,14 @@ class Geometry:
         return int(self.angles.size)
 
     def select(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Geometry:
-        """The same geometry with only `views`, in that order."""
-        theta = self.angles[views].copy()
+        """The same geometry with only `views`, in that order.
+
+        Raises:
+            ValueError: for no views.
+        """
+        theta = np.atleast_1d(self.angles[views]).copy()
+        if theta.size == 0:
+            raise ValueError("no views are selected")
         theta.setflags(write=False)
         return replace(self, angles=theta)
 
@@ -86,8 +93,11 @@ class Geometry:
         return replace(self, detector_shape=(stop - start, self.detector_shape[1]))
 
     def binned(self, factor: int) -> Geometry:
-        """The geometry after summing factor x factor pixels; trailing rows and columns that do not fill a bin go."""
-        if factor < 1:
+        """The geometry after joining factor x factor pixels; trailing rows and columns that do not fill a bin go.
+
+        As with `rows`, v is measured from the middle of what is left.
+        """
+        if operator.index(factor) < 1:
             raise ValueError(f"bin factor must be >= 1, got {factor}")
         rows, cols = (n // factor for n in self.detector_shape)
         if rows < 1 or cols < 1:

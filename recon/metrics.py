@@ -59,12 +59,14 @@ def _ssim_sum(x: Array, y: Array, span: float, plane: tuple[int, int]) -> tuple[
         return image
 
     c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
+    # About their own means: E[x²] - E[x]² of values far from zero would leave nothing but rounding.
+    base_x, base_y = x.mean(), y.mean()
+    x, y = x - base_x, y - base_y
     mean_x, mean_y = blur(x), blur(y)
-    cross = mean_x * mean_y
-    squares = mean_x**2 + mean_y**2
-    covariance = blur(x * y) - cross
-    variances = blur(x * x + y * y) - squares
-    local = (2 * cross + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))
+    covariance = blur(x * y) - mean_x * mean_y
+    variances = blur(x * x + y * y) - (mean_x**2 + mean_y**2)
+    mean_x, mean_y = mean_x + base_x, mean_y + base_y
+    local = (2 * mean_x * mean_y + c1) * (2 * covariance + c2) / ((mean_x**2 + mean_y**2 + c1) * (variances + c2))
     inner = [slice(None)] * x.ndim
     for axis in plane:
         if x.shape[axis] >= _WINDOW:
@@ -172,13 +174,15 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
         mask: 1 (True) dense, 0 (False) empty, -1 not judged; see `kmeans_mask`.
 
     Raises:
-        ValueError: where shapes differ or a region is empty of voxels.
+        ValueError: where shapes differ, a region is empty of voxels, or some of its voxels are not finite.
     """
     if volume.shape != mask.shape:
         raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
     dense, empty = np.asarray(volume[mask == 1], np.float64), np.asarray(volume[mask == 0], np.float64)
     if not dense.size or not empty.size:
         raise ValueError(f"the mask marks {dense.size} dense and {empty.size} empty voxels; both are needed")
+    if not (np.isfinite(dense).all() and np.isfinite(empty).all()):
+        raise ValueError("the volume holds NaN or infinite values")
     spread = float(empty.std())
 
     def decibel(signal: float) -> float:

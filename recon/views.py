@@ -31,9 +31,14 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0) -> NDArray[np.int64
         seed: for `random:N` without a seed of its own.
 
     Raises:
-        ValueError: for a selection that is not one of these forms, or that asks for more views than there are.
+        ValueError: for a selection that is not one of these forms, or that asks for more views than there are; for
+            angles that are not finite.
     """
     theta = np.asarray(angles, np.float64)
+    if not np.isfinite(theta).all():
+        raise ValueError(
+            f"views {np.flatnonzero(~np.isfinite(theta))[:8].tolist()} have no angle; leave them out first"
+        )
     everything = np.arange(theta.size)
     name, _, rest = spec.strip().partition(":")
     if name == "all" and not rest:

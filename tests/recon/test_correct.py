@@ -254,6 +254,14 @@ def test_bad_input_is_refused_with_its_values() -> None:
         correct(counts, at, References(dark, ((3.0, flat), (3.0, flat))))
     with pytest.raises(ValueError, match=r"\(40, 9\) do not fit 48"):
         correct(counts, at, references, CorrectionSettings(air=(40, 9)))
+    with pytest.raises(ValueError, match=r"positions of views \[2\]"):
+        correct(counts, np.where(at == 2, np.nan, at), references)
+    with pytest.raises(ValueError, match=r"masked must have shape \(16, 48\), got \(5, 5\)"):
+        correct(counts, at, references, masked=np.zeros((5, 5), bool))
+    with pytest.raises(ValueError, match=r"view_ids must have shape \(6,\), got \(2,\)"):
+        correct(counts, at, references, view_ids=np.arange(2))
+    with pytest.raises(ValueError, match="nothing to fill them from"):
+        correct(counts, at, references, masked=np.ones((16, 48), bool))
     with pytest.raises(ValueError, match="floor"):
         CorrectionSettings(floor=0)
     with pytest.raises(ValueError, match="thresholds"):

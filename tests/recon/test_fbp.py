@@ -188,6 +188,25 @@ def test_a_missing_wedge_does_not_load_the_views_beside_it() -> None:
     np.testing.assert_allclose(angular_weights(sector), np.deg2rad(2), rtol=1e-9)
 
 
+@pytest.mark.parametrize("n", [20, 45, 400])
+def test_random_angles_cover_the_half_circle(n: int) -> None:
+    # Their widest gap is chance, not a missing wedge: no density may be lost.
+    sums = [angular_weights(np.random.default_rng(seed).uniform(-np.pi, np.pi, n)).sum() for seed in range(40)]
+    assert np.isclose(sums, np.pi).mean() > 0.85
+
+
+@pytest.mark.parametrize(("span", "n"), [(90, 45), (120, 20), (150, 600), (170, 170)])
+def test_a_real_wedge_is_missed_however_dense_the_views(span: float, n: int) -> None:
+    angles = np.deg2rad(np.arange(n) * span / n)
+    np.testing.assert_allclose(angular_weights(angles), np.deg2rad(span / n), rtol=1e-9)
+
+
+@pytest.mark.parametrize("angles", [[], [0.0, np.nan]])
+def test_weights_of_no_angle_are_refused(angles: list[float]) -> None:
+    with pytest.raises(ValueError, match="at least one angle"):
+        angular_weights(angles)
+
+
 def test_bad_input_is_refused() -> None:
     geometry = Geometry.parallel(half_turn(4), (2, 8))
     good = np.zeros((4, 2, 8), np.float32)

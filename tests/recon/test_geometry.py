@@ -31,6 +31,13 @@ def test_selected_views_keep_their_order() -> None:
     assert chosen.angles.tolist() == [0.3, 0.1]
 
 
+def test_a_single_view_is_a_list_of_one_and_none_is_refused() -> None:
+    views = Geometry.parallel([0.1, 0.2, 0.3], (2, 2))
+    assert views.select(np.array([False, True, False])).angles.tolist() == [0.2]
+    with pytest.raises(ValueError, match="no views"):
+        views.select([])
+
+
 def test_rows_keep_the_columns() -> None:
     cut = Geometry.parallel([0.0], (10, 7), axis_col=2.5).rows(3, 8)
     assert cut.detector_shape == (5, 7) and cut.axis_col == 2.5

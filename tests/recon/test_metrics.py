@@ -85,6 +85,14 @@ def test_ssim_of_a_shift_in_brightness_is_its_luminance_term() -> None:
     assert ssim3d(*cube, span) == pytest.approx(expected, abs=1e-5)
 
 
+def test_ssim_of_values_far_from_zero_is_not_rounding(rng: np.random.Generator) -> None:
+    truth = blobs(rng, (12, 20, 20))
+    volume = truth + rng.normal(0, 0.1, truth.shape)
+    slices = [zip(np.moveaxis(truth, k, 0), np.moveaxis(volume, k, 0), strict=True) for k in range(3)]
+    expected = np.mean([np.mean([ssim2d(a + 1e4, b + 1e4, 2.0) for a, b in pairs]) for pairs in slices])
+    assert ssim3d(truth + 1e4, volume + 1e4, 2.0) == pytest.approx(expected, abs=2e-3)
+
+
 def particles(rng: np.random.Generator, noise: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """A can (bright wall at the rim) with dense particles inside, [z, y, x]."""
     z, y, x = np.meshgrid(np.arange(30), np.arange(64), np.arange(64), indexing="ij")
@@ -157,5 +165,7 @@ def test_bad_input_is_refused() -> None:
         inscribed_cuboid((3, 3, 3), 0.5)
     with pytest.raises(ValueError, match="0 dense and 1728 empty"):
         snr_cnr(ones, np.zeros(ones.shape, np.int8))
+    with pytest.raises(ValueError, match="NaN"):
+        snr_cnr(ones * np.nan, np.eye(12, dtype=np.int8)[None].repeat(12, 0))
     with pytest.raises(ValueError, match="the mask"):
         snr_cnr(ones, np.zeros((1, 1, 1), np.int8))

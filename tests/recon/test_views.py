@@ -114,6 +114,12 @@ def test_more_than_there_are_is_refused_with_the_number(spec: str) -> None:
         parse_views(spec, HALF)
 
 
+@pytest.mark.parametrize("spec", ["all", "fixed:2", "sector:0-90"])
+def test_views_without_an_angle_are_named(spec: str) -> None:
+    with pytest.raises(ValueError, match=r"views \[1\] have no angle"):
+        parse_views(spec, [0.0, np.nan, 1.0])
+
+
 def test_sectors_without_extent_or_views_are_refused() -> None:
     with pytest.raises(ValueError, match="end after it begins"):
         parse_views("sector:50-30", HALF)
