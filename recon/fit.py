@@ -97,6 +97,11 @@ class Problem:
     unit: float
     loss: ProjectionLoss
 
+    @property
+    def scale(self) -> np.float32:
+        """Line integrals over what `images` hold."""
+        return np.float32(self.half_field * self.unit)
+
 
 @dataclass(eq=False)
 class FitState:
@@ -148,8 +153,7 @@ def extend(problem: Problem, projections: F32, angles: NDArray[np.float64]) -> P
 
 
 def _with_views(problem: Problem, projections: F32) -> Problem:
-    scale = np.float32(1 / (problem.half_field * problem.unit))
-    images = tuple(np.ascontiguousarray(view, np.float32) * scale for view in projections)
+    images = tuple(np.ascontiguousarray(view, np.float32) / problem.scale for view in projections)
     maps = tuple(problem.loss.target_maps(image) for image in images)
     return replace(problem, images=problem.images + images, target_maps=problem.target_maps + maps)
 

@@ -26,6 +26,7 @@ from recon.volume import Grid, Volume
 _NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _ROUND = 400.0  # steps over which the rates decay within a round
+_BLIND = 100.0  # data so many times larger than the density unit explains: the first views showed nothing
 _ROOM = 0.1  # of the first count that a round may add; the last one has what is left of the growth
 
 
@@ -55,7 +56,6 @@ class StreamingFit:
         now: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._template, self._grid = template, grid or Grid.matching(template)
-        self._field = Grid.of_field(template, max(template.pixel_pitch, self._grid.voxel_size))
         self._rng = np.random.default_rng(seed)
         if gaussians is not None and gaussians < 1:
             raise ValueError(f"a model needs at least one Gaussian, got {gaussians}")
@@ -181,6 +181,16 @@ class StreamingFit:
         if self._state is None:
             if not force and (theta.size < self._first_views or _span(theta) < self._first_span):
                 return
+            try:
+                self._place_first()
+            except ValueError:  # no matter in these views: wait for half as many again
+                if force:
+                    raise
+                self._round_views = self.n_views
+                return
+        elif self._problem is not None and max(float(image.max()) for image in self._problem.images) > _BLIND:
+            # The sample came, or the shutter opened, after the first views: their scale is that of noise.
+            self._data = [image * self._problem.scale for image in self._problem.images]
             self._place_first()
         assert self._state is not None
         # Room is for what later views show: early ones span a narrow angle and would fill it with their streaks.
@@ -192,8 +202,9 @@ class StreamingFit:
     def _place_first(self) -> None:
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        placed = place(data, geometry, self._field, self._count, self._rng)
-        self._problem = fit.make_problem(data, geometry, self._field, placed.density_unit, self._settings)
+        field = Grid.of_field(self._template, max(geometry.pixel_pitch, self._grid.voxel_size))
+        placed = place(data, geometry, field, self._count, self._rng)
+        self._problem = fit.make_problem(data, geometry, field, placed.density_unit, self._settings)
         self._state = fit.init(placed, self._rng)
         self._placed = placed.n
         self._data = []  # the problem holds them from now on

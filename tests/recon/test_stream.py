@@ -125,6 +125,22 @@ def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
     assert model.finish(0.3).n_gaussians == 750
 
 
+@pytest.mark.parametrize("offset", [-1e-5, 1e-5])
+def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
+    # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+    for view, angle in enumerate(np.linspace(0, 1, 10)):
+        noise = np.random.default_rng(view).normal(offset, 1e-5, (1, *SHAPE)).astype(np.float32)
+        model.add_views(noise, [angle])
+        model.advance(0.05)
+    assert model.started == (offset > 0)
+    model.add_views(data, ANGLES)
+    model.advance(0.1)
+    end = model.finish(6.0)
+    assert end.n_views == 50
+    assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 15
+
+
 def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> None:
     model = StreamingFit(VIEWS, GRID, gaussians=500)
     with pytest.raises(ValueError, match="shape"):
