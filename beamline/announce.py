@@ -43,6 +43,8 @@ class Announcer:
 
     def _send(self, event: Event) -> None:
         for sink in list(self._sinks):
+            if sink not in self._sinks:  # given up while the others were told of another
+                continue
             try:
                 sink(event)
             except Exception as error:

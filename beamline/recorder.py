@@ -7,13 +7,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from queue import Full, Queue
 from typing import Any, Protocol
 
 import numpy as np
 
 from beamline.digest import FrameDigest, digest
-from beamline.errors import BeamlineError, DataError
+from beamline.errors import BeamlineError, DataError, in_words
 from beamline.exposures import Emit
 from beamline.monitor import scan as monitor
 from beamline.monitor.flag import Flag, Level
@@ -31,6 +32,10 @@ RATE_FRAMES = 20  # the rate is that of the last so many frames
 class Writer(Protocol):
     """What takes the rows: NXtomoWriter."""
 
+    @property
+    def path(self) -> Path: ...
+    @property
+    def committed(self) -> int: ...
     def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None: ...
 
 
@@ -108,17 +113,17 @@ class Recorder:
             raise self._stalled() from None
 
     def _stalled(self) -> DataError:
-        return DataError(
-            f"The disk took no frame for {STALL:g} s. {self.n_frames} frames are in the file; check the disk."
-        )
+        return DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
 
     def _heed_failure(self) -> None:
         cause = self._failure
         if isinstance(cause, BeamlineError):
             raise cause
         if cause is not None:
-            text = f"A frame could not be written: {cause}. {self.n_frames} frames are in the file."
-            raise DataError(text) from cause
+            raise DataError(f"A frame could not be written: {in_words(cause).rstrip('.')}. {self._safe()}") from cause
+
+    def _safe(self) -> str:
+        return f"The first {self._writer.committed} frames are safe in {self._writer.path}."
 
     def _run(self) -> None:
         while (frame := self._waiting.get()) is not None:

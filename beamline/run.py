@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from beamline.acquire import Acquisition
 from beamline.announce import Announcer
 from beamline.config import Config, resolved_yaml
 from beamline.devices import Bench, connect
-from beamline.errors import ScanStopped, exit_code, in_words
+from beamline.errors import DataError, ScanStopped, exit_code, in_words
 from beamline.events import JsonLines, Sink
 from beamline.exposures import Emit
 from beamline.ledger import LedgerError
@@ -109,10 +109,15 @@ def run_scan(
         if stop.stopping:
             raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
         folder = create_run_folder(runs, config.sample.name, SystemClock().now())
-        (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
         with ExitStack() as stack:
-            events = stack.enter_context((folder / EVENTS).open("x", encoding="utf-8"))
-            log = stack.enter_context((folder / USER_LOG).open("x", encoding="utf-8"))
+            try:
+                (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
+                events = stack.enter_context(_log(folder / EVENTS))
+                log = stack.enter_context(_log(folder / USER_LOG))
+            except OSError as error:
+                raise DataError(
+                    f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
+                ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], bench.clock))
             run = _Run(config, bench, prepared, folder, stop, emit, began)
             return run.go(live, release=connected.close)
@@ -255,6 +260,17 @@ class _Run:
             "total_bytes": timeline.total_bytes,
             "remarks": timeline.remarks,
         }
+
+
+@contextmanager
+def _log(path: Path) -> Iterator[TextIO]:
+    """A new text file. Its last words may be lost to a full disk, which must not replace why the run ended."""
+    file = path.open("x", encoding="utf-8")
+    try:
+        yield file
+    finally:
+        with suppress(OSError):
+            file.close()
 
 
 def _acquire(acquisition: Acquisition, recorder: Recorder) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import errno
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +60,38 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         f"{path} cannot be read as HDF5 ({problems[0]}). If a scan just begins, try again; "
         "if its writer died before the first frame, there is nothing in it."
     )
+
+
+def reason(error: Exception) -> str:
+    """Why the disk or the system did not do it, in its own words; HDF5 wraps them in addresses and offsets."""
+    said = re.search(r"error message = '([^']*)'", str(error))
+    return said[1] if said else (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+def never_close(file: h5py.File) -> None:
+    """Leave a file as it is on the disk, whoever lets go of it or of what is in it, until the process ends.
+
+    For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
+    object, and may leave it marked as one that nobody can open.
+    """
+    for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
+        item.locked = True  # each is a reference of its own to the object, which is now never given back
+
+
+@contextmanager
+def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[h5py.File]:
+    """A new file, closed at the end. OSError where the disk does not take it: then it is never closed, see above."""
+    file = h5py.File(path, "x", libver=libver)
+    try:
+        yield file
+        file.close()
+    except (OSError, RuntimeError) as error:  # what h5py makes of HDF5's errors
+        never_close(file)
+        number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
+        raise OSError(number, reason(error), str(path)) from error
+    except BaseException:
+        file.close()
+        raise
 
 
 def text(value: Any) -> str:

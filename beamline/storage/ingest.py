@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from beamline.digest import digest
 from beamline.errors import DataError, ScanStopped
+from beamline.storage import hdf5
 from beamline.storage import nxtomo_layout as layout
 from beamline.storage.angle_table import Angles
 from beamline.storage.exchange_view import add_exchange_view
@@ -85,14 +86,14 @@ def ingest(
             axis_col=source.axis_col,
         )
         try:
-            with h5py.File(part, "x", libver=layout.LIBVER) as file:
+            with hdf5.created(part, layout.LIBVER) as file:
                 invalid = _copy(source, file, info, no_data, progress, should_stop)
         except FileExistsError as error:
             raise DataError(f"{part} exists: another ingest is at work, or one was killed. Then remove it.") from error
         except BaseException as error:
-            part.unlink(missing_ok=True)
+            left = _remove(part)
             if isinstance(error, OSError):
-                raise DataError(f"{out} could not be written ({error}). Nothing is left of it.") from error
+                raise DataError(f"{out} could not be written ({hdf5.reason(error)}). {left}") from error
             raise
         if out.exists():
             part.unlink()
@@ -102,6 +103,15 @@ def ingest(
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
         return Ingested(out, definition, frames, size, invalid)
+
+
+def _remove(part: Path) -> str:
+    """Remove the file begun; what is left of it."""
+    try:
+        part.unlink(missing_ok=True)
+    except OSError:  # Windows removes no file that is open, as it is after a full disk
+        return f"Remove {part}."
+    return "Nothing is left of it."
 
 
 def _copy(

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.digest import FrameDigest, preview_shape
 from beamline.errors import DataError
+from beamline.plan_checks import size
+from beamline.storage import hdf5
 from beamline.storage import nxtomo_layout as layout
 from beamline.storage.exchange_view import add_exchange_view
 from beamline.storage.nxtomo_layout import ScanInfo
@@ -25,6 +29,8 @@ from drivers.frame import Frame
 __all__ = ["NXtomoWriter", "ScanInfo"]
 
 STATUSES = ("complete", "stopped", "failed")
+FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
+VIEW_ROOM = 10_000_000  # bytes that must be free: more than the /exchange view ever takes
 
 
 class NXtomoWriter:
@@ -69,7 +75,8 @@ class NXtomoWriter:
                 f"{self.path} exists. A scan never overwrites a file: name a new one. Nothing was written."
             ) from error
         except OSError as error:
-            raise DataError(f"{self.path} cannot be created ({error}). Is its folder there and writable?") from error
+            why = hdf5.reason(error)
+            raise DataError(f"{self.path} cannot be created ({why}). Is its folder there and writable?") from error
         try:
             layout.create(
                 self._file,
@@ -81,9 +88,14 @@ class NXtomoWriter:
                 start=clock.now(),
             )
             self._file.swmr_mode = True  # from here on nothing may be created: Rows can only grow what it holds
-        except BaseException:  # without a frame in it, it is no use to anybody
-            self._file.close()
+        except BaseException as error:  # without a frame in it, it is no use to anybody
+            with suppress(*FAILURES):
+                self._file.close()
             self.path.unlink()
+            if isinstance(error, OSError | RuntimeError):
+                raise DataError(
+                    f"{self.path} cannot be begun ({hdf5.reason(error)}). Nothing is left of it."
+                ) from error
             raise
         self._table = layout.Rows(self._file)
         self._progress = self._file[layout.COMMITTED]
@@ -103,7 +115,7 @@ class NXtomoWriter:
             self._rows += 1
             if self._rows - self._committed >= self._flush_every:
                 self.flush()
-        except (OSError, RuntimeError, ValueError) as error:  # what h5py makes of HDF5's errors
+        except FAILURES as error:
             self._broken = True
             raise self._disk_error("take the frame", error) from error
 
@@ -127,28 +139,29 @@ class NXtomoWriter:
     def close(self, status: str = "complete", missing: Sequence[int] = ()) -> None:
         """Finish: missing triggers, end time and status, then `finished`, then the /exchange view. Twice is once.
 
+        After a failed write the file only gets status "failed" and `finished`, and is not closed.
+
         Args:
             status: "complete", "stopped" (by the operator) or "failed".
             missing: triggers, counted over the whole scan from 0, that gave no frame.
+
+        DataError where the disk does not take it; the frames committed stay readable.
         """
         if status not in STATUSES:
             raise ValueError(f"Status {status!r} is none of {', '.join(STATUSES)}.")
-        lost = np.asarray(missing, np.int64)
         if not self._open:
             return
         self._open = False
         try:
+            if self._broken:
+                self._let_go()
+                return
+            self._finish(status, np.asarray(missing, np.int64))
+        except FAILURES as error:
             if not self._broken:
-                self.flush()
-            triggers = self._file[layout.MISSING]
-            triggers.resize(lost.size, 0)
-            triggers[...] = lost
-            self._file[layout.END_TIME][()] = layout.iso_time(self._clock.now()).encode()
-            self._file[layout.STATUS][()] = ("failed" if self._broken else status).encode()
-            self._file.flush()
-            self._file[layout.FINISHED][()] = 1
-            self._file.close()
-        except (OSError, RuntimeError, ValueError) as error:
+                self._broken = True
+                with suppress(*FAILURES):
+                    self._let_go()
             raise self._disk_error("be finished", error) from error
         self._add_exchange_view()
 
@@ -157,6 +170,28 @@ class NXtomoWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close("complete" if kind is None else "failed")
+
+    def _finish(self, status: str, missing: NDArray[np.int64]) -> None:
+        self.flush()
+        triggers = self._file[layout.MISSING]
+        triggers.resize(missing.size, 0)
+        triggers[...] = missing
+        self._file[layout.END_TIME][()] = layout.iso_time(self._clock.now()).encode()
+        self._file[layout.STATUS][()] = status.encode()
+        self._file.flush()
+        self._file[layout.FINISHED][()] = 1
+        self._file.close()
+
+    def _let_go(self) -> None:
+        """Mark the end where there is room for it already, and leave the rest as a dead writer would.
+
+        Readers see every frame committed.
+        """
+        hdf5.never_close(self._file)
+        for path, value in ((layout.STATUS, b"failed"), (layout.FINISHED, 1)):
+            dataset = self._file[path]
+            dataset[()] = value
+            dataset.flush()
 
     def _check(self, frame: Frame, digest: FrameDigest, flags: int) -> None:
         counts, wrong = frame.counts, ""
@@ -176,19 +211,28 @@ class NXtomoWriter:
     def _disk_error(self, what: str, error: Exception) -> DataError:
         free = shutil.disk_usage(self.path.parent).free
         return DataError(
-            f"{self.path} could not {what} ({error}); {free / 1e9:.1f} GB are free on its disk. "
-            f"The first {self._committed} frames are in the file and can be read."
+            f"{self.path} could not {what} ({hdf5.reason(error)}); {size(free)} are free on its disk. "
+            f"The first {self._committed} frames are safe in it and can be read."
         )
 
     def _add_exchange_view(self) -> None:
-        # Groups cannot be made under SWMR, so this needs the file once more. A foreign reader may hold a lock on it;
-        # our own followers hold none.
+        # Groups cannot be made under SWMR, so this needs the file once more, and must not fail half-way: that would
+        # leave it marked as open for writing. A foreign reader may hold a lock on it; our own followers hold none.
+        free = shutil.disk_usage(self.path.parent).free
+        if free < VIEW_ROOM:
+            self._remark_no_view(f"only {size(free)} are free on its disk")
+            return
         try:
-            with h5py.File(self.path, "r+", libver=layout.LIBVER) as file:
-                layout.settle(file)
-                add_exchange_view(file)
+            file = h5py.File(self.path, "r+", libver=layout.LIBVER)
         except OSError as error:
-            self.remarks.append(
-                f"{self.path} has no /exchange view ({error}): another program holds it open. "
-                "The scan itself is complete in /entry."
-            )
+            held = "another program holds it open: " if isinstance(error, BlockingIOError | PermissionError) else ""
+            self._remark_no_view(held + hdf5.reason(error))
+            return
+        with file:
+            layout.settle(file)
+            add_exchange_view(file)
+
+    def _remark_no_view(self, why: str) -> None:
+        self.remarks.append(
+            f"{self.path} has no /exchange view ({why}). Its {self._committed} frames are safe in /entry."
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.errors import DataError
+from beamline.storage import hdf5
 from beamline.version import version
 from recon.volume import Grid, Volume
 
@@ -82,7 +83,8 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk
+            partial.unlink(missing_ok=True)
 
 
 def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
@@ -93,12 +95,12 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
     """
     with whole_file(path, replace=replace) as partial:
         try:
-            with h5py.File(partial, "w-") as file:
+            with hdf5.created(partial) as file:
                 _write_entry(_group(file, "entry", "NXentry"), record)
                 file.attrs["default"] = "entry"
         except OSError as error:
             raise DataError(
-                f"{path} could not be written ({error}). Check the disk; nothing was left there."
+                f"{path} could not be written ({hdf5.reason(error)}). Check the disk; nothing was left there."
             ) from error
 
 

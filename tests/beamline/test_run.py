@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -222,7 +224,7 @@ def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:
 
 @pytest.mark.parametrize(
     "failure",
-    [DataError("the disk is full. The first 8 frames are in the file."), OSError(errno.ENOSPC, "No space left")],
+    [DataError("the disk is full. The first 8 frames are safe in scan.h5."), OSError(errno.ENOSPC, "No space left")],
 )
 def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
@@ -230,11 +232,48 @@ def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
     monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, failure))
     ran = Ran(tmp_path, Instrument(), "scan.angles.views=200", "scan.period_s=0.05")
     assert isinstance(ran.error, DataError)
-    assert "8 frames are in the file" in str(ran.error)
+    assert re.search(r"first 8 frames are safe in .*scan\.h5", str(ran.error))
     ran.assert_good_file(8, "failed")
     ran.assert_safe()
     assert ran.instrument.stage.position() == pytest.approx(100 * COUNT)  # the devices are well: back to the start
     assert ran.of("failed")[0].data["exit_code"] == 5
+
+
+def test_logs_on_a_full_disk_do_not_hide_why_the_run_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A text file writes what it still holds when it is closed, and then it is closed in vain."""
+
+    class FullLog(io.StringIO):
+        def flush(self) -> None:
+            raise OSError(errno.ENOSPC, "No space left")
+
+        def close(self) -> None:
+            raise OSError(errno.ENOSPC, "No space left")
+
+    usual = Path.open
+
+    def opened(path: Path, mode: str = "r", *args: object, **kwargs: object) -> object:
+        return FullLog() if path.suffix in (".jsonl", ".log") else usual(path, mode, *args, **kwargs)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(Path, "open", opened)
+    monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
+    ran = Ran(tmp_path, Instrument())
+    assert str(ran.error) == "the first 8 frames are safe."
+    ran.assert_good_file(8, "failed")
+
+
+def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    ran = Ran(tmp_path, instrument := Instrument())
+    assert isinstance(ran.error, DataError)
+    assert re.search(
+        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing has moved", str(ran.error)
+    )
+    assert not instrument.is_open
 
 
 def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,6 +123,6 @@ def test_another_programs_lock_costs_the_view_and_nothing_else(
     released.set()
     viewer.join(60)
     assert len(writer.remarks) == 1
-    assert "no /exchange view" in writer.remarks[0]
+    assert "no /exchange view (another program holds it open" in writer.remarks[0]
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "complete")

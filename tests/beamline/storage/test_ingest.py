@@ -13,6 +13,7 @@ import tifffile
 
 from beamline.digest import digest
 from beamline.errors import DataError, ScanStopped
+from beamline.storage import nxtomo_layout as layout
 from beamline.storage.ingest import ingest
 from beamline.storage.source import open_scan
 from beamline.storage.validate import validate
@@ -115,6 +116,23 @@ def test_a_failure_halfway_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_pa
 
     with pytest.raises(DataError, match="No space left"):
         ingest(stack[0], tmp_path / "out.h5", angles=ANGLES, progress=fail)
+    assert left(tmp_path) == {"lab.tif"}
+
+
+def test_a_full_disk_is_one_sentence_however_hdf5_tells_of_it(
+    stack: tuple[Path, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """HDF5 cannot close what the disk did not take: h5py then raises once more, of another class."""
+
+    def no_room(*_: object) -> None:
+        raise RuntimeError("file write failed: errno = 28, error message = 'No space left on device', buf = 0x5")
+
+    monkeypatch.setattr(h5py.File, "close", no_room)
+    monkeypatch.setattr(layout.Rows, "write", no_room)
+    with pytest.raises(DataError) as error:
+        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES)
+    out = tmp_path / "out.h5"
+    assert str(error.value) == f"{out} could not be written (No space left on device). Nothing is left of it."
     assert left(tmp_path) == {"lab.tif"}
 
 

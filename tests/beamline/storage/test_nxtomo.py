@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -248,10 +251,95 @@ def test_a_disk_that_takes_no_more_is_named_and_the_rows_before_stay(
 
     with monkeypatch.context() as patch:
         patch.setattr(writer._table, "write", full)
-        with pytest.raises(DataError, match=r"No space left.*GB are free.*first 1 frames"):
+        with pytest.raises(DataError, match=r"s\.h5 could not.*No space left.*are free.*first 1 frames are safe in it"):
             writer.append(frames[1], digest(frames[1].counts))
     with pytest.raises(DataError, match="earlier write failed"):
         writer.append(frames[1], digest(frames[1].counts))
     writer.close()
+    assert not writer.remarks
     with open_scan(tmp_path / "s.h5") as source:
-        assert (source.refresh(), source.attributes["status"]) == (1, "failed")
+        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
+
+
+def no_room(call: str = "take") -> RuntimeError:
+    """As h5py tells of a full disk where it has no number for it."""
+    return RuntimeError(
+        f"Can't {call} (file write failed: time = Fri Nov 20 06:31:51 2026\n, filename = 'scan.h5', "
+        "file descriptor = 5, errno = 28, error message = 'No space left on device', buf = 0x5, offset = 7)"
+    )
+
+
+def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_committed(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To close the file would be to write once more what the disk did not take, with a traceback for each id."""
+    path = tmp_path / "s.h5"
+    writer = NXtomoWriter(path, INFO, SHAPE, clock=clock)
+    for frame in frames[:2]:
+        writer.append(frame, digest(frame.counts))
+
+    def full(*_: object) -> None:
+        raise no_room()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer._table, "write", full)
+        with pytest.raises(DataError, match=r"could not take the frame \(No space left on device\)"):
+            writer.append(frames[2], digest(frames[2].counts))
+        patch.setattr(h5py.File, "close", full)
+        patch.setattr(h5py.File, "flush", full)
+        writer.close()
+    opened = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL)
+    del writer
+    gc.collect()
+    assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL) == opened
+    code = (
+        "import sys; from beamline.storage.source import open_scan\n"
+        "with open_scan(sys.argv[1]) as s: "
+        "print(s.image_key.size, s.finished, s.attributes['status'], s.read([1]).sum())"
+    )
+    said = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["2", "True", "failed", str(frames[1].counts.sum())]
+
+
+def test_a_disk_that_is_full_when_the_scan_ends_is_named(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+
+    def full(*_: object) -> None:
+        raise no_room()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.File, "flush", full)
+        with pytest.raises(DataError, match=r"s\.h5 could not be finished \(No space.*first 1 frames are safe"):
+            writer.close()
+    writer.close()
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
+
+
+def test_no_view_is_begun_where_there_is_no_room_for_it(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000_000))
+    writer.close()
+    assert len(writer.remarks) == 1
+    assert "no /exchange view (only 5 MB are free on its disk). Its 1 frames are safe" in writer.remarks[0]
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert "exchange" not in file
+        assert file[layout.STATUS][()] == b"complete"
+
+
+def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
+    tmp_path: Path, clock: StandingClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise no_room()
+
+    monkeypatch.setattr(layout, "create", full)
+    with pytest.raises(DataError, match=r"s\.h5 cannot be begun \(No space left on device\)"):
+        NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    assert list(tmp_path.iterdir()) == []
