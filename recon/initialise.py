@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
-from recon.fbp import fbp
+from recon.fbp import angular_weights, fbp
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.splat import project
@@ -50,7 +50,9 @@ def place(
     wanted = default_count(grid) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
-    volume = Volume(fbp(projections, geometry, grid, "hann"), grid)
+    # Views over a part of the half circle give an FBP that is weaker by that part; the unit must not be.
+    whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
+    volume = Volume(fbp(projections, geometry, grid, "hann") * whole, grid)
     cols, axis = geometry.detector_shape[1], geometry.axis_col
     radius = max(axis + 0.5, cols - axis - 0.5) * geometry.pixel_pitch
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius)

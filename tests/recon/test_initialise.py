@@ -51,6 +51,17 @@ def test_very_few_gaussians_are_a_model_too(rng: np.random.Generator, n: int) ->
     assert placed.n == n and bool((placed.scales > 0).all()) and bool(placed.scales.isfinite().all())
 
 
+@pytest.mark.parametrize("span", [np.pi / 5, np.pi / 2, np.pi])
+def test_the_unit_is_a_density_of_the_sample_however_narrow_the_views(span: float) -> None:
+    # A Gaussian of peak 1, sigma 3: its line integrals are sigma √(2π) times a Gaussian, from every side.
+    views = Geometry.parallel(np.linspace(0, span, 30, endpoint=False), (16, 40))
+    u, v = np.arange(40) - 19.5, np.arange(16) - 7.5
+    shadow = 3 * np.sqrt(2 * np.pi) * np.exp(-(u[None] ** 2 + v[:, None] ** 2) / 18)
+    data = np.broadcast_to(shadow, (30, 16, 40)).astype(np.float32)
+    placed = place(data, views, Grid.matching(views), 500, np.random.default_rng(0))
+    assert 0.3 < placed.density_unit < 2
+
+
 @pytest.mark.parametrize("count", [0, -5])
 def test_no_gaussians_are_refused(count: int, rng: np.random.Generator) -> None:
     views = Geometry.parallel([0.0, 1.0], (4, 6))
