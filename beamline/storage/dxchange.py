@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.scan_source import WHOLE, Quantity, bare_frames, frame_indices
+from beamline.storage.scan_source import WHOLE, Quantity, bare_frames, frame_indices, require_real
 from drivers.frame import Frame, FrameKind
 
 PARTS = (
@@ -70,6 +70,7 @@ class DataExchangeSource:
 
     def _check(self) -> None:
         for _, item in self._parts:
+            require_real(item.dtype, f"{item.name} in {self.path}")
             if item.ndim != 3 or item.shape[1:] != self._parts[-1][1].shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.shape}" for _, part in self._parts)
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")

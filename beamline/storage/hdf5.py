@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.errors import DataError
+from beamline.storage.scan_source import require_real
 
 DEGREE = np.pi / 180
 ANGLE_UNITS = {
@@ -139,6 +140,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
             f"{item.name} in {item.file.filename} has {f'the units {unit!r}' if unit else 'no units attribute'}; "
             "expected degrees or radians. Give the angles yourself (a file in degrees), or set the attribute."
         )
+    require_real(item.dtype, f"{item.name} in {item.file.filename}")
     return np.atleast_1d(np.asarray(item[()], np.float64)) * factor
 
 

@@ -17,7 +17,7 @@ from beamline.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage import nxtomo_layout as layout
 from beamline.storage.nexus_places import choose, find
-from beamline.storage.scan_source import WHOLE, Quantity, count_in_blocks, frame_indices, require_counts
+from beamline.storage.scan_source import WHOLE, Quantity, count_in_blocks, frame_indices, require_counts, require_real
 from drivers.frame import Frame, FrameKind
 
 
@@ -52,6 +52,10 @@ class NXtomoSource:
             raise
 
     def _check(self) -> None:
+        finer = hdf5.dataset(self._places.detector, "image_key_control")
+        for item in (self._places.data, self._places.image_key, finer):
+            if item is not None:
+                require_real(item.dtype, f"{item.name} in {self.path}")
         lost = hdf5.missing_links(self._places.data)
         if lost:
             raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there ({len(lost)} missing).")
@@ -161,7 +165,7 @@ class NXtomoSource:
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
         item = hdf5.dataset(group, path)
         factor = None if item is None else hdf5.TIME_UNITS.get(hdf5.attribute(item, "units").lower())
-        if item is None or factor is None:
+        if item is None or factor is None or item.dtype.kind not in "uif":
             return np.full(self.n, np.nan)
         if self._ours:
             item.refresh()

@@ -123,6 +123,15 @@ def bare_frames(source: ScanSource) -> Iterator[Frame]:
         )
 
 
+def require_real(dtype: np.dtype[Any], what: str) -> None:
+    """DataError where pixels, keys or angles are text, complex, or anything else that is no real number."""
+    if dtype.kind not in "uif":
+        raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")
+
+
+_SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "text", "S": "text", "U": "text"}
+
+
 def require_counts(source: ScanSource) -> None:
     """DataError where the pixels are not the uint16 that a Frame holds."""
     if source.dtype != np.uint16:

@@ -21,7 +21,8 @@ import tifffile
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.errors import DataError
-from beamline.storage.scan_source import WHOLE, Quantity, bare_frames, frame_indices
+from beamline.storage import hdf5
+from beamline.storage.scan_source import WHOLE, Quantity, bare_frames, frame_indices, require_real
 from drivers.frame import Frame, FrameKind
 
 SUFFIXES = (".tif", ".tiff")
@@ -91,6 +92,7 @@ class TiffStack:
             raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
         self.shape = (int(series.shape[-2]), int(series.shape[-1]))
         self.dtype: np.dtype[Any] = np.dtype(series.dtype)
+        require_real(self.dtype, str(self.path))
         # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
         self._offset = series.dataoffset
         self._stored = self.dtype.newbyteorder(self._tif.byteorder)
@@ -223,6 +225,7 @@ class TiffSeries:
             raise DataError(f"{name} in {self.path} cannot be read as TIFF ({error}).") from error
         if image.ndim != 2:
             raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
+        require_real(image.dtype, f"{name} in {self.path}")
         return image
 
 
@@ -230,6 +233,7 @@ def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
     """Reference frames [frame, row, col]: from an array, one TIFF (any pages) or a folder of TIFFs, all in memory."""
     if not isinstance(images, Path | str):
         stack = np.asarray(images)
+        require_real(stack.dtype, "The array of reference frames")
         return stack[None] if stack.ndim == 2 else stack
     path = Path(images)
     files = (
@@ -241,9 +245,12 @@ def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
         raise DataError(f"{path} holds no .tif or .tiff file.")
     try:
         parts = [read_image(file) for file in files]
-        return np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
+        stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
-        raise DataError(f"The reference frames in {path} cannot be read as TIFFs of one shape ({error}).") from error
+        why = hdf5.reason(error)
+        raise DataError(f"The reference frames in {path} cannot be read as TIFFs of one shape ({why}).") from error
+    require_real(stack.dtype, str(path))
+    return stack
 
 
 def read_image(file: Path | BinaryIO) -> NDArray[Any]:

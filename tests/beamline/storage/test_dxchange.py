@@ -127,3 +127,15 @@ def test_real_files(shared_data: Path) -> None:
     with open_scan(shared_data / "walnut_parallel_rebinned_240x96x256.h5") as source:
         assert source.quantity == "unknown"
         assert source.pixel_size_mm == pytest.approx(0.152172, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "said"), [("S3", "text"), ("c8", "complex numbers"), ("?", "true and false"), ([("a", "f4")], "records")]
+)
+@pytest.mark.parametrize("name", ["data", "data_dark", "theta"])
+def test_what_is_no_real_number_is_refused(tmp_path: Path, parts: Parts, name: str, dtype: object, said: str) -> None:
+    parts[name] = np.zeros(parts[name].shape, dtype)  # type: ignore[call-overload]
+    path = store(tmp_path / "s.h5", parts)
+    with pytest.raises(DataError) as error:
+        open_scan(path)
+    assert str(error.value) == f"/exchange/{name} in {path} holds {said}; expected whole or real numbers."

@@ -239,3 +239,30 @@ def test_esrf_nxtomo(shared_data: Path) -> None:
         assert (source.pixel_size_mm, source.energy_kev) == (pytest.approx(6.69e-4), 26.0)
         assert source.axis_col is None  # 0.0 in the file, which counts from the middle
         np.testing.assert_allclose(np.degrees(source.angles[4:15]), np.linspace(0, 360, 11), atol=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "said"), [("S3", "text"), ("c8", "complex numbers")])
+@pytest.mark.parametrize(
+    "where", ["instrument/detector/data", "instrument/detector/image_key", "sample/rotation_angle"]
+)
+def test_what_is_no_real_number_is_refused(
+    write: Write, frames: list[Frame], where: str, dtype: str, said: str
+) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        shape, attributes = file["entry"][where].shape, dict(file["entry"][where].attrs)
+        del file["entry"][where]
+        file["entry"][where] = np.zeros(shape, dtype)
+        file["entry"][where].attrs.update(attributes)
+    with pytest.raises(DataError, match=rf"^/entry/{where} in .* holds {said}; expected whole or real numbers\.$"):
+        open_scan(path)
+
+
+def test_exposures_that_are_text_are_not_known(write: Write, frames: list[Frame]) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        del file["entry/instrument/detector/count_time"]
+        file["entry/instrument/detector/count_time"] = np.full(len(frames), b"long")
+        file["entry/instrument/detector/count_time"].attrs["units"] = "s"
+    with open_scan(path) as source:
+        assert np.isnan(source.exposures).all()

@@ -207,3 +207,16 @@ def test_the_real_series_is_the_real_hdf5_scan(shared_data: Path) -> None:
         np.testing.assert_allclose(tiffs.angles, exchange.angles, atol=1e-9)
         np.testing.assert_array_equal(tiffs.image_key, exchange.image_key)
         np.testing.assert_array_equal(tiffs.read(slice(None)), exchange.read(slice(None)))
+
+
+def test_complex_pixels_are_refused(tmp_path: Path, series: tuple[Path, np.ndarray]) -> None:
+    waves = np.ones((4, *SHAPE), np.complex64)
+    tifffile.imwrite(tmp_path / "waves.tif", waves, photometric="minisblack")
+    with pytest.raises(DataError, match=r"waves\.tif holds complex numbers; expected whole or real numbers"):
+        open_scan(tmp_path / "waves.tif")
+    for flats in (tmp_path / "waves.tif", waves):
+        with pytest.raises(DataError, match="holds complex numbers"):
+            open_scan(series[0], flats=flats)
+    tifffile.imwrite(series[0] / "dark_0.tif", waves[0], photometric="minisblack")
+    with pytest.raises(DataError, match=r"dark_0\.tif in .* holds complex numbers"):
+        open_scan(series[0])
