@@ -57,8 +57,8 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
         return np.full(theta.size, np.pi / theta.size)
     gaps = np.diff(starts, append=starts[0] + np.pi)
     typical = float(np.median(gaps))
-    # The widest of n random gaps of mean g exceeds g (ln n + 3) once in e³ = 20 times.
-    by_chance = np.pi / gaps.size * (math.log(gaps.size) + 3)
+    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
+    by_chance = np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
     gaps = np.where(gaps > max(_GAP_LIMIT * typical, by_chance), typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)

@@ -74,7 +74,7 @@ def reconstruct(
         steps: of the fit, one view each; 0 gives the starting point; None takes 2000, or as many as fit into `seconds`.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         densify: the fit may clone, split and prune.
-        seed: of every random choice; the same seed gives the same volume on the same machine.
+        seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.
         filter: of "fbp" ("ram-lak", "shepp-logan" or "hann"). The smooth one is best for few or noisy views.
         settings: of the fit, in full; overrides `densify`.
         seconds: a time budget for the fit; the rates decay along it.

@@ -40,7 +40,7 @@ class Truncation:
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """Physical parameters of Gaussians as float32 arrays, and room for the gradients on them."""
+    """Physical parameters of Gaussians as float32 arrays, row-major rotations [n, 9]."""
 
     means: F32
     scales: F32

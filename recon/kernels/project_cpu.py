@@ -10,7 +10,8 @@ its footprint (g the gradient of the image, G the unit footprint, δ the offset 
 
     ∂W = M₀,   ∂m = W K M₁,   ∂Σ₂ = 1/2 W K M₂ K         with W = ρμ, K = Σ₂⁻¹
 
-so every Gaussian gathers its own gradient: no atomics, and the result does not depend on the number of threads.
+so every Gaussian gathers its own gradient: no atomics. Images are summed over threads in a fixed order: the same bits
+come again with the same number of threads, the same but for rounding with another.
 """
 
 from __future__ import annotations

@@ -195,7 +195,7 @@ def test_random_angles_cover_the_half_circle(n: int) -> None:
     assert np.isclose(sums, np.pi).mean() > 0.85
 
 
-@pytest.mark.parametrize(("span", "n"), [(90, 45), (120, 20), (150, 600), (170, 170)])
+@pytest.mark.parametrize(("span", "n"), [(3, 3), (4, 4), (30, 8), (90, 45), (120, 20), (150, 600), (170, 170)])
 def test_a_real_wedge_is_missed_however_dense_the_views(span: float, n: int) -> None:
     angles = np.deg2rad(np.arange(n) * span / n)
     np.testing.assert_allclose(angular_weights(angles), np.deg2rad(span / n), rtol=1e-9)
