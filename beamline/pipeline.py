@@ -23,11 +23,6 @@ from recon.views import parse_views
 
 Warn = Callable[[str], None]
 
-_OPTIONS = {  # what a finding's advice is called on the command line
-    "quantity": "Option: --quantity counts | line-integrals.",
-    "references": "Options: --flats, --darks, --quantity line-integrals.",
-    "angles": "Option: --angles FILE (degrees, one a line).",
-}
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
 _HELD_OUT_VIEWS = 16
@@ -184,8 +179,7 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
     for finding in findings:
         if finding.severity != "error":
             continue
-        option = _OPTIONS.get(finding.rule, "")
-        raise DataError(f"{source.path} cannot be reconstructed. {finding.message} {option}".rstrip())
+        raise DataError(f"{source.path} cannot be reconstructed. {finding.message}")
 
 
 def correction_blockers(source: ScanSource) -> list[Finding]:

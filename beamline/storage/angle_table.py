@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.errors import DataError
+from beamline.storage import hdf5
 from drivers.frame import FrameKind
 
 Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
@@ -21,7 +23,7 @@ def load_angles(angles: Angles) -> NDArray[np.float64]:
         try:
             return parse_angles(path.read_text(), str(path))
         except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"The angles in {path} cannot be read ({error}).") from error
+            raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
     return np.atleast_1d(np.asarray(angles, np.float64))
 
 
@@ -41,11 +43,13 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
     """Rows "a:b" of the angles, counted from 0, b not included; either may be left out."""
     match = re.fullmatch(r"(\d*):(\d*)", rows.strip())
     if match is None:
-        raise DataError(f"Angle rows {rows!r} are not of the form a:b, counted from 0 with b not included.")
+        raise DataError(
+            f"--angle-rows {shlex.quote(rows)} is not of the form A:B, from 0 and B not included, such as 10:101."
+        )
     first = int(match[1] or 0)
     last = int(match[2] or angles.size)
     if not 0 <= first < last <= angles.size:
-        raise DataError(f"Angle rows {rows!r} do not lie within the {angles.size} angles that there are.")
+        raise DataError(f"--angle-rows {rows} does not lie within the {angles.size} angles that there are.")
     return angles[first:last]
 
 
@@ -64,13 +68,13 @@ def assign(image_key: NDArray[np.int32], angles: NDArray[np.float64], name: str)
         return spread
     message = (
         f"{name} has {angles.size} angles, but there are {n} projections among {image_key.size} frames. "
-        "Say which rows belong to the projections with angle_rows='a:b' (from 0, b not included)"
+        "Say with --angle-rows A:B which of them belong to the projections (from 0, B not included)"
     )
     window = evenly_spaced_window(angles, n)
     if window is not None:
         low, high = np.degrees(angles[list(window)])
         message += (
-            f"; rows {window[0]}:{window[1] + 1} are the {n} neighbours in the most equal steps, "
+            f"; --angle-rows {window[0]}:{window[1] + 1} takes the {n} neighbours in the most equal steps, "
             f"from {low:.4f} to {high:.4f} degrees"
         )
     raise DataError(message + ".")

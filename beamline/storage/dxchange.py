@@ -83,7 +83,7 @@ class DataExchangeSource:
         if theta is None:
             raise DataError(
                 f"{self.path} has no /exchange/theta. Some readers then assume 0 to 180 degrees; we do not: "
-                "give the angles yourself (a file in degrees)."
+                "give them with --angles FILE (degrees, one a line)."
             )
         angles = hdf5.radians(theta, default="degrees")
         if angles.size != n_views:

@@ -138,7 +138,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
     if factor is None:
         raise DataError(
             f"{item.name} in {item.file.filename} has {f'the units {unit!r}' if unit else 'no units attribute'}; "
-            "expected degrees or radians. Give the angles yourself (a file in degrees), or set the attribute."
+            "expected degrees or radians. Set the attribute, or give --angles FILE (degrees, one a line)."
         )
     require_real(item.dtype, f"{item.name} in {item.file.filename}")
     return np.atleast_1d(np.asarray(item[()], np.float64)) * factor

@@ -76,7 +76,8 @@ def ingest(
         views = source.image_key == FrameKind.PROJECTION
         if not np.isfinite(source.angles[views]).all():
             raise DataError(
-                f"{tif} does not say the angles of its {views.sum()} projections: give them. Nothing written."
+                f"{tif} does not say the angles of its {views.sum()} projections: give --angles FILE "
+                "(degrees, one a line). Nothing was written."
             )
         info = layout.ScanInfo(
             sample=sample or str(source.attributes.get("sample", Path(tif).stem)),

@@ -46,7 +46,7 @@ class Overlay:
         for kind, images in given:
             if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
                 raise DataError(
-                    f"The {kind.name.lower()}s given are {images.shape}; expected [frame, row, col] with frames of "
+                    f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
                     f"{base.shape} as in {base.path}."
                 )
         # One dtype, as of one camera: references are measured like the frames, and averages of them are floats.

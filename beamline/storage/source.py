@@ -50,7 +50,7 @@ def open_scan(
     """
     path = Path(path)
     if follow and (angles is not None or darks is not None or flats is not None):
-        raise DataError(f"{path} cannot be followed with other angles or references: its counts still change.")
+        raise DataError(f"{path} cannot be followed with --angles, --darks or --flats: its counts still change.")
     base = _open(path, own_angles=angles is None, follow=follow)
     try:
         table = None if angles is None else load_angles(angles)
@@ -60,7 +60,7 @@ def open_scan(
             table = parse_angles(base.angle_text[1], angles_from)
         if angle_rows is not None:
             if table is None:
-                raise DataError(f"Angle rows {angle_rows!r} need angles to choose from: give an angle file.")
+                raise DataError(f"--angle-rows {angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, angle_rows)
         if table is None and darks is None and flats is None and quantity is None:
             return base

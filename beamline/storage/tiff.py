@@ -65,7 +65,7 @@ class TiffStack:
             try:
                 self._tif = tifffile.TiffFile(path)
             except UNREADABLE as error:
-                raise DataError(f"{path} cannot be read as TIFF ({error}).") from error
+                raise DataError(f"{path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
             try:
                 n = self._look()
             except UNREADABLE as error:
@@ -107,7 +107,7 @@ class TiffStack:
             try:
                 self._fill(out[i], int(page), rows)
             except UNREADABLE as error:
-                raise DataError(f"Page {page} of {self.path} cannot be read ({error}).") from error
+                raise DataError(f"Page {page} of {self.path} cannot be read ({hdf5.reason(error)}).") from error
         return out
 
     def _fill(self, out: NDArray[Any], page: int, rows: slice) -> None:
@@ -222,7 +222,7 @@ class TiffSeries:
         try:
             image = read_image(io.BytesIO(self._bytes(name)))
         except UNREADABLE as error:
-            raise DataError(f"{name} in {self.path} cannot be read as TIFF ({error}).") from error
+            raise DataError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
         if image.ndim != 2:
             raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
         require_real(image.dtype, f"{name} in {self.path}")
@@ -247,8 +247,8 @@ def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
         parts = [read_image(file) for file in files]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
-        why = hdf5.reason(error)
-        raise DataError(f"The reference frames in {path} cannot be read as TIFFs of one shape ({why}).") from error
+        wanted = "" if isinstance(error, OSError) and error.errno else " as TIFFs of one shape"
+        raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
     require_real(stack.dtype, str(path))
     return stack
 
@@ -275,7 +275,7 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(path)
     except UNREADABLE as error:
-        raise DataError(f"{path} cannot be read as a zip file ({error}).") from error
+        raise DataError(f"{path} cannot be read as a zip file ({hdf5.reason(error)}).") from error
 
 
 def _prefix(name: str) -> str:
@@ -290,7 +290,7 @@ def _check_one_series(path: Path, names: list[str]) -> None:
         found = ", ".join(f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6])
         raise DataError(
             f"{path} holds several series of images: {found}. Name darks and flats so (dark_0001.tif, flat_0001.tif), "
-            "or give the folder of the projections and, apart, the darks and flats."
+            "or give the folder of the projections, and the others apart, with --darks and --flats."
         )
 
 

@@ -83,7 +83,7 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
             "angles",
             f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
             + (f"; {why}" if why else "")
-            + ". Give an angle file.",
+            + ". Give them with --angles FILE (degrees, one a line).",
         )
 
 
@@ -116,7 +116,10 @@ def quantity_said(source: ScanSource) -> Iterator[Finding]:
     """It is known what a pixel means: a forgotten or a second logarithm ruins a volume without a sign."""
     if source.quantity == "unknown":
         yield Finding(
-            "error", "quantity", "Nothing says whether pixels are counts or line integrals: say which (quantity)."
+            "error",
+            "quantity",
+            "Nothing says whether pixels are counts or line integrals: say --quantity counts or --quantity "
+            "line-integrals.",
         )
 
 
@@ -124,12 +127,12 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
     """Counts come with darks and flats."""
     if source.quantity != "counts":
         return
-    for kind in (FrameKind.FLAT, FrameKind.DARK):
+    for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if not (source.image_key == kind).any():
             yield Finding(
                 "error",
                 "references",
-                f"Counts without {kind.name.lower()}s: give them, or say what else the pixels are.",
+                f"Counts without {name}: give --{name} FILE (or a folder), or --quantity line-integrals if they are.",
             )
 
 

@@ -186,3 +186,45 @@ def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...],
     assert said in result.stderr
     assert "Traceback" not in result.output
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def _bare(folder: Path) -> None:
+    """stack.tif: five pages without angles; long.txt: nine angles for them."""
+    tifffile.imwrite(folder / "stack.tif", np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6))
+    (folder / "long.txt").write_text("0\n0\n0\n10\n20\n30\n40\n40\n40\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "--angles FILE (degrees, one a line)"),
+        (("--angles", "long.txt"), "--angle-rows A:B"),
+        (("--angles", "long.txt"), "--angle-rows 2:7 takes the 5 neighbours"),
+        (("--angles", "long.txt", "--angle-rows", "5"), "--angle-rows 5 is not of the form A:B"),
+        (("--angles", "long.txt", "--angle-rows", "5:12"), "--angle-rows 5:12 does not lie within the 9 angles"),
+        (("--angle-rows", "1:6"), "--angle-rows 1:6 needs angles to choose from: give --angles FILE."),
+        (("--angles", "none.txt"), "The angles in none.txt cannot be read (No such file or directory)."),
+        (("--flats", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
+        (("--darks", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
+    ],
+)
+@pytest.mark.parametrize("command", ["info", "validate", "ingest", "recon"])
+def test_messages_speak_of_options_as_they_are_typed(
+    folder: Path, command: str, options: tuple[str, ...], said: str
+) -> None:
+    _bare(folder)
+    result = _beamline(command, "stack.tif", *(["out.h5"] if command == "ingest" else []), *options)
+    assert result.exit_code == (0 if command == "info" and not options else 5)
+    assert said in result.output
+    assert "angle_rows" not in result.output
+    assert "Errno" not in result.output
+
+
+@pytest.mark.parametrize("command", ["info", "validate"])
+def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) -> None:
+    _bare(folder)
+    said = _beamline(command, "stack.tif").stdout
+    assert "say --quantity counts or --quantity line-integrals." in said
+    said = _beamline(command, "stack.tif", "--quantity", "counts").stdout
+    assert "Counts without flats: give --flats FILE (or a folder), or --quantity line-integrals" in said
+    assert "Counts without darks: give --darks FILE (or a folder), or --quantity line-integrals" in said

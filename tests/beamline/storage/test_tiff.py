@@ -85,7 +85,7 @@ def test_angles_that_do_not_fit_are_refused_with_the_rows_that_would(series: tup
     folder, _ = series
     table = [0.0] * 4 + list(np.linspace(0, 165, 12)) + [165.0] * 3
     np.savetxt(folder / "angles.txt", table)
-    with pytest.raises(DataError, match=r"19 angles, but there are 12 projections among 15 frames.*rows 4:16"):
+    with pytest.raises(DataError, match=r"19 angles, but there are 12 projections among 15 frames.*--angle-rows 4:16 "):
         open_scan(folder)
     with open_scan(folder, angle_rows="4:16") as source:
         np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12)))
@@ -106,7 +106,7 @@ def test_explicit_angles_and_references_win(series: tuple[Path, np.ndarray], tmp
 
 
 def test_references_of_another_shape_are_refused(series: tuple[Path, np.ndarray]) -> None:
-    with pytest.raises(DataError, match=r"flats given are \(2, 3, 3\).*\(6, 8\)"):
+    with pytest.raises(DataError, match=r"--flats are \(2, 3, 3\).*\(6, 8\)"):
         open_scan(series[0], flats=np.zeros((2, 3, 3)))
 
 
@@ -198,7 +198,7 @@ def test_a_cut_stack_is_no_shorter_scan(
 def test_the_real_series_is_the_real_hdf5_scan(shared_data: Path) -> None:
     """The zip holds the same scan as the HDF5 file; rows 10:101 of angles.txt are its projections."""
     path = shared_data / "diamond_24737_tiff_series.zip"
-    with pytest.raises(DataError, match=r"111 angles, but there are 91 projections.*rows 10:101"):
+    with pytest.raises(DataError, match=r"111 angles, but there are 91 projections.*--angle-rows 10:101 "):
         open_scan(path)
     with (
         open_scan(path, angle_rows="10:101") as tiffs,
