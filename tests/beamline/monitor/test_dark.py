@@ -5,9 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from beamline.monitor.flag import Flag, Level
+from beamline.digest import digest
+from beamline.monitor import dark
+from beamline.monitor.flag import Context, Flag, Level
+from drivers.frame import Frame, FrameKind
 
 
 def only(flags: list[Flag]) -> list[Flag]:
@@ -34,3 +38,37 @@ def test_drifting_darks(bench: Any, drift: float, found: int) -> None:
     for flag in flags:
         assert flag.level is Level.WARN
         assert flag.score == pytest.approx(drift, abs=1)
+
+
+def small_darks(n: int, rng: np.random.Generator) -> list[Frame]:
+    """Darks of 32 x 48 pixels around 200 counts: one pixel of 30 000 counts moves their mean by 19."""
+    return [
+        Frame(rng.normal(200, 4, (32, 48)).round().astype(np.uint16), FrameKind.DARK, i, i, i, np.nan, 1000.0 + i, 0.05)
+        for i in range(n)
+    ]
+
+
+def flags_of(frames: list[Frame], preview_bin: int) -> list[Flag]:
+    state, found = dark.State(), []
+    for frame in frames:
+        state, flag = dark.check(state, frame, digest(frame.counts, 65535, preview_bin), Context(65535, 32 * 48))
+        found += [] if flag is None else [flag]
+    return found
+
+
+@pytest.mark.parametrize("preview_bin", [1, 4, 16])
+@pytest.mark.parametrize("hit", [0, 3])
+def test_a_zinger_in_a_small_dark_is_no_drift(rng: np.random.Generator, preview_bin: int, hit: int) -> None:
+    frames = small_darks(6, rng)
+    frames[hit].counts[11, 17] = 30_000
+    assert abs(float(frames[3].counts.mean()) - float(frames[0].counts.mean())) > 15
+    assert flags_of(frames, preview_bin) == []
+
+
+@pytest.mark.parametrize("preview_bin", [4, 16])
+def test_light_on_a_part_of_the_dark_is_still_seen(rng: np.random.Generator, preview_bin: int) -> None:
+    frames = small_darks(6, rng)
+    frames[4].counts[:, :16] += 40  # a third of the frame
+    (flag,) = flags_of(frames, preview_bin)
+    assert (flag.view, flag.level) == (4, Level.WARN)
+    assert 5 < flag.score < 40 / 3
