@@ -6,7 +6,7 @@ from __future__ import annotations
 class DeviceError(Exception):
     """A device did not do what it was asked.
 
-    The message is one readable paragraph; the parts stay available for machines.
+    The message is one readable paragraph; the parts stay available for machines. `wire`: what last went over its line.
     """
 
     def __init__(
@@ -19,9 +19,10 @@ class DeviceError(Exception):
         expected: str = "",
         advice: str = "",
         state: str = "",
+        wire: str = "",
     ) -> None:
         self.device, self.problem, self.request, self.reply = device, problem, request, reply
-        self.expected, self.advice, self.state = expected, advice, state
+        self.expected, self.advice, self.state, self.wire = expected, advice, state, wire
         parts = [f"{device}: {problem}"]
         if request:
             parts.append(f"Asked {request!r}")
@@ -33,6 +34,8 @@ class DeviceError(Exception):
             parts.append(advice)
         if state:
             parts.append(state)
+        if wire:
+            parts.append(f"On the wire: {wire}")
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
 

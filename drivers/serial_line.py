@@ -19,7 +19,10 @@ from drivers.errors import DeviceError, DeviceTimeout
 
 END = b"\r\n"
 LONGEST_LINE = 1024
-TRANSCRIPT_LINES = 400
+TOLD_LINES = 6
+"""Lines that last went over the wire, for errors."""
+TOLD_CHARACTERS = 40
+"""Of each of these lines."""
 QUIET = 0.05
 """s without a byte after which a line counts as quiet."""
 
@@ -30,15 +33,6 @@ class Probe:
 
     request: str
     reply: str
-
-
-@dataclass(frozen=True)
-class TranscriptLine:
-    """One line that went over the wire: s since the Unix epoch, ">" sent, "<" received, "!" what the driver did."""
-
-    time: float
-    mark: str
-    text: str
 
 
 class SerialLine:
@@ -69,7 +63,7 @@ class SerialLine:
         self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
         self._unsolicited = re.compile(unsolicited)
         self._lock = threading.RLock()
-        self._transcript: deque[TranscriptLine] = deque(maxlen=TRANSCRIPT_LINES)
+        self._transcript: deque[tuple[float, str, str]] = deque(maxlen=TOLD_LINES)  # time, mark, text
         self._received = bytearray()
         self._in_step = True
         try:
@@ -84,11 +78,6 @@ class SerialLine:
                 advice="Check the cable, the port's name in the configuration and that no other program holds it",
                 state="Nothing was sent",
             ) from problem
-
-    @property
-    def transcript(self) -> tuple[TranscriptLine, ...]:
-        """The last lines that went over the wire, oldest first."""
-        return tuple(self._transcript.copy())
 
     def send(self, command: str) -> None:
         """Send a command that has no reply. It goes out even where the line is out of step: a stop must not wait.
@@ -117,8 +106,8 @@ class SerialLine:
             self._write(request)
             text = self._read_line()
             if text is None:
-                raise DeviceTimeout(
-                    self._device,
+                raise self._error(
+                    DeviceTimeout,
                     f"no whole reply within {self._timeout:g} s",
                     request=request,
                     reply=_readable(self._received[:80]),
@@ -128,8 +117,8 @@ class SerialLine:
                 )
             match = re.fullmatch(reply, text)
             if match is None:
-                raise DeviceError(
-                    self._device,
+                raise self._error(
+                    DeviceError,
                     "the reply does not have the form it must have",
                     request=request,
                     reply=text,
@@ -154,8 +143,8 @@ class SerialLine:
             if re.fullmatch(self._probe.reply, text):
                 break
         else:
-            raise DeviceTimeout(
-                self._device,
+            raise self._error(
+                DeviceTimeout,
                 f"still no answer after an earlier failure, silent for {self._timeout:g} s",
                 request=self._probe.request,
                 expected=f"a reply of the form {self._probe.reply}",
@@ -172,8 +161,8 @@ class SerialLine:
             self._note("!", f"passed over {_readable(self._received + junk)}")
             self._received.clear()
             if self._clock.now() > deadline:
-                raise DeviceTimeout(
-                    self._device,
+                raise self._error(
+                    DeviceTimeout,
                     "it sends without pause and was not asked",
                     advice="Check the baud rate and that the port is this device's",
                     state=state,
@@ -184,8 +173,8 @@ class SerialLine:
         try:
             self._port.write(text.encode("ascii") + END)
         except serial.SerialTimeoutException as problem:
-            raise DeviceTimeout(
-                self._device,
+            raise self._error(
+                DeviceTimeout,
                 f"it took no bytes for {self._timeout:g} s",
                 request=text,
                 advice="Check power, cable and flow control (none is expected)",
@@ -216,16 +205,28 @@ class SerialLine:
             raise self._port_gone(problem) from problem
 
     def _port_gone(self, problem: OSError) -> DeviceError:
-        return DeviceError(
-            self._device,
+        return self._error(
+            DeviceError,
             f"the port failed: {problem}",
             advice="Check that the cable or adapter is still plugged in, then start again",
             state="What the device was doing it may still be doing",
         )
 
+    def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
+        return kind(self._device, problem, wire=self._told(), **parts)
+
+    def _told(self) -> str:
+        """The last lines and how long ago they went: ">" sent, "<" received, "!" what the driver did."""
+        now = self._clock.now()
+        return ", ".join(f"{mark} {_cut(text)} ({now - time:.2f} s ago)" for time, mark, text in self._transcript)
+
     def _note(self, mark: str, text: str) -> None:
-        self._transcript.append(TranscriptLine(self._clock.now(), mark, text))
+        self._transcript.append((self._clock.now(), mark, text))
 
 
 def _readable(data: bytes | bytearray) -> str:
     return bytes(data).decode("ascii", errors="backslashreplace")
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= TOLD_CHARACTERS else text[:TOLD_CHARACTERS] + "..."

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError, DeviceTimeout
-from drivers.serial_line import TRANSCRIPT_LINES, Probe, SerialLine
+from drivers.serial_line import TOLD_LINES, Probe, SerialLine
 from drivers.stages.pm16c import PM16CStage
 from simulators.clock import VirtualClock
 from simulators.serial_url import register
@@ -213,19 +213,44 @@ def test_a_command_without_reply_goes_out_at_once_even_out_of_step() -> None:
     assert (echo.heard[-1], echo.clock.now()) == ("STOP NOW", before)
 
 
-# the transcript
+# what errors tell of the wire
 
 
-def test_the_transcript_keeps_the_last_lines_with_their_times() -> None:
-    echo = Echo({0: [(0.25, b"5\r\n")]})
+def test_an_error_tells_what_last_went_over_the_wire_and_when() -> None:
+    echo = Echo({1: [(0.25, b"4")]})
     line = connect(echo)
-    ask(line, 5)
-    assert [(entry.mark, entry.text) for entry in line.transcript] == [(">", "N?5"), ("<", "5")]
-    assert line.transcript[1].time - line.transcript[0].time == pytest.approx(0.25, abs=0.06)
-    for n in range(TRANSCRIPT_LINES):
+    ask(line, 7)
+    echo.clock.sleep(2.0)
+    with pytest.raises(DeviceTimeout) as error:
+        ask(line, 42)
+    *before, last = error.value.wire.split(", ")
+    assert [entry.split(" (")[0] for entry in (*before, last)] == ["> N?7", "< 7", "> N?42"]
+    ages = [float(entry.split("(")[1].split()[0]) for entry in (*before, last)]
+    assert ages == pytest.approx([3.0, 3.0, 1.0], abs=0.15)
+    assert str(error.value).endswith(f"On the wire: {error.value.wire}.")
+
+
+def test_a_device_that_stays_silent_is_told_with_the_request_that_it_first_missed() -> None:
+    line = connect(Echo({0: [], 1: []}))
+    with pytest.raises(DeviceTimeout):
+        ask(line, 1)
+    with pytest.raises(DeviceTimeout) as error:
+        ask(line, 2)
+    said = [entry.split(" (")[0] for entry in error.value.wire.split(", ")]
+    assert said == ["> N?1", "! out of step: probing", "> ID?"]
+
+
+def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
+    line = connect(Echo({9: [(0.0, b"x" * 900 + b"\r\n")]}))
+    for n in range(9):
         ask(line, n)
-    assert len(line.transcript) == TRANSCRIPT_LINES
-    assert line.transcript[-1].text == str(TRANSCRIPT_LINES - 1)
+    with pytest.raises(DeviceError, match="does not have the form") as error:
+        ask(line, 9)
+    told = error.value.wire.split(", ")
+    assert len(told) == TOLD_LINES
+    assert told[0].startswith("> N?7 ")
+    assert told[-1].startswith("< " + "x" * 40 + "... (")
+    assert len(error.value.wire) < 300
 
 
 # the port
