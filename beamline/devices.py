@@ -136,7 +136,9 @@ def ask_operator(request: str) -> None:
             state="What was acquired so far is in the file",
         )
     try:
-        click.prompt(f"{request} Then press Enter", default="", show_default=False, prompt_suffix=" ", err=True)
+        # A read from a terminal goes on after a signal, so that a stop is heeded only once it returns.
+        how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
+        click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
     except click.Abort as error:  # the end of input
         raise DeviceError(
             "operator",

@@ -278,6 +278,7 @@ def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     devices.ask_operator("Open the beam shutter.")
     captured = capsys.readouterr()
     assert captured.out.strip() == ""  # stdout is for results
+    assert "Open the beam shutter. Then press Enter (to stop the scan: Ctrl-C, then Enter)" in captured.err
 
 
 def test_limits_hold() -> None:
