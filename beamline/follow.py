@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from beamline.pipeline import (
     refuse,
 )
 from beamline.recon_report import Context, Made, facts_of
+from beamline.stop import Stoppable, never_stopped
 from beamline.storage.recon_file import ReconRecord, write_reconstruction
 from beamline.storage.source import NotReadyError, ScanSource
 from beamline.storage.validate import reconstruction_blockers
@@ -56,7 +58,13 @@ class Rhythm:
     patience: float = 120.0
 
 
-def follow(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm | None = None) -> dict[str, float]:
+def follow(
+    options: ReconOptions,
+    sink: Sink,
+    clock: Clock,
+    rhythm: Rhythm | None = None,
+    stoppable: Stoppable = never_stopped,
+) -> dict[str, float]:
     """Reconstruct a scan while it runs (or one that has ended). Returns the metrics; the event `done` says the rest.
 
     Intermediate volumes stand in `<output>.snapshot.h5`, each replacing the last in one step; a failure leaves the
@@ -84,7 +92,8 @@ def follow(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm | Non
     with _open(options, sink, clock, rhythm) as source:
         growing = _Growing(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
-        made = growing.finish(options.seconds or DEFAULT_SECONDS, rhythm.snapshot)
+        with stoppable() as stopped:
+            made = growing.finish(options.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
         # All flats are there now; the geometry stays the one that the volume has grown in.
         prepared = prepare(source, replace(options.selection, axis_col=growing.axis_col), warn)
@@ -267,8 +276,8 @@ class _Growing:
         data = {"path": self.snapshot_path, "n_views": self._fit.n_views, "seconds": seconds}
         self._sink(Event("snapshot", self._clock.now(), data))
 
-    def finish(self, seconds: float, snapshot_every: float) -> Made:
-        """The last round over all views in `seconds`, with a snapshot now and then, and the volume."""
+    def finish(self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]) -> Made:
+        """The last round over all views in `seconds` or until `stopped`, with snapshots, and the volume."""
         refuse(self.source, reconstruction_blockers(self.source))
         assert self._fit is not None  # two views are there, and the axis was settled with them
         self._sink(
@@ -287,14 +296,18 @@ class _Growing:
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return False
+            return stopped()
 
         try:
             self._say(self._fit.finish(seconds, listen))
         except ValueError as error:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume = self._fit.snapshot()
-        settings = {"seconds_after_scan": seconds, "gaussians": self._history[-1].n_gaussians}
+        settings: dict[str, object] = {
+            "seconds_after_scan": seconds,
+            "gaussians": self._history[-1].n_gaussians,
+            **({"ended_early": True} if stopped() else {}),
+        }
         return Made(volume, "r2", self._clock.now() - self._begin, self._history, settings, self._options.filter)
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ LiveCommand = Callable[[Path, Path], Sequence[str]]
 
 LOOK = 0.2  # real s between looks at whether it should still go on
 PATIENCE = 300.0  # real s without a word, after which it is given up
+GRACE = 30.0  # real s in which it may still deliver the volume as it is
 
 
 def follow_command(config: Config) -> LiveCommand:
@@ -66,11 +68,12 @@ class LiveReconstruction:
             return
         self._reader.start()
 
-    def finish(self, give_up: Callable[[], bool]) -> Mapping[str, Any] | None:
+    def finish(self, give_up: Callable[[], bool], hurry: Callable[[], bool]) -> Mapping[str, Any] | None:
         """Wait for its end; the data of its `done` event, or None where it failed.
 
         Args:
-            give_up: asked a few times a second; True ends it.
+            give_up: asked a few times a second; True asks it to end with what it has.
+            hurry: likewise; True ends it without.
         """
         process = self._process
         if process is None:
@@ -84,9 +87,9 @@ class LiveReconstruction:
                 self._last_word.clear()
                 if give_up() or silent > PATIENCE:
                     given_up = "it was ended" if give_up() else f"it said nothing for {PATIENCE:.0f} s"
-                    self._kill(process)
+                    self._end(process, GRACE, hurry)
         self._reader.join()
-        if process.returncode != 0 or self._done is None:
+        if self._done is None:
             why = given_up or f"it ended with code {process.returncode}"
             message = f"live reconstruction made no volume: {why} ({self._log.name} has its words). The scan is unhurt."
             self._emit("warning", {"message": message, "source": "recon"})
@@ -96,16 +99,18 @@ class LiveReconstruction:
     def close(self) -> None:
         """End it where it still runs."""
         if self._process is not None and self._process.poll() is None:
-            self._kill(self._process)
+            self._end(self._process, GRACE / 6, lambda: False)
             self._reader.join()
 
-    def _kill(self, process: subprocess.Popen[str]) -> None:
+    def _end(self, process: subprocess.Popen[str], grace: float, hurry: Callable[[], bool]) -> None:
         process.terminate()
-        try:
-            process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        while grace > 0 and not hurry():
+            grace -= LOOK
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(LOOK)
+                return
+        process.kill()
+        process.wait()
 
     def _read(self) -> None:
         assert self._process is not None

@@ -14,6 +14,7 @@ from beamline.events import Event, Sink
 from beamline.measure import fit_truth, read_truth
 from beamline.pipeline import Prepared, Selection, prepare
 from beamline.recon_report import Context, Made, facts_of
+from beamline.stop import Stoppable, never_stopped
 from beamline.storage.source import Quantity, ScanSource, open_scan
 from drivers.clock import Clock
 from recon.fbp import Filter
@@ -92,8 +93,10 @@ class Warnings:
             self._sink(Event("warning", self._clock.now(), {"message": text}))
 
 
-def run(options: ReconOptions, sink: Sink, clock: Clock) -> dict[str, float]:
+def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = never_stopped) -> dict[str, float]:
     """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
+
+    A fit that is stopped within `stoppable` delivers what it has, marked `ended_early`.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -116,7 +119,8 @@ def run(options: ReconOptions, sink: Sink, clock: Clock) -> dict[str, float]:
     grid = Grid.matching(prepared.geometry)
     truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning)
     announce(options, prepared, sink, clock)
-    made = reconstruct(options, prepared, grid, sink, clock)
+    with stoppable() as stopped:
+        made = reconstruct(options, prepared, grid, sink, clock, stopped)
     context = Context(facts, options.selection, options.command, options.seed, warn.said, started)
     return deliver(made, prepared, truth, options.target, context, sink, clock)
 
@@ -135,7 +139,9 @@ def announce(options: ReconOptions, prepared: Prepared, sink: Sink, clock: Clock
     sink(Event("recon_started", clock.now(), data))
 
 
-def reconstruct(options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sink, clock: Clock) -> Made:
+def reconstruct(
+    options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sink, clock: Clock, stopped: Callable[[], bool]
+) -> Made:
     """Run the reconstructor on prepared views."""
     try:
         result = recon.reconstruct(
@@ -149,6 +155,7 @@ def reconstruct(options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sin
             filter=options.filter,
             seconds=options.seconds,
             on_progress=progress_events(sink, clock),
+            should_stop=stopped,
             now=clock.now,
         )
     except ValueError as error:
@@ -158,7 +165,7 @@ def reconstruct(options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sin
         method=options.method,
         seconds=result.seconds,
         history=result.history,
-        settings=result.settings,
+        settings={**result.settings, **({"ended_early": True} if stopped() and options.method != "fbp" else {})},
         filter=options.filter,
     )
 

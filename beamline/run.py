@@ -198,7 +198,8 @@ class _Run:
         )
         self.emit("scan_done", {**asdict(result), "status": status})
         if follower is not None:
-            result = replace(result, recon=follower.finish(self._give_up(unfinished is not None)))
+            said = follower.finish(self._give_up(unfinished is not None), lambda: self.stop.aborting)
+            result = replace(result, recon=said)
         if error is not None:
             raise error
         return replace(result, seconds=time.monotonic() - self.began)

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
 from beamline.errors import INTERRUPTED, ScanStopped
+
+Stoppable = Callable[[], AbstractContextManager[Callable[[], bool]]]
+"""Makes the context in which work may be ended early with what it has; within it, ask whether somebody wants that."""
+
+
+@contextmanager
+def never_stopped() -> Iterator[Callable[[], bool]]:
+    """For work that nobody ends early."""
+    yield lambda: False
 
 
 class ScanAborted(ScanStopped):

@@ -107,7 +107,7 @@ class Problem:
 class FitState:
     """Everything that a step reads and changes; with the settings it is a complete checkpoint.
 
-    `step` and `apply_change` update the arrays in place: at 50k Gaussians copying them costs as much as the kernels.
+    `step` updates the arrays in place: at 50k Gaussians copying them costs as much as the kernels.
     """
 
     parameters: dict[str, F32]

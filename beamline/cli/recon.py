@@ -14,9 +14,9 @@ import click
 
 from beamline.cli.narrate import results
 from beamline.cli.scan_options import scan_options
-from beamline.cli.told import terminated_like_interrupted, told_as_json
+from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
 from beamline.deliver import Target
-from beamline.errors import QualityError
+from beamline.errors import QualityError, ScanStopped
 from beamline.events import Event, fan_out
 from beamline.follow import follow as follow_scan
 from beamline.offline import Method, ReconOptions, SourceOptions, run
@@ -166,7 +166,8 @@ def recon(
     """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
 
     Writes a volume [z, y, x] in 1/mm (1/px where the pixel size is unknown) as NXtomoproc, with everything that it was
-    made with, and a report. Nothing is overwritten, and a failure leaves nothing behind.
+    made with, and a report. Nothing is overwritten, and a failure leaves nothing behind. Ctrl-C during the fit ends it
+    with the volume as it is (exit code 4), a second one without.
     """
     if steps is not None and seconds is not None:
         raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
@@ -195,13 +196,15 @@ def recon(
         unfinished=unfinished,
         command=repeated(sys.argv[1:]),
     )
-    clock = SystemClock()
+    clock, end = SystemClock(), EndOfFit()
     last: list[Event] = []
     with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         sink = fan_out(last.append, *(json_sinks or [terminal]))
-        metrics = (follow_scan if follow else run)(options, sink, clock)
+        metrics = (follow_scan if follow else run)(options, sink, clock, stoppable=end)
     if not as_json:
         click.echo(results(last[-1].data))
+    if end.asked:
+        raise ScanStopped(f"The fit was ended early; {output} holds the volume as it then was.")
     if max_residual is not None:
         require(metrics, max_residual)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
 
+import click
 from click.exceptions import ClickException, Exit
 
 from beamline.errors import exit_code, in_words
@@ -36,6 +38,26 @@ def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
         if last not in ("done", "failed"):
             lines(Event("failed", SystemClock().now(), {"message": in_words(error), "exit_code": exit_code(error)}))
         raise
+
+
+class EndOfFit:
+    """Ctrl-C or SIGTERM during a fit: the first asks it to end with what it has, the second throws it away."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    @contextmanager
+    def __call__(self) -> Iterator[Callable[[], bool]]:
+        with ExitStack() as restore:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                restore.callback(signal.signal, number, signal.signal(number, self._ask))
+            yield lambda: self.asked
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+        click.echo("Ending the fit with what it has; once more throws it away.", err=True)
 
 
 @contextmanager

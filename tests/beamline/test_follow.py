@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,6 +141,20 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record.history["n_views"], views)
     assert "<html" in (tmp_path / "report.html").read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "report.html", "scan.h5"]
+
+
+def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+
+    @contextmanager
+    def at_once() -> Iterator[Callable[[], bool]]:
+        yield lambda: True
+
+    follow(_options(tmp_path, seconds=1e5), events.append, clock, RHYTHM, at_once)
+    assert events[-1].event == "done"
+    parameters = read_reconstruction(tmp_path / "recon.h5").parameters
+    assert parameters["ended_early"] and parameters["n_views"] == 30
 
 
 def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from click.testing import CliRunner, Result
 from beamline.cli.main import main
 from beamline.cli.recon import repeated, report_beside
 from beamline.storage.recon_file import read_reconstruction
+from recon import fit
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -187,6 +188,42 @@ def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPat
     assert json.loads(result.stdout.splitlines()[-1])["exit_code"] == 130
     assert _left(folder) == {"scan.h5"}
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_fit_that_is_interrupted_delivers_what_it_has(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    steps = _signal_at_step(monkeypatch, number, {20})
+    result = _beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 4, result.output
+    assert "ended early" in result.stderr
+    assert steps[-1] == 20
+    parameters = read_reconstruction(folder / "scan_r2.h5").parameters
+    assert parameters["ended_early"] and parameters["steps"] == 20
+
+
+def test_a_fit_that_is_interrupted_twice_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _signal_at_step(monkeypatch, signal.SIGINT, {20}, times=2)
+    result = _beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 130
+    assert _left(folder) == {"scan.h5"}
+
+
+def _signal_at_step(monkeypatch: pytest.MonkeyPatch, number: signal.Signals, at: set[int], times: int = 1) -> list[int]:
+    """Raise a signal after some steps of the fit; the steps it has taken."""
+    step, taken = fit.step, []
+
+    def watched(state: fit.FitState, *arguments: Any) -> fit.FitState:
+        state = step(state, *arguments)
+        taken.append(state.step)
+        if state.step in at:
+            for _ in range(times):
+                signal.raise_signal(number)
+        return state
+
+    monkeypatch.setattr(fit, "step", watched)
+    return taken
 
 
 def test_results_are_never_overwritten(folder: Path) -> None:
