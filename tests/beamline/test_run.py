@@ -6,12 +6,8 @@ import errno
 import io
 import json
 import re
-import subprocess
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -19,92 +15,22 @@ import pytest
 
 from beamline import recorder as recorder_module
 from beamline import run as module
-from beamline.config import Config, config_folder, load
+from beamline.config import config_folder, load
 from beamline.devices import connect
 from beamline.digest import FrameDigest
 from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
 from beamline.events import Event
 from beamline.ledger import LedgerError
-from beamline.live import LiveReconstruction
 from beamline.pipeline import Selection, prepare
-from beamline.run import RunResult, State, create_run_folder, run_scan
+from beamline.run import State, create_run_folder, run_scan
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from beamline.storage.source import open_scan
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
 from recon.correct import CorrectionSettings
-from tests.beamline.fakes import COUNT, Faults, Instrument, decode
-
-SMALL = (
-    "scan.angles.views=12",
-    "scan.period_s=0.5",
-    "scan.exposure_s=0.02",
-    "scan.darks.count=3",
-    "scan.flats.count=2",
-    "scan.flats.at=both",
-    "recon.live=false",
-)
-
-
-def small(*overrides: str) -> Config:
-    return load(config_folder() / "simulated.yaml", [*SMALL, *overrides], environment={})
-
-
-class Ran:
-    """A run and everything it left."""
-
-    def __init__(
-        self,
-        runs: Path,
-        instrument: Instrument,
-        *overrides: str,
-        stop: StopRequest | None = None,
-        live: Callable[[Path, Path], Sequence[str]] | None = None,
-    ) -> None:
-        self.events: list[Event] = []
-        self.result: RunResult | None = None
-        self.error: BaseException | None = None
-        self.instrument = instrument
-        try:
-            self.result = run_scan(
-                small(*overrides), runs, [self.events.append], stop, live=live, bench=instrument.bench()
-            )
-        except BaseException as error:
-            self.error = error
-        folders = list(runs.iterdir()) if runs.exists() else []
-        self.folder = folders[0] if folders else None
-
-    def of(self, name: str) -> list[Event]:
-        return [event for event in self.events if event.event == name]
-
-    @property
-    def states(self) -> list[str]:
-        return [event.data["state"] for event in self.of("state")]
-
-    def assert_good_file(self, n: int, status: str, missing: Sequence[int] = ()) -> None:
-        """`n` rows, each with the angle that the fake camera wrote into its pixels, and nothing else."""
-        assert self.folder is not None
-        with open_scan(self.folder / "scan.h5") as source:
-            assert source.finished
-            frames = list(source.frames())
-            assert len(frames) == len(source.image_key) == n
-            for frame in frames:
-                count, is_open, is_in, _ = decode(frame.counts)
-                assert is_open is (frame.kind is not FrameKind.DARK)
-                assert is_in is (frame.kind is not FrameKind.FLAT)
-                if frame.kind is not FrameKind.INVALID:
-                    assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
-        with h5py.File(self.folder / "scan.h5") as file:
-            progress = file["entry/progress"]
-            assert progress["status"][()].decode() == status
-            assert list(progress["missing_triggers"]) == list(missing)
-            assert progress["frames_committed"][()] == n
-
-    def assert_safe(self) -> None:
-        assert not self.instrument.is_open
-        assert not self.instrument.camera.armed
-        assert not self.instrument.stage.moving()
+from tests.beamline.fakes import COUNT, Faults, Instrument
+from tests.beamline.ran import SMALL, Ran, small
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
@@ -360,91 +286,6 @@ def test_an_interpreter_interrupt_closes_the_file_too(tmp_path: Path) -> None:
     ran.assert_safe()
 
 
-def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
-    return lambda scan, output: [sys.executable, "-c", code, str(scan), str(output)]
-
-
-def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
-    code = """
-import json, pathlib, sys
-print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "n_views": 5}))
-print("a library's chatter")
-pathlib.Path(sys.argv[2]).write_text("volume")
-print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
-"""
-    ran = Ran(tmp_path, Instrument(), live=script(code))
-    assert ran.error is None
-    assert ran.result is not None
-    assert ran.folder is not None
-    recon = [(e.event, e.data["source"]) for e in ran.events if "source" in e.data]
-    assert recon == [("snapshot", "recon"), ("recon_done", "recon")]
-    assert ran.result.recon is not None
-    assert ran.result.recon["axis_col"] == 80.5
-    assert Path(ran.result.recon["output"]) == ran.folder / "recon.h5"
-    assert ran.events[-1].event == "done"
-    ran.assert_good_file(19, "complete")
-
-
-@pytest.mark.parametrize(
-    ("code", "says"),
-    [
-        ("import sys; sys.exit('out of memory')", "ended with code 1"),
-        ("pass", "ended with code 0"),
-        ('print(\'{"event": "failed", "message": "no axis", "exit_code": 5}\'); raise SystemExit(5)', "no axis"),
-    ],
-)
-def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: str, says: str) -> None:
-    ran = Ran(tmp_path, Instrument(), live=script(code))
-    assert ran.error is None
-    assert ran.result is not None
-    assert ran.folder is not None
-    assert ran.result.recon is None
-    assert any(says in event.data["message"] for event in ran.of("warning"))
-    ran.assert_good_file(19, "complete")
-    if "memory" in code:
-        assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
-
-
-def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
-    assert ran.error is None
-    assert any("cannot be started" in event.data["message"] for event in ran.of("warning"))
-    ran.assert_good_file(19, "complete")
-
-
-def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
-    stop = StopRequest()
-    ran = Ran(
-        tmp_path,
-        Instrument(on_frame=lambda number: stop.abort() if number == 10 else None),
-        stop=stop,
-        live=script("import time; time.sleep(100)"),
-    )
-    assert type(ran.error) is ScanAborted
-    assert any("it was ended" in event.data["message"] for event in ran.of("warning"))
-
-
-def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    started: list[subprocess.Popen[str]] = []
-
-    class Kept(LiveReconstruction):
-        def __init__(self, *args: Any) -> None:
-            super().__init__(*args)
-            assert self._process is not None
-            started.append(self._process)
-
-    def broken(*_: object, **__: object) -> None:
-        raise ZeroDivisionError("defect")
-
-    monkeypatch.setattr(module, "LiveReconstruction", Kept)
-    monkeypatch.setattr(module, "Recorder", broken)
-    ran = Ran(tmp_path, Instrument(), live=script("import time; time.sleep(100)"))
-    assert isinstance(ran.error, ZeroDivisionError)
-    assert [process.poll() is None for process in started] == [False]
-
-
 def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -458,28 +299,6 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
         run_scan(small(), tmp_path, [events.append])
     done = [event.data for event in events if event.event == "scan_done"]
     assert [(data["status"], data["n_frames"]) for data in done] == [("complete", 19)]
-
-
-def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path) -> None:
-    stop = StopRequest()
-    instrument = Instrument()
-    events: list[Event] = []
-
-    def sink(event: Event) -> None:
-        events.append(event)
-        if event.event == "scan_done":
-            stop.stop()
-
-    result = run_scan(
-        small(),
-        tmp_path,
-        [sink],
-        stop,
-        live=script("import time; time.sleep(100)"),
-        bench=instrument.bench(),
-    )
-    assert result.n_frames == 19
-    assert result.recon is None
 
 
 def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
