@@ -87,15 +87,19 @@ class TiffStack:
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
         series = self._tif.series[0]
-        if len(series.shape) not in (2, 3) or len(self._tif.series) != 1:
-            shapes = ", ".join(str(part.shape) for part in self._tif.series)
+        one_by_one = _pages_one_by_one(self._tif)
+        if len(series.shape) not in (2, 3) or (len(self._tif.series) != 1 and not one_by_one):
+            shapes = ", ".join(str(part.shape) for part in self._tif.series[:6])
+            shapes += f", ... ({len(self._tif.series)} in all)" if len(self._tif.series) > 6 else ""
             raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
         self.shape = (int(series.shape[-2]), int(series.shape[-1]))
         self.dtype: np.dtype[Any] = np.dtype(series.dtype)
         require_real(self.dtype, str(self.path))
         # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
-        self._offset = series.dataoffset
+        self._offset = None if one_by_one else series.dataoffset
         self._stored = self.dtype.newbyteorder(self._tif.byteorder)
+        if one_by_one:
+            return len(self._tif.pages)
         return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
@@ -255,7 +259,15 @@ def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
 
 def read_image(file: Path | BinaryIO) -> NDArray[Any]:
     """All pages of a TIFF; [row, col] for one page."""
-    return np.asarray(tifffile.imread(file))
+    with tifffile.TiffFile(file) as tif:
+        return np.asarray(tif.asarray(key=slice(None)) if _pages_one_by_one(tif) else tif.asarray())
+
+
+def _pages_one_by_one(tif: tifffile.TiffFile) -> bool:
+    """Pages that were appended one at a time, each an image of its own to tifffile, but all alike: one stack."""
+    parts = tif.series
+    alike = all(len(part.shape) == 2 and (part.shape, part.dtype) == (parts[0].shape, parts[0].dtype) for part in parts)
+    return len(parts) > 1 and alike and len(parts) == len(tif.pages)
 
 
 def kind_of(name: str) -> FrameKind:

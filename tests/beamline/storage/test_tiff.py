@@ -11,7 +11,7 @@ import tifffile
 
 from beamline.errors import DataError
 from beamline.storage.source import open_scan
-from beamline.storage.tiff import kind_of, natural
+from beamline.storage.tiff import kind_of, load_images, natural
 from drivers.frame import FrameKind
 
 SHAPE = (6, 8)
@@ -176,6 +176,27 @@ def test_a_stack_is_read_page_by_page(tmp_path: Path, rng: np.random.Generator, 
         np.testing.assert_array_equal(source.angles, np.arange(7.0))
 
 
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_pages_appended_one_at_a_time_are_one_stack(
+    tmp_path: Path, rng: np.random.Generator, compression: str | None
+) -> None:
+    stack = rng.normal(size=(7, *SHAPE)).astype(np.float32)
+    for page in stack:
+        tifffile.imwrite(tmp_path / "s.tif", page, append=True, compression=compression, bigtiff=True)
+    with open_scan(tmp_path / "s.tif") as source:
+        assert (source.shape, source.dtype, source.image_key.size) == (SHAPE, np.float32, 7)
+        np.testing.assert_array_equal(source.read(slice(None)), stack)
+        np.testing.assert_array_equal(source.read([6, 3], slice(1, 4)), stack[[6, 3], 1:4])
+    np.testing.assert_array_equal(load_images(tmp_path / "s.tif"), stack)
+
+
+def test_pages_of_different_shapes_are_refused(tmp_path: Path) -> None:
+    for rows in (6, 6, 5):
+        tifffile.imwrite(tmp_path / "s.tif", np.zeros((rows, 8), np.float32), append=True)
+    with pytest.raises(DataError, match="one stack of grey images"):
+        open_scan(tmp_path / "s.tif")
+
+
 def test_a_colour_stack_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", np.zeros((3, *SHAPE, 3), np.uint8), photometric="rgb")
     with pytest.raises(DataError, match="one stack of grey images"):
@@ -184,11 +205,13 @@ def test_a_colour_stack_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
 @pytest.mark.parametrize("left", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("appended", [False, True])
 def test_a_cut_stack_is_no_shorter_scan(
-    tmp_path: Path, rng: np.random.Generator, compression: str | None, left: float
+    tmp_path: Path, rng: np.random.Generator, compression: str | None, left: float, appended: bool
 ) -> None:
     stack = rng.normal(size=(7, 60, 80)).astype(np.float32)
-    tifffile.imwrite(tmp_path / "s.tif", stack, photometric="minisblack", compression=compression)
+    for part in stack if appended else [stack]:
+        tifffile.imwrite(tmp_path / "s.tif", part, append=appended, photometric="minisblack", compression=compression)
     whole = (tmp_path / "s.tif").read_bytes()
     (tmp_path / "s.tif").write_bytes(whole[: int(len(whole) * left)])
     with pytest.raises(DataError, match="cannot be read"), open_scan(tmp_path / "s.tif") as source:
