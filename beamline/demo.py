@@ -73,7 +73,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         method="r2",
         seconds=record.metrics["seconds"],
         history=history_of(record.history),
-        settings={name: record.parameters[name] for name in ("seconds_after_scan", "gaussians")},
+        settings=record.parameters,
         psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in keeper.snapshots],
     )
     context = Context(facts, selection, command, config.recon.seed, warnings, started, keeper.flags)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -304,6 +304,7 @@ class _Growing:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume = self._fit.snapshot()
         settings: dict[str, object] = {
+            **asdict(self._fit.settings),
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
             **({"ended_early": True} if stopped() else {}),

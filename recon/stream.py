@@ -74,6 +74,11 @@ class StreamingFit:
         return len(self._angles)
 
     @property
+    def settings(self) -> fit.FitSettings:
+        """What the fit runs with."""
+        return self._settings
+
+    @property
     def started(self) -> bool:
         """There is a model; before, there are not enough views for one."""
         return self._state is not None

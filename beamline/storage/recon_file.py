@@ -51,9 +51,7 @@ class ReconRecord:
 def refuse_existing(path: Path) -> None:
     """Raise DataError where `path` exists (results are never overwritten) or its folder does not."""
     if path.exists():
-        raise DataError(
-            f"{path} exists and results are never overwritten. Name another output with -o, or move it away."
-        )
+        raise DataError(f"{path} exists and results are never overwritten. Name another output, or move it away.")
     if not path.parent.is_dir():
         raise DataError(
             f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Make it first."
