@@ -153,6 +153,7 @@ class _Growing:
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
         self.axis: AxisEstimate | None = None  # how the axis was found; None where it was given or stated
         self._corrector: Corrector | None = None
+        self._late = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
         self._taken = 0  # frames that the fit has, or that are no views
@@ -181,7 +182,11 @@ class _Growing:
             self._taken = n
             return grown
         if self._corrector is None:
-            refuse(self.source, correction_blockers(self.source))
+            blockers = correction_blockers(self.source)
+            if not ended and (self._late or any(finding.rule == "references" for finding in blockers)):
+                self._wait_for_references()
+                return grown
+            refuse(self.source, blockers)
             self._corrector = Corrector(self.source, self._options.selection, self._warn)
         if not self._axis_settled:
             self._settle_axis(self._corrector, views, ended)
@@ -196,6 +201,13 @@ class _Growing:
             self._fit.add_views(corrected.data, self.source.angles[corrected.view_ids])
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
+
+    def _wait_for_references(self) -> None:
+        """Darks or flats that come after the views: all of them are there when the scan has ended, not before."""
+        if not self._late:
+            message = "No darks or no flats before the views: the volume begins when the scan has ended"
+            self._sink(Event("state", self._clock.now(), {"state": "waiting", "message": message}))
+        self._late = True
 
     def _settle_axis(self, corrector: Corrector, views: NDArray[np.int64], ended: bool) -> None:
         """Look for the axis each time the views have grown by half, and once more when all are there.

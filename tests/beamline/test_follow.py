@@ -21,7 +21,7 @@ from beamline.offline import ReconOptions, SourceOptions
 from beamline.pipeline import Selection
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.recon_file import read_reconstruction
-from drivers.frame import Frame
+from drivers.frame import Frame, FrameKind
 from recon.align import AxisEstimate
 from recon.metrics import psnr
 from recon.volume import Volume
@@ -142,6 +142,20 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record.history["n_views"], views)
     assert "<html" in (tmp_path / "report.html").read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "report.html", "scan.h5"]
+
+
+@pytest.mark.parametrize("late", [FrameKind.FLAT, FrameKind.DARK])
+def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, late: FrameKind) -> None:
+    clock, events = ScanClock(), list[Event]()
+    frames = frames_of(INTERLACED)
+    order = [frame for frame in frames if frame.kind is not late] + [frame for frame in frames if frame.kind is late]
+    _schedule(clock, tmp_path / "scan.h5", [replace(frame, index=i) for i, frame in enumerate(order)])
+    metrics = follow(_options(tmp_path), events.append, clock, RHYTHM)
+    waiting = [event.data["message"] for event in events if event.event == "state"]
+    assert sum("when the scan has ended" in message for message in waiting) == 1
+    assert metrics["residual"] < 0.1
+    record = read_reconstruction(tmp_path / "recon.h5")
+    assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20
 
 
 def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) -> None:
