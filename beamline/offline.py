@@ -20,6 +20,7 @@ from drivers.clock import Clock
 from recon.fbp import Filter
 from recon.fit import Progress
 from recon.volume import Grid
+from recon.warm_up import warm_up
 
 Method = Literal["r2", "fbp"]
 
@@ -143,6 +144,8 @@ def reconstruct(
     options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sink, clock: Clock, stopped: Callable[[], bool]
 ) -> Made:
     """Run the reconstructor on prepared views."""
+    if options.method == "r2":
+        warm_up()  # so that the fit's time, and the time it says is left, hold no compilation
     try:
         result = recon.reconstruct(
             prepared.projections.data,
