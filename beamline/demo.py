@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +24,6 @@ from recon.metrics import psnr
 from recon.volume import Grid, Volume
 
 REPORT = "report.html"
-
-Truth = Callable[[Grid], Volume]
 
 
 def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: StopRequest, command: str) -> None:

@@ -9,9 +9,6 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from recon import threads  # noqa: F401 - settles the threads before torch starts them
-
-# isort: split
 import numpy as np
 import torch
 from numpy.typing import NDArray
