@@ -18,7 +18,8 @@ from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.kernels import reference
 from recon.kernels.activation import F32, activate, activation_backward
-from recon.kernels.project_cpu import footprint_table, footprints, footprints_backward, moments, render
+from recon.kernels.footprints_cpu import footprint_table, footprints, footprints_backward
+from recon.kernels.project_cpu import moments, render
 from recon.kernels.voxelize_cpu import Layout
 from recon.volume import Grid
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 import recon
-from recon.kernels import activation, adam_cpu, losses_cpu, project_cpu, voxelize_cpu
+from recon.kernels import activation, adam_cpu, footprints_cpu, losses_cpu, project_cpu, voxelize_cpu
 from recon.warm_up import warm_up
 
 
 def _compiled() -> dict[str, int]:
     """Specialisations of each jitted function of the kernels."""
     found = {}
-    for module in (activation, adam_cpu, losses_cpu, project_cpu, voxelize_cpu):
+    for module in (activation, adam_cpu, footprints_cpu, losses_cpu, project_cpu, voxelize_cpu):
         for name, value in vars(module).items():
             if type(value).__name__ == "CPUDispatcher":
                 found[f"{module.__name__}.{name}"] = len(value.signatures)
