@@ -6,12 +6,20 @@ Convention (fixed for the whole project): the object stands still and the view t
     v = z                        rows grow with v (the rotation axis is z)
     rays run along d = (-sin θ, cos θ, 0)
 
-Column i has its centre at u = (i - axis_col) * pixel_pitch, so `axis_col` counts pixels from 0 at the
-centre of the first column; row j has its centre at v = (j - (rows - 1) / 2) * pixel_pitch.
+Parallel beam: column i has its centre at u = (i - axis_col) * pixel_pitch, so `axis_col` counts pixels from 0 at the
+centre of the first column; row j has its centre at v = (j - axis_row) * pixel_pitch, with axis_row = (rows - 1) / 2
+where nothing else is said.
+
+Cone beam: the source lies at -sod * d, the detector sdd away from it; a point at depth w = sod + x·d falls on column
+axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_pitch, with pixel_pitch on the detector.
+
+A real set-up departs from that in three ways, each of them one number a view: `tilt` leans the rotation axis along
+the beam (laminography), `roll` turns the detector about the beam, `shifts` move the picture on the detector.
 """
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,22 +27,36 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+F64 = NDArray[np.float64]
+
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Parallel-beam geometry of a set of views.
+    """Geometry of a set of views; made by `Geometry.parallel` or `Geometry.cone`.
 
     Attributes:
         angles: float64 [view], radians, any order, any range.
         detector_shape: (rows, cols) in pixels.
-        pixel_pitch: detector pixel in mm at the sample (1.0 = work in pixels).
-        axis_col: column coordinate of the rotation axis, 0 at the centre of the first column.
+        pixel_pitch: detector pixel in mm: at the sample for a parallel beam (1.0 = work in pixels), on the detector
+            for a cone.
+        axis_col, axis_row: where the rotation axis, and the height z = 0, fall on the detector (a cone: its central
+            ray): pixels from 0 at the centre of the first column, row.
+        sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
+        shifts: float64 [view, 2], pixels (col, row) by which each view is displaced.
+        roll: float64 [view], radians; the detector turned about the beam: its columns run along u cos + v sin.
+        tilt: float64 [view], radians; the rotation axis leaning along the beam: rows then run along v cos + d sin.
     """
 
-    angles: NDArray[np.float64]
+    angles: F64
     detector_shape: tuple[int, int]
     pixel_pitch: float
     axis_col: float
+    axis_row: float
+    sod: float
+    sdd: float
+    shifts: F64
+    roll: F64
+    tilt: F64
 
     @classmethod
     def parallel(
@@ -43,32 +65,82 @@ class Geometry:
         detector_shape: tuple[int, int],
         pixel_pitch: float = 1.0,
         axis_col: float | None = None,
+        *,
+        axis_row: float | None = None,
+        shifts: ArrayLike | None = None,
+        roll: ArrayLike = 0.0,
+        tilt: ArrayLike = 0.0,
     ) -> Geometry:
-        """Parallel beam. `axis_col=None` puts the axis in the middle of the detector, at (cols - 1) / 2.
+        """Parallel beam. `axis_col=None` puts the axis in the middle of the detector, at (cols - 1) / 2; rows alike.
 
         Raises:
             ValueError: for no views, non-finite angles, an empty detector, or a pitch that is not positive.
         """
-        theta = np.atleast_1d(np.asarray(angles, dtype=np.float64)).copy()
-        rows, cols = (operator.index(n) for n in detector_shape)
-        if theta.ndim != 1 or theta.size == 0:
-            raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
-        if not np.isfinite(theta).all():
-            bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
-            raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (views {bad} ...)")
-        if rows < 1 or cols < 1:
-            raise ValueError(f"detector_shape must be (rows, cols) >= 1, got {(rows, cols)}")
-        if not (np.isfinite(pixel_pitch) and pixel_pitch > 0):
-            raise ValueError(f"pixel_pitch must be a positive length in mm, got {pixel_pitch}")
-        axis = (cols - 1) / 2 if axis_col is None else float(axis_col)
-        if not np.isfinite(axis):
-            raise ValueError(f"axis_col must be finite, got {axis_col}")
-        theta.setflags(write=False)
-        return cls(theta, (rows, cols), float(pixel_pitch), axis)
+        return _checked(
+            angles, detector_shape, pixel_pitch, axis_col, axis_row, math.inf, math.inf, shifts, roll, tilt
+        )  # fmt: skip
+
+    @classmethod
+    def cone(
+        cls,
+        angles: ArrayLike,
+        detector_shape: tuple[int, int],
+        pixel_pitch: float,
+        sod: float,
+        sdd: float,
+        axis_col: float | None = None,
+        *,
+        axis_row: float | None = None,
+        shifts: ArrayLike | None = None,
+        roll: ArrayLike = 0.0,
+        tilt: ArrayLike = 0.0,
+    ) -> Geometry:
+        """Cone beam from a point `sod` mm before the rotation axis onto a flat detector `sdd` mm behind the source.
+
+        Raises:
+            ValueError: as `parallel`, and for distances that are not finite with 0 < sod <= sdd.
+        """
+        if not (math.isfinite(sod) and math.isfinite(sdd) and 0 < sod <= sdd):
+            raise ValueError(f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}")
+        return _checked(
+            angles, detector_shape, pixel_pitch, axis_col, axis_row, float(sod), float(sdd), shifts, roll, tilt
+        )  # fmt: skip
 
     @property
     def n_views(self) -> int:
         return int(self.angles.size)
+
+    @property
+    def is_cone(self) -> bool:
+        return math.isfinite(self.sod)
+
+    @property
+    def is_straight(self) -> bool:
+        """Rows run along u and columns along the rotation axis: no roll, no tilt (views may be shifted)."""
+        return not (self.roll.any() or self.tilt.any())
+
+    @property
+    def middle_height(self) -> float:
+        """z in mm that falls on the middle of the detector's rows."""
+        return ((self.detector_shape[0] - 1) / 2 - self.axis_row) * self.sample_pitch
+
+    @property
+    def sample_pitch(self) -> float:
+        """Detector pixel in mm at the rotation axis."""
+        return self.pixel_pitch * self.sod / self.sdd if self.is_cone else self.pixel_pitch
+
+    def axes(self, view: int) -> F64:
+        """Unit vectors [3, 3] of one view in the object's frame: along the columns, along the rows, along the beam."""
+        c, s = math.cos(self.angles[view]), math.sin(self.angles[view])
+        u, v, d = np.array([c, s, 0.0]), np.array([0.0, 0.0, 1.0]), np.array([-s, c, 0.0])
+        ct, st = math.cos(self.tilt[view]), math.sin(self.tilt[view])
+        v, d = ct * v + st * d, ct * d - st * v
+        cr, sr = math.cos(self.roll[view]), math.sin(self.roll[view])
+        return np.stack((cr * u + sr * v, cr * v - sr * u, d))
+
+    def origin(self, view: int) -> tuple[float, float]:
+        """Pixel (col, row) at which the middle of the object's frame falls in one view."""
+        return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def select(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Geometry:
         """The same geometry with only `views`, in that order.
@@ -76,31 +148,105 @@ class Geometry:
         Raises:
             ValueError: for no views.
         """
-        theta = np.atleast_1d(self.angles[views]).copy()
+        theta = np.atleast_1d(self.angles[views])
         if theta.size == 0:
             raise ValueError("no views are selected")
-        theta.setflags(write=False)
-        return replace(self, angles=theta)
+        shifts = np.atleast_2d(self.shifts[views])
+        roll, tilt = np.atleast_1d(self.roll[views]), np.atleast_1d(self.tilt[views])
+        return replace(
+            self, angles=_frozen(theta), shifts=_frozen(shifts), roll=_frozen(roll), tilt=_frozen(tilt)
+        )  # fmt: skip
 
     def at(self, angles: ArrayLike) -> Geometry:
-        """The same detector and axis at other angles (radians)."""
-        return Geometry.parallel(angles, self.detector_shape, self.pixel_pitch, self.axis_col)
+        """The same set-up at other angles (radians), without the shifts of single views.
+
+        Raises:
+            ValueError: for bad angles, or where roll or tilt differ between views: which would the new ones have?
+        """
+        if np.ptp(self.roll) > 0 or np.ptp(self.tilt) > 0:
+            raise ValueError("roll or tilt differ from view to view: say those of the new angles, too")
+        return _checked(
+            angles, self.detector_shape, self.pixel_pitch, self.axis_col, self.axis_row, self.sod, self.sdd,
+            None, self.roll[0], self.tilt[0],
+        )  # fmt: skip
 
     def rows(self, start: int, stop: int) -> Geometry:
-        """The same geometry for detector rows start..stop; v is measured from the middle of the kept rows."""
-        if not 0 <= start < stop <= self.detector_shape[0]:
-            raise ValueError(f"rows {start}:{stop} do not lie in 0:{self.detector_shape[0]}")
-        return replace(self, detector_shape=(stop - start, self.detector_shape[1]))
+        """The same geometry for detector rows start..stop.
+
+        For a parallel beam v is measured from the middle of the kept rows, so that a slab is a scan of its own; a cone
+        keeps its central ray where it is.
+        """
+        rows = self.detector_shape[0]
+        if not 0 <= start < stop <= rows:
+            raise ValueError(f"rows {start}:{stop} do not lie in 0:{rows}")
+        off_middle = self.axis_row - (rows - 1) / 2
+        axis_row = self.axis_row - start if self.is_cone else off_middle + (stop - start - 1) / 2
+        return replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
 
     def binned(self, factor: int) -> Geometry:
         """The geometry after joining factor x factor pixels; trailing rows and columns that do not fill a bin go.
 
-        As with `rows`, v is measured from the middle of what is left.
+        As with `rows`, a parallel beam's v is measured from the middle of what is left.
         """
         if operator.index(factor) < 1:
             raise ValueError(f"bin factor must be >= 1, got {factor}")
         rows, cols = (n // factor for n in self.detector_shape)
         if rows < 1 or cols < 1:
             raise ValueError(f"bin factor {factor} is larger than the detector {self.detector_shape}")
-        axis = (self.axis_col - (factor - 1) / 2) / factor
-        return replace(self, detector_shape=(rows, cols), pixel_pitch=self.pixel_pitch * factor, axis_col=axis)
+        kept = self.rows(0, rows * factor)
+        return replace(
+            kept,
+            detector_shape=(rows, cols),
+            pixel_pitch=self.pixel_pitch * factor,
+            axis_col=(kept.axis_col - (factor - 1) / 2) / factor,
+            axis_row=(kept.axis_row - (factor - 1) / 2) / factor,
+            shifts=_frozen(self.shifts / factor),
+        )
+
+
+def _checked(
+    angles: ArrayLike,
+    detector_shape: tuple[int, int],
+    pixel_pitch: float,
+    axis_col: float | None,
+    axis_row: float | None,
+    sod: float,
+    sdd: float,
+    shifts: ArrayLike | None,
+    roll: ArrayLike,
+    tilt: ArrayLike,
+) -> Geometry:
+    theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
+    rows, cols = (operator.index(n) for n in detector_shape)
+    if theta.ndim != 1 or theta.size == 0:
+        raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
+    if not np.isfinite(theta).all():
+        bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
+        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (views {bad} ...)")
+    if rows < 1 or cols < 1:
+        raise ValueError(f"detector_shape must be (rows, cols) >= 1, got {(rows, cols)}")
+    if not (np.isfinite(pixel_pitch) and pixel_pitch > 0):
+        raise ValueError(f"pixel_pitch must be a positive length in mm, got {pixel_pitch}")
+    col = (cols - 1) / 2 if axis_col is None else float(axis_col)
+    row = (rows - 1) / 2 if axis_row is None else float(axis_row)
+    for name, value in (("axis_col", col), ("axis_row", row)):
+        if not np.isfinite(value):
+            raise ValueError(f"{name} must be finite, got {value}")
+    moved = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
+    if moved.shape != (theta.size, 2) or not np.isfinite(moved).all():
+        raise ValueError(f"shifts must be finite pixels (col, row) [{theta.size}, 2], got shape {moved.shape}")
+    turned = []
+    for name, turn in (("roll", roll), ("tilt", tilt)):
+        given = np.asarray(turn, np.float64)
+        if given.shape not in ((), (theta.size,)) or not np.isfinite(given).all():
+            raise ValueError(f"{name} must be finite radians, one for all views or [{theta.size}], got {given.shape}")
+        turned.append(_frozen(np.broadcast_to(given, theta.shape)))
+    return Geometry(
+        _frozen(theta), (rows, cols), float(pixel_pitch), col, row, sod, sdd, _frozen(moved), turned[0], turned[1]
+    )  # fmt: skip
+
+
+def _frozen(values: F64) -> F64:
+    own = np.array(values, np.float64)
+    own.setflags(write=False)
+    return own

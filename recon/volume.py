@@ -14,23 +14,26 @@ from recon.geometry import Geometry
 
 @dataclass(frozen=True)
 class Grid:
-    """A box of cubic voxels; voxel [k, j, i] has its centre at centre + ((i, j, k) - (n - 1) / 2) * voxel_size.
+    """A box of voxels; voxel [k, j, i] has its centre at centre + ((i, j, k) - (n - 1) / 2) * edge.
 
     Attributes:
         shape: (nz, ny, nx) in voxels; z runs along the rotation axis.
-        voxel_size: edge in mm.
+        voxel_size: edge in mm along x and y, and along z where no other is given.
         centre: (z, y, x) of the box's centre in mm; the rotation axis is x = y = 0.
+        slice_pitch: edge in mm along z; None: voxels are cubes.
     """
 
     shape: tuple[int, int, int]
     voxel_size: float = 1.0
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slice_pitch: float | None = None
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3 or min(self.shape) < 1:
             raise ValueError(f"grid shape must be (nz, ny, nx) >= 1, got {self.shape}")
-        if not (np.isfinite(self.voxel_size) and self.voxel_size > 0):
-            raise ValueError(f"voxel_size must be a positive length in mm, got {self.voxel_size}")
+        for name, edge in (("voxel_size", self.voxel_size), ("slice_pitch", self.spacing[0])):
+            if not (np.isfinite(edge) and edge > 0):
+                raise ValueError(f"{name} must be a positive length in mm, got {edge}")
         if len(self.centre) != 3 or not np.isfinite(self.centre).all():
             raise ValueError(f"centre must be three finite lengths (z, y, x) in mm, got {self.centre}")
         # A shape from a list or an array is the same box.
@@ -41,32 +44,39 @@ class Grid:
     def matching(cls, geometry: Geometry) -> Grid:
         """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis."""
         rows, cols = geometry.detector_shape
-        return cls((rows, cols, cols), geometry.pixel_pitch)
+        return cls((rows, cols, cols), geometry.sample_pitch, (geometry.middle_height, 0.0, 0.0))
 
     @classmethod
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
         """A box around the rotation axis that holds all that any view sees, however far from the middle the axis is.
 
-        An axis off the detector counts as one at its edge.
+        An axis off the detector counts as one at its edge. A cone's field is measured at the rotation axis, as its
+        makers do: what lies nearer the source is seen larger, and by few views only.
         """
         rows, cols = geometry.detector_shape
         axis = min(max(geometry.axis_col, -0.5), cols - 0.5)
-        per_voxel = geometry.pixel_pitch / voxel_size
+        per_voxel = geometry.sample_pitch / voxel_size
         across, along = 2 * max(axis + 0.5, cols - axis - 0.5) * per_voxel, rows * per_voxel
         nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error is no voxel
-        return cls((nz, nx, nx), voxel_size)
+        return cls((nz, nx, nx), voxel_size, (geometry.middle_height, 0.0, 0.0))
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Voxel edges (z, y, x) in mm."""
+        return (self.voxel_size if self.slice_pitch is None else self.slice_pitch, self.voxel_size, self.voxel_size)
 
     @property
     def edges(self) -> NDArray[np.float64]:
         """Lower and upper corner of the box, [2, 3] mm, each (x, y, z)."""
-        half = np.asarray(self.shape[::-1]) * self.voxel_size / 2
+        half = np.asarray(self.shape[::-1]) * np.asarray(self.spacing[::-1]) / 2
         middle = np.asarray(self.centre[::-1])
         return np.stack((middle - half, middle + half))
 
     def coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Voxel centres along each axis: (z [nz], y [ny], x [nx]) in mm."""
         return tuple(  # type: ignore[return-value]
-            c + (np.arange(n) - (n - 1) / 2) * self.voxel_size for n, c in zip(self.shape, self.centre, strict=True)
+            c + (np.arange(n) - (n - 1) / 2) * edge
+            for n, c, edge in zip(self.shape, self.centre, self.spacing, strict=True)
         )
 
 

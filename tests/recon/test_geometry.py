@@ -116,3 +116,83 @@ def test_a_grid_takes_any_list_of_whole_numbers() -> None:
 def test_a_volume_fits_its_grid() -> None:
     with pytest.raises(ValueError, match="shape"):
         Volume(np.zeros((2, 2, 2), np.float32), Grid((2, 2, 3)))
+
+
+def _pixel(geometry: Geometry, view: int, point: np.ndarray) -> np.ndarray:
+    """Where a point falls, by the trigonometry of the module's docstring written out without matrices."""
+    x, y, z = point
+    c, s = np.cos(geometry.angles[view]), np.sin(geometry.angles[view])
+    u, v, along = x * c + y * s, z, -x * s + y * c
+    t, r = geometry.tilt[view], geometry.roll[view]
+    v, along = v * np.cos(t) + along * np.sin(t), along * np.cos(t) - v * np.sin(t)
+    u, v = u * np.cos(r) + v * np.sin(r), v * np.cos(r) - u * np.sin(r)
+    enlarged = geometry.sdd / (geometry.sod + along) if geometry.is_cone else 1.0
+    col, row = geometry.shifts[view]
+    return np.array(
+        [geometry.axis_col + col + enlarged * u / geometry.pixel_pitch,
+         geometry.axis_row + row + enlarged * v / geometry.pixel_pitch]
+    )  # fmt: skip
+
+
+finite = st.floats(-2, 2)
+
+
+@given(angle=st.floats(-9, 9), roll=finite, tilt=finite, point=st.tuples(finite, finite, finite), cone=st.booleans())
+def test_axes_are_a_right_handed_frame_that_puts_points_where_trigonometry_does(
+    angle: float, roll: float, tilt: float, point: tuple[float, float, float], cone: bool
+) -> None:
+    how = {"axis_col": 3.3, "axis_row": 2.2, "shifts": [[0.5, -1.5]], "roll": roll, "tilt": tilt}
+    make = (lambda *a, **k: Geometry.cone(*a, 50.0, 70.0, **k)) if cone else Geometry.parallel
+    geometry = make([angle], (6, 8), 0.3, **how)
+    u, v, d = geometry.axes(0)
+    np.testing.assert_allclose(np.stack((u, v, d)) @ np.stack((u, v, d)).T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.cross(u, v), -d, atol=1e-12)
+    p = np.array(point)
+    enlarged = geometry.sdd / (geometry.sod + d @ p) if cone else 1.0
+    found = np.array(geometry.origin(0)) + enlarged * np.array([u @ p, v @ p]) / geometry.pixel_pitch
+    np.testing.assert_allclose(found, _pixel(geometry, 0, p), atol=1e-9)
+
+
+def test_the_pixel_of_a_cone_is_smaller_at_the_sample() -> None:
+    cone = Geometry.cone([0.0], (4, 8), 0.7, 50.0, 70.0)
+    assert cone.sample_pitch == pytest.approx(0.5)
+    assert Grid.matching(cone).voxel_size == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="0 < sod <= sdd"):
+        Geometry.cone([0.0], (4, 8), 0.7, 70.0, 50.0)
+
+
+@given(start=st.integers(0, 3), factor=st.integers(1, 3))
+def test_cutting_and_binning_keep_the_rays_of_a_cone(start: int, factor: int) -> None:
+    whole = Geometry.cone([0.3], (9, 12), 0.5, 20.0, 30.0, 4.2, axis_row=3.1, shifts=[[1.0, 2.0]])
+    binned = whole.rows(start, 9).binned(factor)
+    for j in range(binned.detector_shape[0]):
+        rows = np.arange(start + j * factor, start + (j + 1) * factor)
+        expected = ((rows - whole.origin(0)[1]) * whole.pixel_pitch).mean()
+        assert (j - binned.origin(0)[1]) * binned.pixel_pitch == pytest.approx(expected)
+
+
+def test_views_keep_their_own_shifts_roll_and_tilt() -> None:
+    g = Geometry.parallel([0.1, 0.2], (2, 2), shifts=[[0, 1], [2, 3]], roll=[0.0, 0.4], tilt=[0.1, 0.2])
+    second = g.select([1])
+    assert second.shifts.tolist() == [[2, 3]] and second.roll.tolist() == [0.4] and second.tilt.tolist() == [0.2]
+    assert not second.is_straight and Geometry.parallel([0.0], (2, 2), shifts=[[1, 1]]).is_straight
+    with pytest.raises(ValueError, match="differ from view to view"):
+        g.at([0.5])
+    for bad in ({"shifts": [[0, 1]]}, {"roll": [0.1]}, {"tilt": np.nan}):
+        with pytest.raises(ValueError, match="must be finite"):
+            Geometry.parallel([0.1, 0.2], (2, 2), **bad)
+
+
+def test_a_grid_follows_the_height_of_the_axis_row() -> None:
+    view = Geometry.parallel([0.0], (5, 8), 0.5, axis_row=3.0)  # the middle row, 2, is one row below z = 0
+    assert Grid.matching(view).centre[0] == pytest.approx(-0.5)
+    assert Grid.of_field(view, 0.5).centre[0] == pytest.approx(-0.5)
+
+
+def test_voxels_may_be_longer_along_z() -> None:
+    grid = Grid((4, 6, 6), 0.5, slice_pitch=2.0)
+    assert grid.spacing == (2.0, 0.5, 0.5)
+    np.testing.assert_allclose(grid.coordinates()[0], [-3, -1, 1, 3])
+    np.testing.assert_allclose(grid.edges[:, 2], [-4, 4])
+    with pytest.raises(ValueError, match="slice_pitch"):
+        Grid((4, 6, 6), 0.5, slice_pitch=0.0)
