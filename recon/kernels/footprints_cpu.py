@@ -8,6 +8,9 @@ For a view with axes u, v and ray d, and the columns of R S written as a = S R�
 any subtraction. Backward, with the moments M of the image gradient under a footprint (see `project_cpu`):
 
     ∂W = M₀,   ∂m = W K M₁,   ∂Σ₂ = 1/2 W K M₂ K         with W = ρμ, K = Σ₂⁻¹
+
+The quadratic form is kept factored, δᵀKδ = k (δu - r δv)² + δv² / Σvv with k = Σvv / det Σ₂ and r = Σuv / Σvv: sums
+of squares keep their digits where the expanded form of a long thin footprint would cancel.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from recon.kernels.activation import F32, OPTIONS
 _f = np.float32
 _ROOT_TWO_PI = np.float32(math.sqrt(2 * math.pi))
 # Columns of the footprint table.
-U, V, KA, KB, KC, W, HU, HV = range(8)
+U, V, K, SHEAR, KV, W, HU, HV = range(8)
 
 
 @njit(**OPTIONS)
@@ -41,7 +44,7 @@ def footprints(
     cut: float,
     table: F32,
 ) -> None:
-    """Fill table [n, 8]: centre (col, row), inverse covariance (1/px², three), weight W = ρμ, half widths in px (two).
+    """Fill table [n, 8]: centre (col, row), k (1/px²), r, 1 / Σvv (1/px²), weight W = ρμ, half widths in px (two).
 
     A footprint ends where it falls below `faint` (in units of the image) and at the latest after `cut` standard
     deviations; half widths are negative where nothing of it is above `faint`.
@@ -57,7 +60,7 @@ def footprints(
         uu, uv, vv = a0 * a0 + a1 * a1 + a2 * a2, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2
         root = sc[0] * sc[1] * sc[2] * length  # sqrt(det Σ₂), mm²
         scale = _f(1) / (per * root)
-        table[i, KA], table[i, KB], table[i, KC] = vv * scale * scale, -uv * scale * scale, uu * scale * scale
+        table[i, K], table[i, SHEAR], table[i, KV] = vv * scale * scale, uv / vv, _f(1) / (vv * per * per)
         weight = densities[i] * _ROOT_TWO_PI / length
         table[i, U] = _f(axis_col) + per * (c * x + s * y)
         table[i, V] = _f(mid_row) + per * z
@@ -92,7 +95,8 @@ def footprints_backward(
             continue
         m0, mx, my = moments[i, 0], moments[i, 1], moments[i, 2]
         mxx, mxy, myy = moments[i, 3], moments[i, 4], moments[i, 5]
-        ka, kb, kc, w = table[i, KA], table[i, KB], table[i, KC], table[i, W]
+        ka, shear, w = table[i, K], table[i, SHEAR], table[i, W]
+        kb, kc = -ka * shear, table[i, KV] + ka * shear * shear
         gu, gv = w * (ka * mx + kb * my), w * (kb * mx + kc * my)
         d_centres[i, 0], d_centres[i, 1] = gu, gv
         d_means[i, 0] += per * c * gu

@@ -16,7 +16,7 @@ from numba import get_num_threads, njit, prange
 
 from recon.kernels import lanes
 from recon.kernels.activation import F32, OPTIONS
-from recon.kernels.footprints_cpu import HU, HV, KA, KB, KC, U, V, W
+from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W
 
 _f = np.float32
 
@@ -42,13 +42,13 @@ def _render(table: F32, rows: int, cols: int, layers: F32) -> None:
         image[:] = _f(0)
         for i in range(t * share, min(n, (t + 1) * share)):
             row0, row1, col0, col1 = _box(table, i, rows, cols)
-            a, b, c, w = _f(-0.5) * table[i, KA], -table[i, KB], _f(-0.5) * table[i, KC], table[i, W]
+            k, shear, kv, w = _f(-0.5) * table[i, K], table[i, SHEAR], _f(-0.5) * table[i, KV], table[i, W]
             for start in range(col0, col1, 16):
                 dx = lanes.iota() + (_f(start) - table[i, U])
-                adx, bdx = dx * dx * a, dx * b
                 for row in range(row0, row1):
                     dy = _f(row) - table[i, V]
-                    value = lanes.exp(adx + bdx * dy + c * dy * dy) * w
+                    across = dx - shear * dy
+                    value = lanes.exp(across * across * k + kv * dy * dy) * w
                     lanes.store(image, row, start, lanes.load(image, row, start) + value)
 
 
@@ -75,15 +75,15 @@ def render(table: F32, image: F32) -> None:
 def _moments(table: F32, gradient: F32, rows: int, cols: int, moments: F32) -> None:
     for i in prange(table.shape[0]):
         row0, row1, col0, col1 = _box(table, i, rows, cols)
-        a, b, c = _f(-0.5) * table[i, KA], -table[i, KB], _f(-0.5) * table[i, KC]
+        k, shear, kv = _f(-0.5) * table[i, K], table[i, SHEAR], _f(-0.5) * table[i, KV]
         m0 = mx = my = mxx = mxy = myy = _f(0)
         for start in range(col0, col1, 16):
             dx = lanes.iota() + (_f(start) - table[i, U])
-            adx, bdx = dx * dx * a, dx * b
             s0, s1, s2 = lanes.zero(), lanes.zero(), lanes.zero()
             for row in range(row0, row1):
                 dy = _f(row) - table[i, V]
-                value = lanes.load(gradient, row, start) * lanes.exp(adx + bdx * dy + c * dy * dy)
+                across = dx - shear * dy
+                value = lanes.load(gradient, row, start) * lanes.exp(across * across * k + kv * dy * dy)
                 s0, s1, s2 = s0 + value, s1 + value * dy, s2 + value * (dy * dy)
             first = dx * s0
             m0 += lanes.total(s0)
