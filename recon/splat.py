@@ -5,7 +5,6 @@ Float32 tensors go to the threaded CPU kernels; float64 tensors (or `kernel="ref
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -18,7 +17,7 @@ from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.kernels import reference
 from recon.kernels.activation import F32, activate, activation_backward
-from recon.kernels.footprints_cpu import footprint_table, footprints, footprints_backward
+from recon.kernels.footprints_cpu import Camera, footprint_table, footprints, footprints_backward
 from recon.kernels.project_cpu import moments, render
 from recon.kernels.voxelize_cpu import Layout
 from recon.volume import Grid
@@ -78,14 +77,21 @@ class Gradients:
         return self.means, self.log_scales, d_quaternions, d_raw
 
 
+def camera(geometry: Geometry, view: int) -> Camera:
+    """One view as the kernels take it."""
+    axes = geometry.axes(view).astype(np.float32)
+    col, row = geometry.origin(view)
+    if geometry.is_cone:
+        return Camera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, straight=False)
+    straight = bool(geometry.roll[view] == 0 and geometry.tilt[view] == 0)
+    return Camera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
+
+
 def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
     """Footprints of all Gaussians in one view; `faint` in units of the image."""
     table = footprint_table(active.densities.shape[0])
-    angle = float(geometry.angles[view])
-    footprints(
-        active.means, active.scales, active.rotations, active.densities, math.cos(angle), math.sin(angle),
-        1 / geometry.pixel_pitch, geometry.axis_col, (geometry.detector_shape[0] - 1) / 2, faint, sigmas, table,
-    )  # fmt: skip
+    parameters = (active.means, active.scales, active.rotations, active.densities)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table)
     return table
 
 
@@ -93,11 +99,9 @@ def view_backward(
     active: Active, geometry: Geometry, view: int, table: F32, gradient: F32, into: Gradients, centres: F32
 ) -> None:
     """Add one view's image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
-    angle = float(geometry.angles[view])
     footprints_backward(
-        table, moments(table, gradient), active.scales, active.rotations, active.densities,
-        math.cos(angle), math.sin(angle), 1 / geometry.pixel_pitch,
-        into.means, into.log_scales, into.rotations, into.densities, centres,
+        table, moments(table, gradient), active.means, active.scales, active.rotations, active.densities,
+        camera(geometry, view), into.means, into.log_scales, into.rotations, into.densities, centres,
     )  # fmt: skip
 
 
@@ -108,7 +112,7 @@ class _Project(torch.autograd.Function):
         unit: float, geometry: Geometry, truncation: Truncation,
     ) -> Tensor:  # fmt: skip
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
-        faint = truncation.faint * unit * geometry.pixel_pitch * geometry.detector_shape[1]
+        faint = truncation.faint * unit * geometry.sample_pitch * geometry.detector_shape[1]
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         tables = []
         for view in range(geometry.n_views):
@@ -173,14 +177,8 @@ def project(
     chosen = geometry if views is None else geometry.select(views)
     g = gaussians
     if _use_reference(g, kernel):
-        images = [
-            reference.project_view(
-                g.means, g.scales, g.quaternions, g.densities,
-                float(angle), chosen.detector_shape, chosen.pixel_pitch, chosen.axis_col,
-            )
-            for angle in chosen.angles
-        ]  # fmt: skip
-        return torch.stack(images)
+        parameters = (g.means, g.scales, g.quaternions, g.densities)
+        return torch.stack([reference.project_view(*parameters, chosen, view) for view in range(chosen.n_views)])
     cut = truncation or Truncation()
     return _Project.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, chosen, cut)
 

@@ -1,10 +1,15 @@
 """The readable twin: projection and voxelisation of Gaussians as dense float64 sums, the oracle of every fast kernel.
 
     density   σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),   Σ = R S² Rᵀ          (Zha et al. 2024)
-    ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))                    (parallel beam: exact)
+    ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))       (parallel beam: exact; cone: affine)
 
-With the covariance in view coordinates split as [[Σ₂, v], [vᵀ, f]] (f along the ray), the corrected factor is
-μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)): the Schur complement, never negative, with no difference of large determinants.
+With the covariance taken to the detector by the Jacobian of the projection at the centre, a third row along the ray,
+and split as [[Σ₂, v], [vᵀ, f]], the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)): the Schur complement, never
+negative, with no difference of large determinants. The exact ray of a cone needs no projection: with H = S⁻¹Rᵀ, δ from
+the source to the centre and D along the ray of a pixel,
+
+    ∫ σ dt = Σ_i ρ_i sqrt(2π) |D| / |H D| exp(-1/2 |Hδ x HD|² / |HD|²)
+
 Everything is plain torch, so autograd gives the gradients that the fast kernels are held against.
 """
 
@@ -14,6 +19,8 @@ import math
 
 import torch
 from torch import Tensor
+
+from recon.geometry import Geometry
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
@@ -38,28 +45,95 @@ def project_view(
     scales: Tensor,  # [n, 3] mm
     quaternions: Tensor,  # [n, 4]
     densities: Tensor,  # [n] 1/mm
-    angle: float,
-    detector_shape: tuple[int, int],
-    pixel_pitch: float,
-    axis_col: float,
+    geometry: Geometry,
+    view: int,
+    *,
+    exact: Tensor | None = None,  # bool [n]: a cone's true ray integral; None: of none
+    length: float = 0.0,  # mm, stands in for μ where it is not 0: the uncorrected factor
 ) -> Tensor:
-    """Line integrals [row, col] of one parallel view; every Gaussian on every pixel, no cut-off."""
-    rows, cols = detector_shape
-    c, s = math.cos(angle), math.sin(angle)
-    view = means.new_tensor([[c, s, 0.0], [0.0, 0.0, 1.0], [-s, c, 0.0]])  # rows: u, v, ray
-    centre = means @ view.T
-    covariance = view @ covariances(scales, quaternions) @ view.T
+    """Line integrals [row, col] of one view; every Gaussian on every pixel, no cut-off."""
+    in_view = means @ means.new_tensor(geometry.axes(view)).T  # along columns, rows and beam
+    seen = in_front(means, geometry, view)
+    rays = torch.zeros_like(seen) if exact is None or not geometry.is_cone else exact & seen
+    flat = seen & ~rays
+    image = _affine(in_view[flat], scales[flat], quaternions[flat], densities[flat], geometry, view, length)
+    return image + _along_rays(means[rays], scales[rays], quaternions[rays], densities[rays], geometry, view)
+
+
+def in_front(means: Tensor, geometry: Geometry, view: int) -> Tensor:
+    """Which Gaussians [n] lie clear of the source plane (0.01 of its distance to the axis), all for a parallel beam."""
+    if not geometry.is_cone:
+        return torch.ones(means.shape[0], dtype=torch.bool)
+    return geometry.sod + means.detach() @ means.new_tensor(geometry.axes(view)[2]) > 0.01 * geometry.sod
+
+
+def pixels(geometry: Geometry, view: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns [col] and rows [row] counted from where the middle of the object's frame falls."""
+    rows, cols = geometry.detector_shape
+    col, row = geometry.origin(view)
+    return torch.arange(cols, dtype=like.dtype) - col, torch.arange(rows, dtype=like.dtype) - row
+
+
+def to_detector(in_view: Tensor, geometry: Geometry) -> tuple[Tensor, Tensor]:
+    """Centres [n, 2] in px and the Jacobian [n, 3, 3] (px/mm, 1 along the ray) of points along the view's axes."""
+    n = in_view.shape[0]
+    if not geometry.is_cone:
+        pitch = geometry.pixel_pitch
+        return in_view[:, :2] / pitch, torch.diag(in_view.new_tensor([1 / pitch, 1 / pitch, 1.0])).expand(n, 3, 3)
+    x, y = in_view[:, 0], in_view[:, 1]
+    z = in_view[:, 2] + geometry.sod
+    f, far = geometry.sdd / geometry.pixel_pitch, torch.sqrt(x * x + y * y + z * z)
+    zero = torch.zeros_like(z)
+    rows = (
+        torch.stack((f / z, zero, -f * x / z**2), 1),
+        torch.stack((zero, f / z, -f * y / z**2), 1),
+        torch.stack((x / far, y / far, z / far), 1),
+    )
+    return f * in_view[:, :2] / z[:, None], torch.stack(rows, 1)
+
+
+def _affine(
+    in_view: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    densities: Tensor,
+    geometry: Geometry,
+    view: int,
+    length: float,
+) -> Tensor:
+    centre, jacobian = to_detector(in_view, geometry)
+    turn = jacobian @ in_view.new_tensor(geometry.axes(view))
+    covariance = turn @ covariances(scales, quaternions) @ turn.transpose(1, 2)
     flat, across, along = covariance[:, :2, :2], covariance[:, :2, 2:], covariance[:, 2:, 2:]
     inverse = torch.linalg.inv(flat)
-    schur = (along - across.transpose(1, 2) @ inverse @ across).reshape(-1)
-    factor = torch.sqrt(2 * math.pi * schur)
-
-    u = (torch.arange(cols, dtype=means.dtype) - axis_col) * pixel_pitch
-    v = (torch.arange(rows, dtype=means.dtype) - (rows - 1) / 2) * pixel_pitch
+    if length > 0:
+        factor = torch.full_like(densities, length)
+    else:
+        factor = torch.sqrt(2 * math.pi * (along - across.transpose(1, 2) @ inverse @ across).reshape(-1))
+    u, v = pixels(geometry, view, in_view)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
-    offset = grid[None] - centre[:, None, None, :2]
+    offset = grid[None] - centre[:, None, None, :]
     exponent = torch.einsum("nrci,nij,nrcj->nrc", offset, inverse, offset)
     return torch.einsum("n,nrc->rc", densities * factor, torch.exp(-0.5 * exponent))
+
+
+def _along_rays(
+    means: Tensor, scales: Tensor, quaternions: Tensor, densities: Tensor, geometry: Geometry, view: int
+) -> Tensor:
+    u, v = pixels(geometry, view, means)
+    if means.shape[0] == 0:
+        return means.new_zeros((v.shape[0], u.shape[0]))
+    axes = means.new_tensor(geometry.axes(view))
+    focal = torch.full((1, 1), geometry.sdd / geometry.pixel_pitch, dtype=means.dtype)
+    ray = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None], focal), -1) @ axes  # [row, col, 3]
+    whiten = rotation_matrices(quaternions).transpose(1, 2) / scales[:, :, None]  # H
+    centre = (whiten @ (means + geometry.sod * axes[2])[:, :, None])[:, None, None, :, 0]
+    white = torch.einsum("nij,rcj->nrci", whiten, ray)
+    power = (white * white).sum(-1)
+    miss = torch.linalg.cross(centre.expand_as(white), white)
+    exponent = (miss * miss).sum(-1) / power
+    factor = math.sqrt(2 * math.pi) * torch.linalg.norm(ray, dim=-1) / torch.sqrt(power)
+    return torch.einsum("n,nrc->rc", densities, factor * torch.exp(-0.5 * exponent))
 
 
 def voxelize(
