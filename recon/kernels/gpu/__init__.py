@@ -1,0 +1,48 @@
+"""Triton kernels for CUDA devices, the same operations as the CPU's; imported only where a GPU is asked for.
+
+They work on contiguous float32 torch tensors. Sums are gathered, never scattered: an image tile or a brick of voxels
+sums the Gaussians on its list, a Gaussian sums the gradient under it, so there are no atomics and the same input gives
+the same bits. With TRITON_INTERPRET=1 in the environment, before the first import, the same kernels run on the CPU,
+slowly, for tests.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Triton 3.9 warns that the default changes unless one is chosen; fused multiply-adds are what the kernels want.
+os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")
+
+try:
+    import triton
+except ImportError as error:
+    raise ImportError(
+        "the GPU kernels need triton, which is not installed; install splatline[gpu] (Linux), or fit on the cpu"
+    ) from error
+
+import torch
+
+
+def interpreted() -> bool:
+    """Whether kernels run in Triton's interpreter, on CPU tensors."""
+    return bool(triton.knobs.runtime.interpret)
+
+
+def require(device: str | torch.device) -> torch.device:
+    """The device to run on.
+
+    Raises:
+        ValueError: where the device is not CUDA (and Triton not interpreted).
+        RuntimeError: where torch sees no CUDA device.
+    """
+    wanted = torch.device(device)
+    if interpreted():
+        return torch.device("cpu")
+    if wanted.type != "cuda":
+        raise ValueError(f"the GPU kernels run on cuda devices, got {wanted}; take the CPU kernels for it")
+    if not torch.cuda.is_available():
+        raise RuntimeError(
+            f"device {wanted} was asked for, but torch {torch.__version__} sees no CUDA device: check the driver and "
+            "that this torch is a CUDA build, or fit on the cpu"
+        )
+    return wanted

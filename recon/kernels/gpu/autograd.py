@@ -1,0 +1,72 @@
+"""Projection and voxelisation of raw parameters on a GPU as autograd functions (gradients as the readable twin's)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.geometry import Geometry
+from recon.kernels.gpu.engine import GpuPass
+from recon.volume import Grid
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+        unit: float, geometry: Geometry, faint: float, cut: float,
+    ) -> Tensor:  # fmt: skip
+        run = _pass(means, log_scales, quaternions, raw, unit)
+        views = [run.footprints(geometry, view, faint, cut) for view in range(geometry.n_views)]
+        ctx.state = (run, views, geometry)
+        return torch.stack([run.render(found, geometry) for found in views])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        run, views, geometry = ctx.state
+        fresh = run.again()
+        for view, found in enumerate(views):
+            fresh.render_backward(found, geometry, view, gradient[view].contiguous())
+        return (*fresh.gradients(), None, None, None, None)
+
+
+class _Voxelize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+        unit: float, grid: Grid, faint: float, cut: float,
+    ) -> Tensor:  # fmt: skip
+        run = _pass(means, log_scales, quaternions, raw, unit)
+        placed = run.place(grid, faint, cut)
+        ctx.state = (run, placed)
+        return run.fill(placed)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        run, placed = ctx.state
+        fresh = run.again()
+        fresh.fill_backward(placed, gradient.contiguous())
+        return (*fresh.gradients(), None, None, None, None)
+
+
+def _pass(means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> GpuPass:
+    p, s, q, r = (t.detach().contiguous() for t in (means, log_scales, quaternions, raw))
+    return GpuPass(p, s, q, r, unit)
+
+
+def project(
+    means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+    unit: float, geometry: Geometry, faint: float, cut: float,
+) -> Tensor:  # fmt: skip
+    """Line integrals [view, row, col]; `faint` in units of the image, `cut` in σ; differentiable in the tensors."""
+    return _Project.apply(means, log_scales, quaternions, raw, unit, geometry, faint, cut)
+
+
+def voxelize(
+    means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+    unit: float, grid: Grid, faint: float, cut: float,
+) -> Tensor:  # fmt: skip
+    """Density [z, y, x] at the grid's voxel centres; `faint` a density, `cut` in σ; differentiable in the tensors."""
+    return _Voxelize.apply(means, log_scales, quaternions, raw, unit, grid, faint, cut)

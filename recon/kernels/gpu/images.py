@@ -1,0 +1,111 @@
+"""Footprints to an image and an image's gradient to six moments a footprint (Triton).
+
+    pixel = Σ_i W_i G_i,   G = exp(-1/2 (k e² + δv² / Σvv)),   e = δu - r δv
+    moments of the gradient g:  Σ g G (1, e, δv, e², e δv, δv²)
+
+The moments are taken in the sheared offset e, in which the quadratic form is diagonal: those of a long thin footprint
+keep their digits. A footprint ends at its box, whatever the tiles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from recon.kernels.gpu.footprints import HU, HV, KV, SHEAR, Footprints, K, U, V, W
+from recon.kernels.gpu.tiles import tile_lists
+
+_EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, larger tiles would evaluate more beside them
+_GROUP = 8  # Gaussians that a tile takes up at once
+_BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
+_HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))  # exp(-q / 2) = 2^(q * this)
+
+
+@triton.jit
+def _render(  # type: ignore[no-untyped-def]
+    table, owners, starts, layers, rows, cols, tile_cols, shares, EDGE: tl.constexpr, GROUP: tl.constexpr
+):
+    tile, share = tl.program_id(0), tl.program_id(1)
+    lane = tl.arange(0, EDGE * EDGE)
+    row, col = (tile // tile_cols) * EDGE + lane // EDGE, (tile % tile_cols) * EDGE + lane % EDGE
+    first, last = tl.load(starts + tile), tl.load(starts + tile + 1)
+    member = tl.arange(0, GROUP)
+    # Each member of a group sums by itself, so that the loop holds no reduction.
+    sums = tl.zeros((GROUP, EDGE * EDGE), tl.float32)
+    for start in range(first + share * GROUP, last, shares * GROUP):
+        held = start + member < last
+        f = table + 8 * tl.load(owners + start + member, held, 0)
+        u, v = tl.load(f + U, held, 0.0), tl.load(f + V, held, 0.0)
+        k, kv = tl.load(f + K, held, 0.0) * _HALF_LOG2_E, tl.load(f + KV, held, 0.0) * _HALF_LOG2_E
+        shear, w = tl.load(f + SHEAR, held, 0.0), tl.load(f + W, held, 0.0)
+        hu, hv = tl.load(f + HU, held, -1.0), tl.load(f + HV, held, -1.0)
+        du, dv = col[None, :] - u[:, None], row[None, :] - v[:, None]
+        inside = (tl.abs(du) <= hu[:, None]) & (tl.abs(dv) <= hv[:, None])
+        e = du - shear[:, None] * dv
+        value = w[:, None] * tl.exp2(k[:, None] * e * e + kv[:, None] * dv * dv)
+        sums += tl.where(inside, value, 0.0)
+    pixel = (share.to(tl.int64) * rows + row) * cols + col
+    tl.store(layers + pixel, tl.sum(sums, axis=0), (row < rows) & (col < cols))
+
+
+def render(found: Footprints, shape: tuple[int, int]) -> Tensor:
+    """Image [row, col]: the sum of the footprints."""
+    lists = tile_lists(found.boxes, shape, _EDGE)
+    layers = found.table.new_empty((lists.shares, *shape))
+    _render[(lists.n_tiles, lists.shares)](
+        found.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.shares,
+        EDGE=_EDGE, GROUP=_GROUP, num_warps=2,
+    )  # fmt: skip
+    return layers.sum(0)
+
+
+@triton.jit
+def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl.constexpr):  # type: ignore[no-untyped-def]
+    i = tl.program_id(0)
+    f, box = table + 8 * i, boxes + 4 * i
+    u, v, shear = tl.load(f + U), tl.load(f + V), tl.load(f + SHEAR)
+    k, kv = tl.load(f + K) * _HALF_LOG2_E, tl.load(f + KV) * _HALF_LOG2_E
+    hu, hv = tl.load(f + HU), tl.load(f + HV)
+    row_low, row_high, col_low, col_high = tl.load(box), tl.load(box + 1), tl.load(box + 2), tl.load(box + 3)
+    lane = tl.arange(0, HIGH * WIDE)
+    down, over = lane // WIDE, lane % WIDE
+    m0, me, mv = (
+        tl.zeros_like(lane).to(tl.float32),
+        tl.zeros_like(lane).to(tl.float32),
+        tl.zeros_like(lane).to(tl.float32),
+    )
+    mee, mev, mvv = m0, m0, m0
+    for row_start in range(row_low, row_high, HIGH):
+        row = row_start + down
+        dv = row - v
+        for col_start in range(col_low, col_high, WIDE):
+            col = col_start + over
+            du = col - u
+            inside = (row < row_high) & (col < col_high) & (tl.abs(du) <= hu) & (tl.abs(dv) <= hv)
+            e = du - shear * dv
+            g = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * tl.exp2(k * e * e + kv * dv * dv)
+            ge, gv = g * e, g * dv
+            m0, me, mv = m0 + g, me + ge, mv + gv
+            mee, mev, mvv = mee + ge * e, mev + ge * dv, mvv + gv * dv
+    m = moments + 6 * i
+    tl.store(m, tl.sum(m0))
+    tl.store(m + 1, tl.sum(me))
+    tl.store(m + 2, tl.sum(mv))
+    tl.store(m + 3, tl.sum(mee))
+    tl.store(m + 4, tl.sum(mev))
+    tl.store(m + 5, tl.sum(mvv))
+
+
+def moments(found: Footprints, gradient: Tensor) -> Tensor:
+    """Moments [n, 6] (1, e, v, ee, ev, vv) of an image gradient [row, col] under each footprint."""
+    n = found.table.shape[0]
+    result = found.table.new_empty((n, 6))
+    if n > 0:
+        high, wide = _BLOCK
+        _moments[(n,)](
+            found.table, found.boxes, gradient, result, gradient.shape[1], HIGH=high, WIDE=wide, num_warps=1
+        )  # fmt: skip
+    return result

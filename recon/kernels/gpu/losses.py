@@ -1,0 +1,183 @@
+"""L1 with D-SSIM and total variation, with their gradients, in a few passes over the pixels (Triton)."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from recon.kernels.losses_cpu import RADIUS, gaussian_window
+
+_BLOCK = 256
+_R = tl.constexpr(RADIUS)
+
+
+@triton.jit
+def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """One axis of the window over each map [k, row, col], zeros outside; the map is the second axis of the grid."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < pixels
+    first = tl.program_id(1).to(tl.int64) * pixels
+    row, col = i // cols, i % cols
+    total = tl.zeros((BLOCK,), tl.float32)
+    for tap in tl.static_range(-_R, _R + 1):
+        weight = tl.load(window + (tap + _R))
+        if ACROSS:
+            at, ok = i + tap, live & (col + tap >= 0) & (col + tap < cols)
+        else:
+            at, ok = i + tap * cols, live & (row + tap >= 0) & (row + tap < rows)
+        total += weight * tl.load(source + first + at, ok, 0.0)
+    tl.store(out + first + i, total, live)
+
+
+@triton.jit
+def _products_across(image, target, out, window, cols, pixels, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """x, x² and xy blurred along the rows, out [3, row, col]."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < pixels
+    col = i % cols
+    bx, bxx, bxy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for tap in tl.static_range(-_R, _R + 1):
+        ok = live & (col + tap >= 0) & (col + tap < cols)
+        x, y = tl.load(image + i + tap, ok, 0.0), tl.load(target + i + tap, ok, 0.0)
+        weighted = tl.load(window + (tap + _R)) * x
+        bx, bxx, bxy = bx + weighted, bxx + weighted * x, bxy + weighted * y
+    tl.store(out + i, bx, live)
+    tl.store(out + pixels + i, bxx, live)
+    tl.store(out + 2 * pixels + i, bxy, live)
+
+
+@triton.jit
+def _ssim_terms(half, target_maps, partials, sums, window, rows, cols, pixels, c1, c2, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Finish the blur down the columns; the SSIM map's sum a block, and its derivatives by the blurred x, x², xy."""
+    block = tl.program_id(0)
+    i = block * BLOCK + tl.arange(0, BLOCK)
+    live = i < pixels
+    row = i // cols
+    mx, mxx, mxy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for tap in tl.static_range(-_R, _R + 1):
+        ok = live & (row + tap >= 0) & (row + tap < rows)
+        weight, at = tl.load(window + (tap + _R)), half + i + tap * cols
+        mx += weight * tl.load(at, ok, 0.0)
+        mxx += weight * tl.load(at + pixels, ok, 0.0)
+        mxy += weight * tl.load(at + 2 * pixels, ok, 0.0)
+    my, myy = tl.load(target_maps + i, live, 0.0), tl.load(target_maps + pixels + i, live, 0.0)
+    vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
+    top1, top2 = 2.0 * mx * my + c1, 2.0 * vxy + c2
+    low1, low2 = 1.0 / (mx * mx + my * my + c1), 1.0 / (vx + vy + c2)
+    value = top1 * top2 * low1 * low2
+    d_vx, d_vxy = -value * low2, 2.0 * top1 * low1 * low2
+    d_mx = 2.0 * my * top2 * low1 * low2 - 2.0 * mx * value * low1
+    tl.store(partials + i, d_mx - 2.0 * mx * d_vx - my * d_vxy, live)
+    tl.store(partials + pixels + i, d_vx, live)
+    tl.store(partials + 2 * pixels + i, d_vxy, live)
+    tl.store(sums + block, tl.sum(tl.where(live, value, 0.0)))
+
+
+@triton.jit
+def _combine(image, target, half, gradient, sums, window, rows, cols, pixels, l1, ssim, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Finish the derivatives' blur and join them with L1's; the sum of |x - y| a block."""
+    block = tl.program_id(0)
+    i = block * BLOCK + tl.arange(0, BLOCK)
+    live = i < pixels
+    row = i // cols
+    px, pxx, pxy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for tap in tl.static_range(-_R, _R + 1):
+        ok = live & (row + tap >= 0) & (row + tap < rows)
+        weight, at = tl.load(window + (tap + _R)), half + i + tap * cols
+        px += weight * tl.load(at, ok, 0.0)
+        pxx += weight * tl.load(at + pixels, ok, 0.0)
+        pxy += weight * tl.load(at + 2 * pixels, ok, 0.0)
+    x, y = tl.load(image + i, live, 0.0), tl.load(target + i, live, 0.0)
+    off = x - y
+    sign = tl.where(off > 0.0, 1.0, tl.where(off < 0.0, -1.0, 0.0))
+    tl.store(gradient + i, l1 * sign - ssim * (px + 2.0 * x * pxx + y * pxy), live)
+    tl.store(sums + block, tl.sum(tl.abs(off)))
+
+
+class ProjectionLoss:
+    """mean |x - y| + λ (1 - SSIM(x, y)) and its gradient; the target's blurred maps are computed once a view."""
+
+    def __init__(
+        self, shape: tuple[int, int], ssim_weight: float, device: torch.device,
+        c1: float = 0.01**2, c2: float = 0.03**2,
+    ) -> None:  # fmt: skip
+        self.shape, self.pixels, self.ssim_weight, self.c1, self.c2 = shape, shape[0] * shape[1], ssim_weight, c1, c2
+        self.window = torch.from_numpy(gaussian_window()).to(device)
+        self._blocks = triton.cdiv(self.pixels, _BLOCK)
+        self._half = torch.empty((3, *shape), device=device)
+        self._partials = torch.empty((3, *shape), device=device)
+        self._sums = torch.empty((2, self._blocks), device=device)
+
+    def target_maps(self, target: Tensor) -> Tensor:
+        """Blurred y and y² [2, row, col] of a target image."""
+        maps = torch.stack((target, target * target))
+        return self._blurred(self._blurred(maps, across=True), across=False)
+
+    def _blurred(self, maps: Tensor, *, across: bool) -> Tensor:
+        out = torch.empty_like(maps)
+        _blur[(self._blocks, maps.shape[0])](
+            maps, out, self.window, *self.shape, self.pixels, ACROSS=across, BLOCK=_BLOCK
+        )
+        return out
+
+    def __call__(self, image: Tensor, target: Tensor, target_maps: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss (float64, no dimensions, on the device: reading it waits for the device) and its gradient."""
+        (rows, cols), pixels, grid = self.shape, self.pixels, (self._blocks,)
+        gradient = torch.empty_like(image)
+        weight = self.ssim_weight / pixels
+        ssim, l1 = self._sums
+        _products_across[grid](image, target, self._half, self.window, cols, pixels, BLOCK=_BLOCK)
+        _ssim_terms[grid](
+            self._half, target_maps, self._partials, ssim, self.window, rows, cols, pixels, self.c1, self.c2,
+            BLOCK=_BLOCK,
+        )  # fmt: skip
+        _blur[(self._blocks, 3)](self._partials, self._half, self.window, rows, cols, pixels, ACROSS=True, BLOCK=_BLOCK)
+        _combine[grid](
+            image, target, self._half, gradient, l1, self.window, rows, cols, pixels, 1 / pixels, weight, BLOCK=_BLOCK
+        )
+        sums = self._sums.sum(1, dtype=torch.float64)
+        return sums[1] / pixels + (self.ssim_weight - weight * sums[0]), gradient
+
+
+@triton.jit
+def _slope(here, other, ok):  # type: ignore[no-untyped-def]
+    """|other - here| and its derivative by `here`, 0 where there is no neighbour."""
+    step = other - here
+    sign = tl.where(step > 0.0, 1.0, tl.where(step < 0.0, -1.0, 0.0))
+    return tl.where(ok, tl.abs(step), 0.0), tl.where(ok, -sign, 0.0)
+
+
+@triton.jit
+def _total_variation(volume, gradient, sums, weight, nz, ny, nx, voxels, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    block = tl.program_id(0)
+    i = block.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = i < voxels
+    x, y, z = i % nx, (i // nx) % ny, i // nx // ny
+    here = tl.load(volume + i, live, 0.0)
+    stride_z = ny * nx
+    after_x, before_x = live & (x + 1 < nx), live & (x > 0)
+    after_y, before_y = live & (y + 1 < ny), live & (y > 0)
+    after_z, before_z = live & (z + 1 < nz), live & (z > 0)
+    amount_x, slope_x = _slope(here, tl.load(volume + i + 1, after_x, 0.0), after_x)
+    amount_y, slope_y = _slope(here, tl.load(volume + i + nx, after_y, 0.0), after_y)
+    amount_z, slope_z = _slope(here, tl.load(volume + i + stride_z, after_z, 0.0), after_z)
+    _, back_x = _slope(here, tl.load(volume + i - 1, before_x, 0.0), before_x)
+    _, back_y = _slope(here, tl.load(volume + i - nx, before_y, 0.0), before_y)
+    _, back_z = _slope(here, tl.load(volume + i - stride_z, before_z, 0.0), before_z)
+    tl.store(gradient + i, weight * (slope_x + slope_y + slope_z + back_x + back_y + back_z), live)
+    tl.store(sums + block, tl.sum(amount_x + amount_y + amount_z))
+
+
+def total_variation(volume: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    """weight * mean |difference of neighbours| over the three axes (float64, no dimensions), and its gradient."""
+    nz, ny, nx = volume.shape
+    count = (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)
+    gradient = torch.zeros_like(volume)
+    if count == 0:
+        return torch.zeros((), dtype=torch.float64, device=volume.device), gradient
+    blocks = triton.cdiv(volume.numel(), _BLOCK)
+    sums = volume.new_empty(blocks)
+    _total_variation[(blocks,)](volume, gradient, sums, weight / count, nz, ny, nx, volume.numel(), BLOCK=_BLOCK)
+    return sums.sum(dtype=torch.float64) * (weight / count), gradient

@@ -1,0 +1,156 @@
+"""Raw parameters to physical ones, gradients back, and Adam's update: what a step does once a Gaussian (Triton)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from recon.kernels.adam_cpu import BETA1, BETA2
+
+_BLOCK = 128
+_SHORTEST = tl.constexpr(1e-12)  # a quaternion shorter than this acts as the identity
+
+
+@triton.jit
+def _unit_quaternion(quaternions, i, live):  # type: ignore[no-untyped-def]
+    w, x = tl.load(quaternions + 4 * i, live, 1.0), tl.load(quaternions + 4 * i + 1, live, 0.0)
+    y, z = tl.load(quaternions + 4 * i + 2, live, 0.0), tl.load(quaternions + 4 * i + 3, live, 0.0)
+    # Scaled by the largest part first: squares of 1e-30 are no float32 numbers.
+    most = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
+    scale = tl.where(most > 0.0, most, 1.0)
+    w, x, y, z = w / scale, x / scale, y / scale, z / scale
+    length = tl.sqrt(w * w + x * x + y * y + z * z)
+    norm = length * scale
+    turned = norm > _SHORTEST
+    length = tl.where(turned, length, 1.0)
+    w, x = tl.where(turned, w / length, 1.0), tl.where(turned, x / length, 0.0)
+    y, z = tl.where(turned, y / length, 0.0), tl.where(turned, z / length, 0.0)
+    return w, x, y, z, norm, turned
+
+
+@triton.jit(do_not_specialize=["n"])
+def _activate(log_scales, quaternions, raw, scales, rotations, densities, unit, n, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < n
+    for k in tl.static_range(3):
+        tl.store(scales + 3 * i + k, tl.exp(tl.load(log_scales + 3 * i + k, live, 0.0)), live)
+    r = tl.load(raw + i, live, 0.0)
+    # log(1 + e) with all digits of a small e: the rounding of 1 + e is divided out again.
+    e = tl.exp(-tl.abs(r))
+    more = 1.0 + e
+    log1p = tl.where(more > 1.0, tl.log(more) * (e / tl.where(more > 1.0, more - 1.0, 1.0)), e)
+    tl.store(densities + i, unit * (tl.maximum(r, 0.0) + log1p), live)
+    w, x, y, z, _, _ = _unit_quaternion(quaternions, i, live)
+    tl.store(rotations + 9 * i, 1.0 - 2.0 * (y * y + z * z), live)
+    tl.store(rotations + 9 * i + 1, 2.0 * (x * y - w * z), live)
+    tl.store(rotations + 9 * i + 2, 2.0 * (x * z + w * y), live)
+    tl.store(rotations + 9 * i + 3, 2.0 * (x * y + w * z), live)
+    tl.store(rotations + 9 * i + 4, 1.0 - 2.0 * (x * x + z * z), live)
+    tl.store(rotations + 9 * i + 5, 2.0 * (y * z - w * x), live)
+    tl.store(rotations + 9 * i + 6, 2.0 * (x * z - w * y), live)
+    tl.store(rotations + 9 * i + 7, 2.0 * (y * z + w * x), live)
+    tl.store(rotations + 9 * i + 8, 1.0 - 2.0 * (x * x + y * y), live)
+
+
+def activate(log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Scales [n, 3], rotations [n, 9] (row-major) and densities [n]."""
+    n = raw.shape[0]
+    scales, rotations, densities = torch.empty_like(log_scales), raw.new_empty((n, 9)), torch.empty_like(raw)
+    grid = (triton.cdiv(n, _BLOCK),)
+    if n > 0:
+        _activate[grid](log_scales, quaternions, raw, scales, rotations, densities, unit, n, BLOCK=_BLOCK)
+    return scales, rotations, densities
+
+
+@triton.jit(do_not_specialize=["n"])
+def _activation_backward(  # type: ignore[no-untyped-def]
+    quaternions, raw, d_rotations, d_densities, d_quaternions, d_raw, unit, n, BLOCK: tl.constexpr
+):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < n
+    r = tl.load(raw + i, live, 0.0)
+    e = tl.exp(-tl.abs(r))
+    slope = tl.where(r >= 0.0, 1.0, e) / (1.0 + e)
+    tl.store(d_raw + i, tl.load(d_densities + i, live, 0.0) * unit * slope, live)
+    w, x, y, z, norm, turned = _unit_quaternion(quaternions, i, live)
+    g = d_rotations + 9 * i
+    g0, g1, g2 = tl.load(g, live, 0.0), tl.load(g + 1, live, 0.0), tl.load(g + 2, live, 0.0)
+    g3, g4, g5 = tl.load(g + 3, live, 0.0), tl.load(g + 4, live, 0.0), tl.load(g + 5, live, 0.0)
+    g6, g7, g8 = tl.load(g + 6, live, 0.0), tl.load(g + 7, live, 0.0), tl.load(g + 8, live, 0.0)
+    gw = 2.0 * (z * (g3 - g1) + y * (g2 - g6) + x * (g7 - g5))
+    gx = 2.0 * (y * (g1 + g3) + z * (g2 + g6) + w * (g7 - g5)) - 4.0 * x * (g4 + g8)
+    gy = 2.0 * (x * (g1 + g3) + z * (g5 + g7) + w * (g2 - g6)) - 4.0 * y * (g0 + g8)
+    gz = 2.0 * (x * (g2 + g6) + y * (g5 + g7) + w * (g3 - g1)) - 4.0 * z * (g0 + g4)
+    # Only the part across the unit quaternion turns anything; the rest would change its length.
+    along = gw * w + gx * x + gy * y + gz * z
+    per = tl.where(turned, 1.0 / tl.where(turned, norm, 1.0), 0.0)
+    tl.store(d_quaternions + 4 * i, per * (gw - along * w), live)
+    tl.store(d_quaternions + 4 * i + 1, per * (gx - along * x), live)
+    tl.store(d_quaternions + 4 * i + 2, per * (gy - along * y), live)
+    tl.store(d_quaternions + 4 * i + 3, per * (gz - along * z), live)
+
+
+def activation_backward(
+    quaternions: Tensor, raw: Tensor, unit: float, d_rotations: Tensor, d_densities: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Gradients on quaternions [n, 4] and raw densities [n] from those on rotations [n, 9] and densities [n]."""
+    n = raw.shape[0]
+    d_quaternions, d_raw = torch.empty_like(quaternions), torch.empty_like(raw)
+    if n > 0:
+        _activation_backward[(triton.cdiv(n, _BLOCK),)](
+            quaternions, raw, d_rotations, d_densities, d_quaternions, d_raw, unit, n, BLOCK=_BLOCK
+        )
+    return d_quaternions, d_raw
+
+
+@triton.jit
+def _adam_one(parameter, gradient, first, second, rate, scale2, eps, b1, b2, size, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = i < size
+    g = tl.load(gradient + i, live, 0.0)
+    m = b1 * tl.load(first + i, live, 0.0) + (1.0 - b1) * g
+    v = b2 * tl.load(second + i, live, 0.0) + (1.0 - b2) * g * g
+    tl.store(first + i, m, live)
+    tl.store(second + i, v, live)
+    tl.store(parameter + i, tl.load(parameter + i, live, 0.0) - rate * m / (tl.sqrt(v * scale2) + eps), live)
+
+
+@triton.jit
+def _adam(  # type: ignore[no-untyped-def]
+    p0, g0, m0, v0, rate0, size0, p1, g1, m1, v1, rate1, size1, p2, g2, m2, v2, rate2, size2, p3, g3, m3, v3, rate3,
+    size3, scale2, eps, b1, b2, BLOCK: tl.constexpr,
+):  # fmt: skip
+    # One launch for all four arrays: the second axis of the grid says which.
+    which = tl.program_id(1)
+    if which == 0:
+        _adam_one(p0, g0, m0, v0, rate0, scale2, eps, b1, b2, size0, BLOCK)
+    elif which == 1:
+        _adam_one(p1, g1, m1, v1, rate1, scale2, eps, b1, b2, size1, BLOCK)
+    elif which == 2:
+        _adam_one(p2, g2, m2, v2, rate2, scale2, eps, b1, b2, size2, BLOCK)
+    else:
+        _adam_one(p3, g3, m3, v3, rate3, scale2, eps, b1, b2, size3, BLOCK)
+
+
+def adam(
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    rates: Sequence[float],
+    step: int,
+    eps: float = 1e-15,
+) -> None:
+    """Update four arrays and their moments in place (Kingma & Ba 2015, algorithm 1); `step` counts from 1."""
+    scale1, scale2 = 1 / (1 - BETA1**step), 1 / (1 - BETA2**step)
+    arguments: list[Tensor | float | int] = []
+    for p, g, m, v, rate in zip(parameters, gradients, first, second, rates, strict=True):
+        arguments += [p, g, m, v, rate * scale1, p.numel()]
+    largest = max(p.numel() for p in parameters)
+    if largest > 0:
+        block = 4 * _BLOCK
+        _adam[(triton.cdiv(largest, block), 4)](*arguments, scale2, eps, BETA1, BETA2, BLOCK=block)

@@ -1,0 +1,268 @@
+"""Voxelisation of Gaussians: any box of voxels, gathered brick by brick; ten moments a Gaussian backward (Triton).
+
+With P = Σ⁻¹ and Σ_yz the covariance's block in y and z the exponent is a sum of three squares,
+
+    δᵀPδ = Pxx (δx + Pxy/Pxx δy + Pxz/Pxx δz)² + k (δy - r δz)² + δz² / Σzz
+    k = Σzz / det Σ_yz,   r = Σyz / Σzz,   det Σ_yz = Pxx (s₁ s₂ s₃)²
+
+all from inner products, so that it cannot cancel. Backward, with N = Σ g G (1, δ, δδᵀ) and H = S⁻¹Rᵀ:
+∂ρ = N₀,  ∂p = ρ HᵀH N₁,  ∂H = -ρ H N₂.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from recon.kernels.gpu.tiles import tile_lists
+from recon.volume import Grid
+
+_BLOCK = 128
+_EDGE = 8  # voxels a brick edge
+_GROUP = 4  # Gaussians that a brick takes up at once
+_DEEP, _HIGH, _WIDE = 2, 8, 8  # voxels of a Gaussian at once
+_HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))
+_HUGE = tl.constexpr(3.0e38)
+# Columns of the table: centre and half widths in voxels, the three squares' factors, the density.
+X, Y, Z, KX, SXY, SXZ, KY, SYZ, KZ, HX, HY, HZ, RHO = (tl.constexpr(column) for column in range(13))
+_WIDTH = tl.constexpr(16)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Gaussians on a grid: float32 [n, 16] as in the columns above, int32 [n, 6] boxes (z0, z1, y0, y1, x0, x1)."""
+
+    table: Tensor
+    boxes: Tensor
+    grid: Grid
+
+
+@triton.jit(do_not_specialize=["n"])
+def _placed(  # type: ignore[no-untyped-def]
+    means, scales, rotations, densities, table, boxes, n, x0, y0, z0, per_x, per_z, nx, ny, nz, faint, cut,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < n
+    i = tl.minimum(i, n - 1)  # lanes past the end compute the last one again and store nothing
+    zero = tl.zeros((BLOCK,), tl.float32)
+    xx, yy, zz, yz, pxx, pxy, pxz, product = zero, zero, zero, zero, zero, zero, zero, zero + 1.0
+    for k in tl.static_range(3):
+        s = tl.load(scales + 3 * i + k)
+        r0, r1 = tl.load(rotations + 9 * i + k), tl.load(rotations + 9 * i + 3 + k)
+        r2 = tl.load(rotations + 9 * i + 6 + k)
+        a, b, c = s * r0 * per_x, s * r1 * per_x, s * r2 * per_z
+        xx, yy, zz, yz = xx + a * a, yy + b * b, zz + c * c, yz + b * c
+        h0, h1, h2 = r0 / (s * per_x), r1 / (s * per_x), r2 / (s * per_z)
+        pxx, pxy, pxz = pxx + h0 * h0, pxy + h0 * h1, pxz + h0 * h2
+        product *= s
+    product *= per_x * per_x * per_z
+    kx, kz = pxx, 1.0 / zz
+    inverse = 1.0 / (product * tl.sqrt(pxx))
+    ky = zz * inverse * inverse
+    density = tl.load(densities + i)
+    seen = live & (density > faint) & (density < _HUGE) & (kx < _HUGE) & (ky < _HUGE) & (kz < _HUGE)
+    reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, density, 1.0) / faint), 0.0)))
+    x = (tl.load(means + 3 * i) - x0) * per_x
+    y = (tl.load(means + 3 * i + 1) - y0) * per_x
+    z = (tl.load(means + 3 * i + 2) - z0) * per_z
+    hx, hy, hz = reach * tl.sqrt(xx), reach * tl.sqrt(yy), reach * tl.sqrt(zz)
+    f = table + _WIDTH * i
+    tl.store(f + X, x, live)
+    tl.store(f + Y, y, live)
+    tl.store(f + Z, z, live)
+    tl.store(f + KX, tl.where(seen, kx, 0.0), live)
+    tl.store(f + SXY, tl.where(seen, pxy / pxx, 0.0), live)
+    tl.store(f + SXZ, tl.where(seen, pxz / pxx, 0.0), live)
+    tl.store(f + KY, tl.where(seen, ky, 0.0), live)
+    tl.store(f + SYZ, tl.where(seen, yz / zz, 0.0), live)
+    tl.store(f + KZ, tl.where(seen, kz, 0.0), live)
+    tl.store(f + HX, tl.where(seen, hx, -1.0), live)
+    tl.store(f + HY, tl.where(seen, hy, -1.0), live)
+    tl.store(f + HZ, tl.where(seen, hz, -1.0), live)
+    tl.store(f + RHO, tl.where(seen, density, 0.0), live)
+    hit = seen & (x + hx >= 0.0) & (x - hx <= nx - 1.0) & (y + hy >= 0.0) & (y - hy <= ny - 1.0)
+    hit = hit & (z + hz >= 0.0) & (z - hz <= nz - 1.0)
+    # Clipped as floats: a box far outside is no int32.
+    x_low, x_high = tl.maximum(tl.ceil(x - hx), 0.0), tl.minimum(tl.floor(x + hx) + 1.0, nx * 1.0)
+    y_low, y_high = tl.maximum(tl.ceil(y - hy), 0.0), tl.minimum(tl.floor(y + hy) + 1.0, ny * 1.0)
+    z_low, z_high = tl.maximum(tl.ceil(z - hz), 0.0), tl.minimum(tl.floor(z + hz) + 1.0, nz * 1.0)
+    hit = hit & (x_high > x_low) & (y_high > y_low) & (z_high > z_low)
+    box = boxes + 6 * i
+    tl.store(box, tl.where(hit, z_low, 0.0).to(tl.int32), live)
+    tl.store(box + 1, tl.where(hit, z_high, 0.0).to(tl.int32), live)
+    tl.store(box + 2, tl.where(hit, y_low, 0.0).to(tl.int32), live)
+    tl.store(box + 3, tl.where(hit, y_high, 0.0).to(tl.int32), live)
+    tl.store(box + 4, tl.where(hit, x_low, 0.0).to(tl.int32), live)
+    tl.store(box + 5, tl.where(hit, x_high, 0.0).to(tl.int32), live)
+
+
+def place(
+    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, grid: Grid, faint: float, cut: float
+) -> Placed:
+    """Where Gaussians fall on a grid, ending below `faint` (a density) and at the latest after `cut` σ."""
+    n = densities.shape[0]
+    z, y, x = (float(axis[0]) for axis in grid.coordinates())
+    nz, ny, nx = grid.shape
+    edge_z, _, edge_x = grid.spacing
+    placed = Placed(
+        means.new_empty((n, _WIDTH.value)), torch.empty((n, 6), dtype=torch.int32, device=means.device), grid
+    )
+    if n > 0:
+        _placed[(triton.cdiv(n, _BLOCK),)](
+            means, scales, rotations, densities, placed.table, placed.boxes, n, x, y, z, 1 / edge_x, 1 / edge_z,
+            nx, ny, nz, faint, cut, BLOCK=_BLOCK,
+        )  # fmt: skip
+    return placed
+
+
+@triton.jit
+def _fill(  # type: ignore[no-untyped-def]
+    table, owners, starts, layers, nz, ny, nx, bricks_y, bricks_x, shares, EDGE: tl.constexpr, GROUP: tl.constexpr
+):
+    brick, share = tl.program_id(0), tl.program_id(1)
+    lane = tl.arange(0, EDGE * EDGE * EDGE)
+    ix = (brick % bricks_x) * EDGE + lane % EDGE
+    iy = ((brick // bricks_x) % bricks_y) * EDGE + (lane // EDGE) % EDGE
+    iz = (brick // (bricks_x * bricks_y)) * EDGE + lane // (EDGE * EDGE)
+    first, last = tl.load(starts + brick), tl.load(starts + brick + 1)
+    member = tl.arange(0, GROUP)
+    sums = tl.zeros((GROUP, EDGE * EDGE * EDGE), tl.float32)
+    for start in range(first + share * GROUP, last, shares * GROUP):
+        held = start + member < last
+        f = table + _WIDTH * tl.load(owners + start + member, held, 0)
+        x, y, z = tl.load(f + X, held, 0.0), tl.load(f + Y, held, 0.0), tl.load(f + Z, held, 0.0)
+        kx, ky = tl.load(f + KX, held, 0.0) * _HALF_LOG2_E, tl.load(f + KY, held, 0.0) * _HALF_LOG2_E
+        kz, rho = tl.load(f + KZ, held, 0.0) * _HALF_LOG2_E, tl.load(f + RHO, held, 0.0)
+        sxy, sxz, syz = tl.load(f + SXY, held, 0.0), tl.load(f + SXZ, held, 0.0), tl.load(f + SYZ, held, 0.0)
+        hx, hy, hz = tl.load(f + HX, held, -1.0), tl.load(f + HY, held, -1.0), tl.load(f + HZ, held, -1.0)
+        dx, dy, dz = ix[None, :] - x[:, None], iy[None, :] - y[:, None], iz[None, :] - z[:, None]
+        inside = (tl.abs(dx) <= hx[:, None]) & (tl.abs(dy) <= hy[:, None]) & (tl.abs(dz) <= hz[:, None])
+        a, b = dx + sxy[:, None] * dy + sxz[:, None] * dz, dy - syz[:, None] * dz
+        value = rho[:, None] * tl.exp2(kx[:, None] * a * a + ky[:, None] * b * b + kz[:, None] * dz * dz)
+        sums += tl.where(inside, value, 0.0)
+    voxel = ((share.to(tl.int64) * nz + iz) * ny + iy) * nx + ix
+    tl.store(layers + voxel, tl.sum(sums, axis=0), (iz < nz) & (iy < ny) & (ix < nx))
+
+
+def fill(placed: Placed) -> Tensor:
+    """Density [z, y, x] at the voxel centres."""
+    shape = placed.grid.shape
+    lists = tile_lists(placed.boxes, shape, _EDGE)
+    layers = placed.table.new_empty((lists.shares, *shape))
+    _fill[(lists.n_tiles, lists.shares)](
+        placed.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.counts[2], lists.shares,
+        EDGE=_EDGE, GROUP=_GROUP, num_warps=4,
+    )  # fmt: skip
+    return layers[0] if lists.shares == 1 else layers.sum(0)
+
+
+@triton.jit
+def _moments(  # type: ignore[no-untyped-def]
+    table, boxes, gradient, moments, ny, nx, DEEP: tl.constexpr, HIGH: tl.constexpr, WIDE: tl.constexpr
+):
+    i = tl.program_id(0)
+    f, box = table + _WIDTH * i, boxes + 6 * i
+    x, y, z = tl.load(f + X), tl.load(f + Y), tl.load(f + Z)
+    kx, ky, kz = tl.load(f + KX) * _HALF_LOG2_E, tl.load(f + KY) * _HALF_LOG2_E, tl.load(f + KZ) * _HALF_LOG2_E
+    sxy, sxz, syz = tl.load(f + SXY), tl.load(f + SXZ), tl.load(f + SYZ)
+    hx, hy, hz = tl.load(f + HX), tl.load(f + HY), tl.load(f + HZ)
+    z_low, z_high, y_low = tl.load(box), tl.load(box + 1), tl.load(box + 2)
+    y_high, x_low, x_high = tl.load(box + 3), tl.load(box + 4), tl.load(box + 5)
+    lane = tl.arange(0, DEEP * HIGH * WIDE)
+    n0 = tl.zeros((DEEP * HIGH * WIDE,), tl.float32)
+    mx, my, mz, mxx, mxy, mxz, myy, myz, mzz = n0, n0, n0, n0, n0, n0, n0, n0, n0
+    for z_start in range(z_low, z_high, DEEP):
+        iz = z_start + lane // (HIGH * WIDE)
+        dz = iz - z
+        for y_start in range(y_low, y_high, HIGH):
+            iy = y_start + (lane // WIDE) % HIGH
+            dy = iy - y
+            for x_start in range(x_low, x_high, WIDE):
+                ix = x_start + lane % WIDE
+                dx = ix - x
+                inside = (iz < z_high) & (iy < y_high) & (ix < x_high)
+                inside = inside & (tl.abs(dx) <= hx) & (tl.abs(dy) <= hy) & (tl.abs(dz) <= hz)
+                a, b = dx + sxy * dy + sxz * dz, dy - syz * dz
+                weight = tl.exp2(kx * a * a + ky * b * b + kz * dz * dz)
+                g = tl.load(gradient + (iz.to(tl.int64) * ny + iy) * nx + ix, inside, 0.0) * weight
+                gx, gy, gz = g * dx, g * dy, g * dz
+                n0, mx, my, mz = n0 + g, mx + gx, my + gy, mz + gz
+                mxx, mxy, mxz = mxx + gx * dx, mxy + gx * dy, mxz + gx * dz
+                myy, myz, mzz = myy + gy * dy, myz + gy * dz, mzz + gz * dz
+    m = moments + 10 * i
+    tl.store(m, tl.sum(n0))
+    tl.store(m + 1, tl.sum(mx))
+    tl.store(m + 2, tl.sum(my))
+    tl.store(m + 3, tl.sum(mz))
+    tl.store(m + 4, tl.sum(mxx))
+    tl.store(m + 5, tl.sum(mxy))
+    tl.store(m + 6, tl.sum(mxz))
+    tl.store(m + 7, tl.sum(myy))
+    tl.store(m + 8, tl.sum(myz))
+    tl.store(m + 9, tl.sum(mzz))
+
+
+@triton.jit(do_not_specialize=["n"])
+def _backward(  # type: ignore[no-untyped-def]
+    moments, boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations, d_densities, n, per_x, per_z,
+    MEANS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < n
+    hit = live & (tl.load(boxes + 6 * i + 1, live, 0) > 0)
+    m = moments + 10 * i
+    mx, my, mz = tl.load(m + 1, hit, 0.0), tl.load(m + 2, hit, 0.0), tl.load(m + 3, hit, 0.0)
+    xx, xy, xz = tl.load(m + 4, hit, 0.0), tl.load(m + 5, hit, 0.0), tl.load(m + 6, hit, 0.0)
+    yy, yz, zz = tl.load(m + 7, hit, 0.0), tl.load(m + 8, hit, 0.0), tl.load(m + 9, hit, 0.0)
+    rho = tl.load(densities + i, hit, 0.0)
+    tl.store(d_densities + i, tl.load(d_densities + i, hit, 0.0) + tl.load(m, hit, 0.0), hit)
+    px, py, pz = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(3):
+        s = tl.load(scales + 3 * i + k, hit, 1.0)
+        at = d_rotations + 9 * i + k
+        # H in voxel units, on the left of H N and Hᵀ H N.
+        in_x, in_z = 1.0 / (s * per_x), 1.0 / (s * per_z)
+        h0, h1 = tl.load(rotations + 9 * i + k, hit, 0.0) * in_x, tl.load(rotations + 9 * i + 3 + k, hit, 0.0) * in_x
+        h2 = tl.load(rotations + 9 * i + 6 + k, hit, 0.0) * in_z
+        if MEANS:
+            q = h0 * mx + h1 * my + h2 * mz
+            px, py, pz = px + h0 * q, py + h1 * q, pz + h2 * q
+        g0 = -rho * (h0 * xx + h1 * xy + h2 * xz)
+        g1 = -rho * (h0 * xy + h1 * yy + h2 * yz)
+        g2 = -rho * (h0 * xz + h1 * yz + h2 * zz)
+        scale = d_log_scales + 3 * i + k
+        tl.store(scale, tl.load(scale, hit, 0.0) - (g0 * h0 + g1 * h1 + g2 * h2), hit)
+        tl.store(at, tl.load(at, hit, 0.0) + g0 * in_x, hit)
+        tl.store(at + 3, tl.load(at + 3, hit, 0.0) + g1 * in_x, hit)
+        tl.store(at + 6, tl.load(at + 6, hit, 0.0) + g2 * in_z, hit)
+    if MEANS:
+        at = d_means + 3 * i
+        tl.store(at, tl.load(at, hit, 0.0) + rho * per_x * px, hit)
+        tl.store(at + 1, tl.load(at + 1, hit, 0.0) + rho * per_x * py, hit)
+        tl.store(at + 2, tl.load(at + 2, hit, 0.0) + rho * per_z * pz, hit)
+
+
+def fill_backward(
+    placed: Placed, gradient: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
+    d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, *, means_too: bool = True,
+) -> None:  # fmt: skip
+    """Add the gradients that follow from `gradient` [z, y, x]; `means_too=False` leaves positions alone."""
+    n = densities.shape[0]
+    _, ny, nx = placed.grid.shape
+    if n == 0:
+        return
+    edge_z, _, edge_x = placed.grid.spacing
+    moments = placed.table.new_empty((n, 10))
+    _moments[(n,)](
+        placed.table, placed.boxes, gradient, moments, ny, nx, DEEP=_DEEP, HIGH=_HIGH, WIDE=_WIDE, num_warps=1
+    )  # fmt: skip
+    _backward[(triton.cdiv(n, _BLOCK),)](
+        moments, placed.boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations, d_densities, n,
+        1 / edge_x, 1 / edge_z, MEANS=means_too, BLOCK=_BLOCK,
+    )  # fmt: skip
