@@ -56,7 +56,7 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
         title=f"View at {np.degrees(geometry.angles[view]):.2f}°",
     )
     figure.colorbar(image, ax=axes, label="line integral", shrink=0.9, pad=0.02)
-    return _png(figure)
+    return png(figure)
 
 
 def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
@@ -74,7 +74,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     axes.set_yticks(ticks, [f"{angles[i]:.0f}" for i in ticks])
     axes.set(xlabel="column (px)", ylabel="angle (°)", title=f"Sinogram of row {row}, {len(order)} views")
     figure.colorbar(image, ax=axes, label="line integral", pad=0.02)
-    return _png(figure)
+    return png(figure)
 
 
 def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window | None = None) -> bytes:
@@ -125,7 +125,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
                 axes.set_title(name, fontsize=11)
     bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
     bar.set_label(f"attenuation (1/{unit})")
-    return _png(figure)
+    return png(figure)
 
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
@@ -137,7 +137,7 @@ def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], valu
     axes.set_title("Rotation axis: " + ("a clear optimum" if confident else "NOT a clear optimum"))
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
-    return _png(figure)
+    return png(figure)
 
 
 def quality_against_time(
@@ -185,7 +185,7 @@ def quality_against_time(
     for panel in figure.axes:
         panel.grid(alpha=0.3)
         panel.tick_params(labelsize=8)
-    return _png(figure)
+    return png(figure)
 
 
 def _bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
@@ -208,7 +208,8 @@ def _figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
     return figure, figure.subplots()
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """The figure's bytes as PNG."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()

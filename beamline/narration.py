@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, TextIO
@@ -31,6 +32,10 @@ def sentence(event: Event) -> str | None:
             again = " again, from the start" if data.get("again") else ""
             axis = f"rotation axis at column {data['axis_col']:.2f}"
             return f"{data['method']}{again}: {data['n_views']} views, {axis}"
+        case "tradeoff_started":
+            return f"{data['trials']} trials of {data['file']}, quality by {data['by']}"
+        case "trial":
+            return _trial(data)
         case "snapshot":
             return f"Volume so far, from {data['n_views']} views: {data['path']}"
         case "scan_done":
@@ -59,6 +64,15 @@ class UserLog:
             stamp = datetime.fromtimestamp(event.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
             self._stream.write(f"{stamp}  {text}\n")
             self._stream.flush()
+
+
+def _trial(data: Mapping[str, Any]) -> str:
+    begin = f"{data['n']}/{data['of']} {data['label']}: "
+    if data["status"] != "done":
+        return begin + f"{data['status']}: {data['message']}"
+    quality = f", {data['quality_db']:.2f} dB" if math.isfinite(data["quality_db"]) else ""
+    memory = "" if data["peak_bytes"] is None else f", {size(data['peak_bytes'])}"
+    return begin + f"{data['seconds']:.2f} s{quality}{memory}"
 
 
 def _missing(data: Mapping[str, Any]) -> str | None:

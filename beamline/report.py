@@ -99,13 +99,18 @@ def to_html(report: Report) -> str:
         f"<h1>{escape(report.title)}</h1>\n<p class='summary'>{escape(report.summary)}</p>",
         _flags(report),
         "<h2>Metrics</h2>\n" + _metrics(report.metrics) + "".join(f"<p>{escape(n)}</p>\n" for n in report.footnotes),
-        *(_picture(picture) for picture in report.pictures),
-        "<h2>Scan</h2>\n" + _table({**report.scan, "frames": report.frames}),
-        "<h2>Settings</h2>\n" + _table(report.settings),
+        *(picture_html(picture) for picture in report.pictures),
+        "<h2>Scan</h2>\n" + table_html({**report.scan, "frames": report.frames}),
+        "<h2>Settings</h2>\n" + table_html(report.settings),
         f"<h2>To repeat</h2>\n<pre><code>{escape(report.command)}</code></pre>",
-        f"<footer>Made by splatline {escape(version())}.</footer>",
     ]
-    return _PAGE.format(title=escape(report.title), css=_CSS, body="\n".join(sections))
+    return page(report.title, sections)
+
+
+def page(title: str, sections: Sequence[str]) -> str:
+    """A page in the look of all reports; `sections` are HTML."""
+    footer = f"<footer>Made by splatline {escape(version())}.</footer>"
+    return _PAGE.format(title=escape(title), css=_CSS, body="\n".join((*sections, footer)))
 
 
 def _flags(report: Report) -> str:
@@ -127,12 +132,14 @@ def _metrics(metrics: Mapping[str, Mapping[str, float]]) -> str:
     return f"<table class='metrics'><thead><tr><td></td>{head}</tr></thead>\n<tbody>{''.join(rows)}</tbody></table>\n"
 
 
-def _table(values: Table) -> str:
+def table_html(values: Table) -> str:
+    """Names and values in two columns."""
     rows = "".join(f"<tr><th scope='row'>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in values.items())
     return f"<table><tbody>{rows}</tbody></table>"
 
 
-def _picture(picture: Picture) -> str:
+def picture_html(picture: Picture) -> str:
+    """A picture within the page, under its heading."""
     data = base64.b64encode(picture.png).decode("ascii")
     return (
         f"<h2>{escape(picture.title)}</h2>\n<figure><img alt='{escape(picture.caption)}' "

@@ -69,6 +69,8 @@ class Terminal:
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") == "ingest":
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
+        elif event.event == "progress" and event.data.get("stage") == "tradeoff":
+            self._show("trials", event.data["n"], event.data["of"], trials(event.data))
         elif event.event == "progress":
             self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
         elif event.event not in ("failed", "done"):  # the command has the last word
@@ -101,6 +103,14 @@ def rates(data: Mapping[str, Any]) -> str:
 def copied(data: Mapping[str, Any]) -> str:
     """n/N, frames/s and the time left, of an ingest's `progress` event."""
     return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
+
+
+def trials(data: Mapping[str, Any]) -> str:
+    """n/N, trials/min, the time left where it is known, and which one runs, of a trade-off's `progress` event."""
+    parts = [f"{data['n']}/{data['of']}"]
+    if data["eta_s"] is not None:
+        parts += [f"{data['per_min']:.1f} trials/min", f"{_clock_time(data['eta_s'])} left"]
+    return "  ".join([*parts, str(data["label"])])
 
 
 def fit(data: Mapping[str, Any]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 import shlex
 import sys
 from collections.abc import Mapping
@@ -13,51 +11,16 @@ from typing import Any
 import click
 
 from beamline.cli.narrate import results
-from beamline.cli.scan_options import scan_options
+from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
 from beamline.deliver import Target
 from beamline.errors import QualityError, ScanStopped
 from beamline.events import Event, fan_out
 from beamline.follow import follow as follow_scan
-from beamline.offline import Method, ReconOptions, SourceOptions, run
-from beamline.pipeline import Selection
+from beamline.offline import Method, ReconOptions, run
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock
-from recon.correct import CorrectionSettings
 from recon.fbp import Filter
-
-
-def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
-    """`first:end`, whole numbers."""
-    if value is None:
-        return None
-    match = re.fullmatch(r"(\d+):(\d+)", value)
-    if match is None or int(match[1]) >= int(match[2]):
-        raise click.BadParameter(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
-    return int(match[1]), int(match[2])
-
-
-def column(ctx: click.Context, param: click.Parameter, value: str) -> float | None:
-    """A column of the detector; None for "auto"."""
-    if value == "auto":
-        return None
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise click.BadParameter(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
-    return number
-
-
-def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str | tuple[int, int]:
-    """Which columns at the detector's edges show air: auto, none, or counts `left,right`."""
-    match = re.fullmatch(r"(\d+),(\d+)", value)
-    if match is not None:
-        return int(match[1]), int(match[2])
-    if value not in ("auto", "none"):
-        raise click.BadParameter(f"{value!r} is none of auto, none, LEFT,RIGHT (numbers of columns, e.g. 12,12)")
-    return value
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
@@ -77,35 +40,7 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     show_default=True,
     help="r2: Gaussians fitted to the views; fbp: filtered back-projection.",
 )
-@click.option(
-    "--views",
-    default="all",
-    show_default=True,
-    metavar="SPEC",
-    help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N",
-)
-@click.option("--rows", callback=span, metavar="FIRST:END", help="Detector rows; the volume has one slice a row.")
-@click.option(
-    "--bin", "binning", type=click.IntRange(min=1), default=1, show_default=True, help="Pixels averaged a side."
-)
-@click.option(
-    "--axis",
-    callback=column,
-    metavar="PX|auto",
-    default="auto",
-    show_default=True,
-    help="Rotation axis: column of the unbinned detector (0 is the centre of the first), or auto to find it.",
-)
-@scan_options
-@click.option("--pixel-size-um", type=click.FloatRange(min=0, min_open=True), help="At the sample; else the file's.")
-@click.option(
-    "--air",
-    callback=air_columns,
-    metavar="auto|none|LEFT,RIGHT",
-    default="auto",
-    show_default=True,
-    help="Edge columns that show air in every view.",
-)
+@selection_options
 @click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2).")
 @click.option(
     "--seconds",
@@ -143,12 +78,6 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 def recon(
     file: Path,
     method: Method,
-    views: str,
-    rows: tuple[int, int] | None,
-    binning: int,
-    axis: float | None,
-    pixel_size_um: float | None,
-    air: Any,
     steps: int | None,
     seconds: float | None,
     gaussians: int | None,
@@ -174,18 +103,11 @@ def recon(
     if method != "r2" and any(value is not None for value in (steps, seconds, gaussians)):
         raise click.UsageError(f"--steps, --seconds and --gaussians are of the r2 fit; {method} has none.")
     output = output or Path(f"{file.stem}_{method}.h5")
+    source, selection = chosen(file, seed, said)
     options = ReconOptions(
-        source=SourceOptions(file, **said),
+        source=source,
         target=Target(output, report_beside(output) if report else None),
-        selection=Selection(
-            views=views,
-            rows=rows,
-            binning=binning,
-            axis_col=axis,
-            pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
-            correction=CorrectionSettings(air=air),
-            seed=seed,
-        ),
+        selection=selection,
         method=method,
         steps=steps,
         seconds=seconds,

@@ -1,0 +1,111 @@
+"""Options that choose a part of a scan and say how it is to be read; the same for every command that reconstructs."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.scan_options import scan_options
+from beamline.offline import SourceOptions
+from beamline.pipeline import Selection
+from recon.correct import CorrectionSettings
+
+
+def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """`first:end`, whole numbers."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+):(\d+)", value)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise click.BadParameter(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
+    return int(match[1]), int(match[2])
+
+
+def column(ctx: click.Context, param: click.Parameter, value: str) -> float | None:
+    """A column of the detector; None for "auto"."""
+    if value == "auto":
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise click.BadParameter(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
+    return number
+
+
+def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str | tuple[int, int]:
+    """Which columns at the detector's edges show air: auto, none, or counts `left,right`."""
+    match = re.fullmatch(r"(\d+),(\d+)", value)
+    if match is not None:
+        return int(match[1]), int(match[2])
+    if value not in ("auto", "none"):
+        raise click.BadParameter(f"{value!r} is none of auto, none, LEFT,RIGHT (numbers of columns, e.g. 12,12)")
+    return value
+
+
+def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds --views, --rows, --bin, --axis, --pixel-size-um, --air and the options of `scan_options`."""
+    for option in reversed(_AFTER):
+        command = option(command)
+    command = scan_options(command)
+    for option in reversed(_BEFORE):
+        command = option(command)
+    return command
+
+
+def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
+    """The scan and the part of it that the options in `said` name."""
+    rest = dict(said)
+    pixel_size_um = rest.pop("pixel_size_um")
+    selection = Selection(
+        views=rest.pop("views"),
+        rows=rest.pop("rows"),
+        binning=rest.pop("binning"),
+        axis_col=rest.pop("axis"),
+        pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
+        correction=CorrectionSettings(air=rest.pop("air")),
+        seed=seed,
+    )
+    return SourceOptions(file, **rest), selection
+
+
+_BEFORE = (
+    click.option(
+        "--views",
+        default="all",
+        show_default=True,
+        metavar="SPEC",
+        help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N",
+    ),
+    click.option("--rows", callback=span, metavar="FIRST:END", help="Detector rows; the volume has one slice a row."),
+    click.option(
+        "--bin", "binning", type=click.IntRange(min=1), default=1, show_default=True, help="Pixels averaged a side."
+    ),
+    click.option(
+        "--axis",
+        callback=column,
+        metavar="PX|auto",
+        default="auto",
+        show_default=True,
+        help="Rotation axis: column of the unbinned detector (0 is the centre of the first), or auto to find it.",
+    ),
+)
+_AFTER = (
+    click.option(
+        "--pixel-size-um", type=click.FloatRange(min=0, min_open=True), help="At the sample; else the file's."
+    ),
+    click.option(
+        "--air",
+        callback=air_columns,
+        metavar="auto|none|LEFT,RIGHT",
+        default="auto",
+        show_default=True,
+        help="Edge columns that show air in every view.",
+    ),
+)

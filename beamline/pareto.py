@@ -1,0 +1,49 @@
+"""What is worth its cost: the Pareto front of (cost, quality) and what each further decibel along it takes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+def front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+    """Positions of the points that no other point beats, by rising cost (and so by rising quality).
+
+    A point is beaten by one that costs no more and is no worse, and better in one of the two; of equal points the
+    first stays. Points with a value that is not finite take no part.
+    """
+    known = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
+    kept: list[int] = []
+    for i in sorted(known, key=lambda i: (costs[i], -qualities[i], i)):
+        if not kept or qualities[i] > qualities[kept[-1]]:
+            kept.append(i)
+    return kept
+
+
+@dataclass(frozen=True)
+class Step:
+    """From one point of a front to the next.
+
+    Attributes:
+        start, end: positions of the points.
+        cost: what the second costs more.
+        gain: dB.
+    """
+
+    start: int
+    end: int
+    cost: float
+    gain: float
+
+    @property
+    def per_decibel(self) -> float:
+        """What a dB costs on this stretch."""
+        return self.cost / self.gain
+
+
+def steps(kept: Sequence[int], costs: Sequence[float], qualities: Sequence[float]) -> list[Step]:
+    """The stretches of a front, cheapest point first; none where it has fewer than two points."""
+    pairs = itertools.pairwise(kept)
+    return [Step(a, b, costs[b] - costs[a], qualities[b] - qualities[a]) for a, b in pairs]

@@ -1,0 +1,233 @@
+"""What accuracy costs in time: many reconstructions of one scan, each in its own process, measured alike."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamline.errors import ConfigError, DataError, ScanStopped
+from beamline.events import Event, Sink
+from beamline.machine import machine
+from beamline.measure import fit_truth, read_truth
+from beamline.offline import SourceOptions, Warnings
+from beamline.pipeline import Prepared, Selection, prepare
+from beamline.recon_report import facts_of
+from beamline.tradeoff_report import Table, write_figures, write_table
+from beamline.trial_process import Data
+from beamline.trials import Depth, Outcome, Status, Trial, plan, seconds_left
+from drivers.clock import Clock
+from recon.initialise import default_count
+from recon.volume import Grid
+
+_HELD_OUT_SHARE = 8  # one of so many views is kept back where there is nothing else to judge by
+_HELD_OUT_VIEWS = 16
+
+
+@dataclass(frozen=True)
+class TradeoffOptions:
+    """What to compare.
+
+    Attributes:
+        source, selection: the scan and the part of it to use.
+        folder: for the results; must not exist.
+        methods: of recon.reconstruct.
+        depth: how many trials.
+        max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
+        truth: FILE or FILE:first:end to compare with.
+        seed: of everything random.
+        command: that repeats this, for the record.
+    """
+
+    source: SourceOptions
+    selection: Selection
+    folder: Path
+    methods: Sequence[str]
+    depth: Depth = "quick"
+    max_seconds: float | None = None
+    truth: str | None = None
+    seed: int = 0
+    command: str = ""
+
+
+def run(options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> Table:
+    """Make all trials, and leave table, pictures and page in the folder. The event `done` says where.
+
+    The table in the folder is complete after every trial, so that whatever ends this leaves what was measured.
+
+    Raises:
+        ConfigError, DataError: with nothing written.
+        ScanStopped: Ctrl-C ended it; the results hold the trials done until then.
+    """
+    folder, started = options.folder, clock.now()
+    if folder.exists():
+        raise DataError(f"{folder} exists and results are never overwritten. Name another folder, or move it away.")
+    if not folder.parent.is_dir():
+        raise DataError(f"The folder {folder.parent} does not exist. Make it first.")
+    wanted = None if options.truth is None else read_truth(options.truth)
+    warn = Warnings(sink, clock)
+    with options.source.open() as source:
+        facts = facts_of(source)
+        prepared = prepare(source, options.selection, warn)
+    grid = Grid.matching(prepared.geometry)
+    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning).data
+    data = split(prepared, truth)
+    trials = plan(
+        options.methods,
+        data.geometry.n_views,
+        default_count(Grid.of_field(data.geometry, grid.voxel_size)),
+        options.depth,
+    )
+    table = Table(
+        outcomes=tuple(Outcome(trial, "not run") for trial in trials),
+        by="psnr" if truth is not None else "residual_held_out",
+        length_unit=prepared.length_unit,
+        machine=machine(),
+        scan={**facts.table, "views used": str(data.geometry.n_views), "volume": " × ".join(map(str, grid.shape))},
+        command=options.command,
+    )
+    sink(Event("tradeoff_started", clock.now(), {"file": options.source.path, "trials": len(trials), "by": table.by}))
+    folder.mkdir()
+    work = folder / "work"
+    work.mkdir()
+    stopped = False
+    try:
+        data.save(work / "data.npz")
+        for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each is the one before and a trial more
+            write_table(folder, table)
+    except KeyboardInterrupt:
+        stopped = True
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    write_table(folder, table)
+    write_figures(folder, table)
+    summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": stopped}
+    sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))
+    if stopped:
+        raise ScanStopped(f"The trade-off was ended after {table.n_done} of {len(trials)} trials; {folder} holds them.")
+    return table
+
+
+def split(prepared: Prepared, truth: Any) -> Data:
+    """The views that trials may use, and those that none may: judging by data needs views that no trial has seen.
+
+    Raises:
+        ConfigError: too few views to keep some back.
+    """
+    projections, geometry = prepared.projections.data, prepared.geometry
+    if truth is not None or prepared.held_out is not None:
+        return Data(projections, geometry, prepared.held_out, truth)
+    n = geometry.n_views
+    kept_back = min(_HELD_OUT_VIEWS, max(1, n // _HELD_OUT_SHARE))
+    if n - kept_back < 2:
+        raise ConfigError(f"{n} views leave none to judge by; choose more with --views, or give --truth.")
+    # Not the first and last: a view next to nothing is no fair question.
+    held = np.unique((np.arange(kept_back) + 0.5) * n // kept_back).astype(np.int64)
+    used = np.setdiff1d(np.arange(n), held)
+    return Data(projections[used], geometry.select(used), (projections[held], geometry.select(held)), None)
+
+
+def _each(
+    table: Table, work: Path, options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float]
+) -> Iterator[Table]:
+    """The table after each trial."""
+    begin = now()
+    timed: list[tuple[Trial, float]] = []
+    for index, outcome in enumerate(table.outcomes):
+        trial = outcome.trial
+        left = None if options.max_seconds is None else options.max_seconds - (now() - begin)
+        if left is not None and left <= 0:
+            break
+        eta = seconds_left(timed, [other.trial for other in table.outcomes[index:]])
+        progress = {"stage": "tradeoff", "n": index, "of": len(table.outcomes), "label": trial.label, "eta_s": eta}
+        sink(Event("progress", clock.now(), {**progress, "per_min": 60 * index / max(now() - begin, 1e-9)}))
+        started = now()
+        result = run_trial(trial, work, options.seed, left)
+        timed.append((trial, now() - started))
+        table = table.with_outcome(index, result)
+        yield table
+        sink(Event("trial", clock.now(), {"n": index + 1, "of": len(table.outcomes), **table.told(result)}))
+
+
+def command(job: Path) -> Sequence[str]:
+    """What runs the job in the file `job`."""
+    return [sys.executable, "-m", "beamline.trial_process", str(job)]
+
+
+def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = None) -> Outcome:
+    """One trial in its own process; it is gone when this returns, whatever ended it.
+
+    Args:
+        work: a folder with data.npz.
+        max_seconds: after which it is ended.
+    """
+    job, words = work / "job.json", work / "stderr.txt"
+    job.write_text(json.dumps({"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed}), encoding="utf-8")
+    late = threading.Event()
+    with words.open("w", encoding="utf-8") as stderr:
+        process = subprocess.Popen(
+            command(job),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # Ctrl-C is for this process, which decides what becomes of that one
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        )
+
+        def end() -> None:
+            late.set()
+            process.kill()
+
+        alarm = None if max_seconds is None else threading.Timer(max_seconds, end)
+        if alarm is not None:
+            alarm.start()
+        last: Mapping[str, Any] = {}
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                last = _said(line) or last
+            process.wait()
+        finally:
+            if alarm is not None:
+                alarm.cancel()
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+    return _outcome(trial, last, late.is_set(), process.returncode, words)
+
+
+def _said(line: str) -> Mapping[str, Any] | None:
+    try:
+        said = json.loads(line)
+    except ValueError:
+        return None  # a library's print
+    return said if isinstance(said, dict) else None
+
+
+def _outcome(trial: Trial, last: Mapping[str, Any], late: bool, code: int, words: Path) -> Outcome:
+    said = dict(last)
+    if said.pop("event", None) == "result":
+        curve = [(float(s), float(q)) for s, q in said.pop("curve", [])]
+        return Outcome(trial, "done", curve=tuple(curve), **said)
+    status: Status = "out of time" if late else "failed"
+    if late:
+        return Outcome(trial, status, message="ended: the time given with --max-seconds was over")
+    lines = words.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    default = f"its process ended with code {code}" + (f": {lines[-1]}" if lines else "")
+    return Outcome(trial, status, math.nan, message=str(said.get("message", default)))

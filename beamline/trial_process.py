@@ -1,0 +1,232 @@
+"""One trial in a process of its own, so that its peak memory is its own: `python -m beamline.trial_process JOB.json`.
+
+Reads the job and its arrays, says progress and the result as lines of JSON on stdout.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import recon
+from beamline.memory import peak_memory
+from beamline.trials import Trial, decibels
+from recon import metrics
+from recon.fit import FitSettings
+from recon.geometry import Geometry
+from recon.operators import data_residual
+from recon.reconstruction import Reconstruction
+from recon.resolution import fourier_shell_correlation, soft_cylinder
+from recon.splat import Truncation
+from recon.twin import compare
+from recon.views import parse_views
+from recon.volume import Grid, Volume
+from recon.warm_up import warm_up as compile_fit
+
+F32 = NDArray[np.float32]
+Say = Callable[[Mapping[str, Any]], None]
+
+_SAY_EVERY = 0.5  # s
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """What every trial of a trade-off shares.
+
+    Attributes:
+        projections, geometry: of the views that may be used.
+        held_out: views that no trial uses, and their geometry.
+        truth: the volume [z, y, x] on Grid.matching(geometry).
+    """
+
+    projections: F32
+    geometry: Geometry
+    held_out: tuple[F32, Geometry] | None
+    truth: F32 | None
+
+    def save(self, path: Path) -> None:
+        """As .npz, without pickle."""
+        arrays = {"projections": self.projections, **_geometry_arrays("geometry", self.geometry)}
+        if self.held_out is not None:
+            arrays |= {"held_out": self.held_out[0], **_geometry_arrays("held_out_geometry", self.held_out[1])}
+        if self.truth is not None:
+            arrays["truth"] = self.truth
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: Path) -> Data:
+        with np.load(path, allow_pickle=False) as file:
+            geometry = _geometry("geometry", file)
+            held = (file["held_out"], _geometry("held_out_geometry", file)) if "held_out" in file else None
+            return cls(file["projections"], geometry, held, file.get("truth"))
+
+
+def _geometry_arrays(prefix: str, geometry: Geometry) -> dict[str, NDArray[Any]]:
+    return {f"{prefix}.{f.name}": np.asarray(getattr(geometry, f.name)) for f in fields(Geometry)}
+
+
+def _geometry(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Geometry:
+    values: dict[str, Any] = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(Geometry)}
+    rows, cols = values.pop("detector_shape").tolist()
+    plain = {name: value.item() if value.ndim == 0 else value for name, value in values.items()}
+    return Geometry(detector_shape=(rows, cols), **plain)
+
+
+def run(trial: Trial, data: Data, seed: int, say: Say, now: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
+    """Make a trial's reconstruction and measure it; the fields of an Outcome.
+
+    Raises:
+        ValueError: the reconstruction refuses these settings.
+    """
+    if trial.group == "precision":
+        found = compare(data.projections, data.geometry, seed, now)
+        return {"seconds": found["seconds_float32"], "peak_bytes": peak_memory(), "details": found}
+    views = parse_views(f"fixed:{trial.views}", data.geometry.angles)
+    projections, geometry = data.projections[views], data.geometry.select(views)
+    grid = Grid.matching(data.geometry)
+    warm_up(trial)
+    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
+    peak = peak_memory()  # before measuring, which has needs of its own
+    volume = on_grid(result.volume, grid)
+    found = {}
+    if data.truth is not None:
+        found["psnr"] = metrics.psnr(data.truth, volume.data)
+        found["ssim3d"] = metrics.ssim3d(data.truth, volume.data)
+    if data.held_out is not None:
+        found["residual_held_out"] = data_residual(volume, *data.held_out)
+    if trial.halves and trial.views >= 4:
+        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed)
+    return {
+        "seconds": result.seconds,
+        "peak_bytes": peak,
+        "metrics": {name: float(value) for name, value in found.items()},
+        "gaussians": None if result.gaussians is None else result.gaussians.n,
+        "curve": curve_of(result),
+    }
+
+
+def half_set_resolution(trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int) -> float:
+    """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
+    order = np.argsort(np.mod(geometry.angles, np.pi), kind="stable")
+
+    def half(views: NDArray[np.int64]) -> F32:
+        made = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None)
+        return on_grid(made.volume, grid).data
+
+    even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
+    return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
+
+
+def reconstruct(
+    trial: Trial,
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid,
+    held_out: tuple[F32, Geometry] | None,
+    seed: int,
+    on_progress: Callable[[recon.Progress], None] | None,
+) -> Reconstruction:
+    """The one place that turns a trial into a call of recon.reconstruct.
+
+    A fit of binned views fills `grid` all the same; voxel methods have one voxel a binned pixel.
+    """
+    binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
+    if trial.method != "r2":
+        target = grid if trial.binning == 1 else Grid.matching(coarse)
+        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed)  # type: ignore[arg-type]
+    settings = FitSettings(truncation=replace(Truncation(), sigmas=trial.sigmas))
+    if trial.loss == "l1":
+        settings = replace(settings, ssim_weight=0.0)
+    return recon.reconstruct(
+        binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=settings,
+        on_progress=on_progress,
+    )  # fmt: skip
+
+
+def warm_up(trial: Trial) -> None:
+    """Compile what a trial uses on a toy of the same kind, so that compilation is in no trial's time."""
+    toy = Geometry.parallel(np.linspace(0, np.pi, 8, endpoint=False), (12, 24))
+    u = np.arange(24) - toy.axis_col
+    views = np.broadcast_to(np.exp(-(u**2) / 18).astype(np.float32), (8, 12, 24)).copy()
+    short = replace(
+        trial, binning=1, steps=None if trial.steps is None else 3, gaussians=None if trial.gaussians is None else 60,
+        iterations=None if trial.iterations is None else 1,
+    )  # fmt: skip
+    if trial.method == "r2":
+        compile_fit()
+    reconstruct(short, views, toy, Grid.matching(toy), None, 0, None)
+
+
+def bin_views(projections: F32, factor: int) -> F32:
+    """Means of factor x factor line integrals, [view, row, col]; trailing pixels that fill no bin go."""
+    if factor == 1:
+        return projections
+    n, rows, cols = projections.shape
+    rows, cols = rows // factor, cols // factor
+    kept = projections[:, : rows * factor, : cols * factor]
+    return kept.reshape(n, rows, factor, cols, factor).mean(axis=(2, 4), dtype=np.float32)
+
+
+def on_grid(volume: Volume, grid: Grid) -> Volume:
+    """The volume on another grid, by linear interpolation at its voxels' centres (edge values beyond the ends)."""
+    if volume.grid == grid:
+        return volume
+    index = [
+        (there - here[0]) / edge
+        for there, here, edge in zip(grid.coordinates(), volume.grid.coordinates(), volume.grid.spacing, strict=True)
+    ]
+    out = np.empty(grid.shape, np.float32)
+    plane = np.meshgrid(index[1], index[2], indexing="ij")
+    for k, height in enumerate(index[0]):
+        where = np.stack((np.full_like(plane[0], height), *plane))
+        ndimage.map_coordinates(volume.data, where, out[k], order=1, mode="nearest")
+    return Volume(out, grid)
+
+
+def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
+    """(seconds, dB) of the fit's own record: the residual of the views it used."""
+    pairs = [(p.seconds, decibels("residual_held_out", p.residual)) for p in result.history]
+    return [(seconds, db) for seconds, db in pairs if math.isfinite(db)]
+
+
+def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:
+    said = -math.inf
+
+    def listen(progress: recon.Progress) -> None:
+        nonlocal said
+        if now() - said >= _SAY_EVERY:
+            said = now()
+            say({"event": "progress", "step": progress.step, "steps": progress.steps})
+
+    return listen
+
+
+def main(job: Path) -> int:
+    """Run the job in the file `job`: {"data": .npz, "trial": {...}, "seed": n}."""
+
+    def say(line: Mapping[str, Any]) -> None:
+        print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
+
+    said = json.loads(job.read_text(encoding="utf-8"))
+    trial = Trial(**said["trial"])
+    try:
+        result = run(trial, Data.load(Path(said["data"])), int(said["seed"]), say)
+    except ValueError as error:
+        say({"event": "failed", "message": str(error)})
+        return 1
+    say({"event": "result", **result})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

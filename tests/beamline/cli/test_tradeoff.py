@@ -1,0 +1,89 @@
+"""`beamline tradeoff`: options, exit codes, streams."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline import tradeoff
+from beamline.cli.main import main
+from beamline.trials import Outcome, Trial
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    return tmp_path
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["tradeoff", *arguments])
+
+
+@pytest.fixture
+def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
+    seen: list[Trial] = []
+
+    def trial(trial: Trial, *_: object) -> Outcome:
+        seen.append(trial)
+        return Outcome(trial, "done", float(len(seen)), 10**8, {"residual_held_out": 1 / (1 + len(seen))})
+
+    monkeypatch.setattr(tradeoff, "run_trial", trial)
+    return seen
+
+
+def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trials: list[Trial]) -> None:
+    result = _beamline("scan.h5", "--axis", "20.7", "--methods", "fbp", "--views", "fixed:20")
+    assert result.exit_code == 0, result.output
+    assert (folder / "scan_tradeoff" / "tradeoff.html").is_file()
+    assert "fbp, 20 views" in result.stdout and "s a dB" in result.stdout
+    assert "1/2 fbp, 20 views" in result.stderr and "1/2" not in result.stdout
+    assert [t.views for t in quick_trials] == [20, 10]
+
+
+def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> None:
+    result = _beamline("scan.h5", "--axis", "20.7", "--full", "--json", "-o", "out")
+    assert result.exit_code == 0, result.output
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert (events[0]["event"], events[-1]["event"]) == ("tradeoff_started", "done")
+    assert events[-1]["output"] == "out"
+    assert events[0]["trials"] == len(quick_trials) > 10
+    assert {"r2", "fbp"} <= {trial.method for trial in quick_trials}
+
+
+def test_ctrl_c_is_exit_code_4_with_a_table(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> Outcome:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tradeoff, "run_trial", interrupted)
+    result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
+    assert result.exit_code == 4, result.output
+    assert "after 0 of" in result.stderr
+    assert {p.name for p in (folder / "out").iterdir()} == {"tradeoff.json", "tradeoff.csv", "tradeoff.html"}
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["--methods", "r2,magic"], 2, "magic"),
+        (["--views", "fixed:31"], 2, "30"),
+        (["--truth", "missing.npz"], 2, "missing.npz"),
+        (["--max-seconds", "0"], 2, "0"),
+        (["-o", "scan.h5"], 2, "scan.h5"),
+        (["-o", "."], 5, "never overwritten"),
+    ],
+)
+def test_bad_input_leaves_nothing(folder: Path, options: list[str], code: int, said: str) -> None:
+    result = _beamline("scan.h5", *options)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr
+    assert result.stdout == ""
+    assert {p.name for p in folder.iterdir()} == {"scan.h5"}

@@ -1,0 +1,19 @@
+"""The line about the machine: short, true, and the same for people and programs."""
+
+from __future__ import annotations
+
+import json
+
+import numba
+
+from beamline.machine import machine, machine_line
+
+
+def test_what_a_time_means_nothing_without() -> None:
+    found = machine()
+    assert found["threads"] == numba.get_num_threads()
+    assert int(found["cores"]) >= 1
+    assert str(found["processor"]).strip()
+    json.dumps(found)
+    line = machine_line(found)
+    assert "\n" not in line and all(str(value) in line for value in found.values())

@@ -1,0 +1,220 @@
+"""The trade-off as a whole: what is written, what is left when it is ended, and that its processes end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline import tradeoff
+from beamline.errors import ConfigError, DataError, ScanStopped
+from beamline.events import Event
+from beamline.offline import SourceOptions
+from beamline.pipeline import Selection
+from beamline.tradeoff import TradeoffOptions, run, run_trial
+from beamline.tradeoff_report import text
+from beamline.trial_process import Data
+from beamline.trials import Outcome, Trial
+from drivers.clock import SystemClock
+from recon.geometry import Geometry
+from recon.volume import Grid
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+FIGURES = {"quality_seconds.png", "quality_memory.png"}
+TABLES = {"tradeoff.json", "tradeoff.csv", "tradeoff.html"}
+
+
+def _options(tmp_path: Path, **changes: Any) -> TradeoffOptions:
+    if not (tmp_path / "scan.h5").exists():
+        write_exchange(tmp_path / "scan.h5", SCAN)
+    options = TradeoffOptions(
+        SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out", ("r2", "fbp"),
+        command="beamline tradeoff scan.h5",
+    )  # fmt: skip
+    return replace(options, **changes)
+
+
+def _made_up(trial: Trial, *_: object) -> Outcome:
+    """A trial that takes no time: more work gives more quality, for more seconds and memory."""
+    if trial.group == "precision":
+        names = ("residual_float32", "residual_float64", "difference", "seconds_float32", "seconds_float64")
+        return Outcome(trial, "done", 0.1, details=dict.fromkeys(names, 0.1))
+    amount = float((trial.steps or 20) * trial.views / trial.binning)
+    metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
+    return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics, curve=((0.1, 10.0), (0.2, 11.0)))
+
+
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., Outcome]], None]:
+    def use(trial: Callable[..., Outcome]) -> None:
+        monkeypatch.setattr(tradeoff, "run_trial", trial)
+
+    use(_made_up)
+    return use
+
+
+def _left(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def _rows(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "tradeoff.csv").read_text(encoding="utf-8").splitlines()))
+
+
+def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) -> None:
+    events: list[Event] = []
+    table = run(_options(tmp_path), events.append, SystemClock())
+    assert _left(tmp_path / "out") == TABLES | FIGURES | {"curves.png"}
+    record = json.loads((tmp_path / "out" / "tradeoff.json").read_text(encoding="utf-8"))
+    rows = _rows(tmp_path / "out")
+    assert len(record["trials"]) == len(rows) == len(table.outcomes)
+    assert [row["status"] for row in rows] == ["done"] * len(rows)
+    assert record["quality"] == "residual_held_out"
+    for row, outcome in zip(rows, table.outcomes, strict=True):
+        assert float(row["seconds"]) == outcome.seconds
+        if outcome.trial.group != "precision":
+            assert float(row["quality_db"]) == pytest.approx(20 * math.log10(1000 * outcome.seconds))
+    page = (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 3
+    assert all(outcome.trial.label in page for outcome in table.compared)
+    assert [e.event for e in events if e.event != "progress"] == [
+        "tradeoff_started", *["trial"] * len(rows), "done"
+    ]  # fmt: skip
+    progress = [e.data for e in events if e.event == "progress"]
+    assert [p["n"] for p in progress] == list(range(len(rows)))
+    assert progress[0]["eta_s"] is None and progress[-1]["eta_s"] >= 0
+
+
+def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path: Path, made_up: object) -> None:
+    table = run(_options(tmp_path), lambda e: None, SystemClock())
+    said = text(table)
+    best = {table.compared[i].trial.label for i in table.front("seconds")}
+    marked = {line[2:].split("  ")[0] for line in said.splitlines() if line.startswith("* ")}
+    assert marked == best
+    assert said.count("s a dB") == len(best) - 1
+    assert "float64 twin" in said
+
+
+def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> None:
+    grid = Grid.matching(Geometry.parallel([0.0], SCAN.shape))
+    np.save(tmp_path / "truth.npy", SCAN.truth(grid))
+    seen: list[Trial] = []
+    made_up(lambda trial, *rest: seen.append(trial) or _made_up(trial))  # type: ignore[operator, func-returns-value]
+    table = run(_options(tmp_path, truth=str(tmp_path / "truth.npy")), lambda e: None, SystemClock())
+    assert table.by == "psnr"
+    assert max(trial.views for trial in seen) == 30
+    assert run(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock()).outcomes[0].trial.views == 27
+
+
+def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> None:
+    done: list[Trial] = []
+
+    def interrupted(trial: Trial, *_: object) -> Outcome:
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(trial)
+        return _made_up(trial)
+
+    made_up(interrupted)
+    events: list[Event] = []
+    with pytest.raises(ScanStopped, match="3 of"):
+        run(_options(tmp_path), events.append, SystemClock())
+    rows = _rows(tmp_path / "out")
+    assert [row["status"] for row in rows] == ["done"] * 3 + ["not run"] * (len(rows) - 3)
+    assert _left(tmp_path / "out") >= TABLES | FIGURES
+    assert "work" not in _left(tmp_path / "out")
+    assert events[-1].event == "done" and events[-1].data["stopped"]
+
+
+def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any) -> None:
+    time = iter(range(0, 10_000, 5))
+    limits: list[float] = []
+
+    def timed(trial: Trial, work: Path, seed: int, left: float) -> Outcome:
+        limits.append(left)
+        return _made_up(trial)
+
+    made_up(timed)
+    table = run(_options(tmp_path, max_seconds=60.0), lambda e: None, SystemClock(), lambda: float(next(time)))
+    assert 0 < table.n_done < len(table.outcomes)
+    assert all(0 < left <= 60 for left in limits) and limits == sorted(limits, reverse=True)
+
+
+def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any) -> None:
+    def failing(trial: Trial, *_: object) -> Outcome:
+        return Outcome(trial, "failed", message="no room") if trial.method == "fbp" else _made_up(trial)
+
+    made_up(failing)
+    table = run(_options(tmp_path), lambda e: None, SystemClock())
+    assert "failed: no room" in text(table)
+    assert "failed: no room" in (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
+    made_up(lambda trial, *_: Outcome(trial, "failed", message="no room"))
+    table = run(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock())
+    assert "No trial has both" in text(table)
+    assert _left(tmp_path / "b") == TABLES
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"folder": Path()}, DataError, "never overwritten"),
+        ({"folder": Path("no/such/folder")}, DataError, "does not exist"),
+        ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
+        ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
+    ],
+)
+def test_what_cannot_be_done_leaves_nothing(
+    tmp_path: Path, changes: dict[str, Any], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        run(_options(tmp_path, **changes), lambda e: None, SystemClock())
+    assert _left(tmp_path) == {"scan.h5"}
+
+
+def test_two_views_leave_none_to_judge_by(tmp_path: Path) -> None:
+    few = TwoCylinders(angles=np.radians([0.0, 90.0]), shape=(4, 40))
+    write_exchange(tmp_path / "scan.h5", few)
+    with pytest.raises(ConfigError, match="--truth"):
+        run(_options(tmp_path), lambda e: None, SystemClock())
+
+
+@pytest.mark.parametrize(
+    ("program", "limit", "status", "said"),
+    [
+        ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
+        ("import sys; sys.exit('it broke')", None, "failed", "it broke"),
+        ('print(\'{"event": "failed", "message": "no matter"}\')', None, "failed", "no matter"),
+        ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5, "curve": [[1, 2]]}\')', 60.0, "done", ""),
+    ],
+)
+def test_what_becomes_of_a_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float | None, status: str, said: str
+) -> None:
+    def fake(job: Path) -> Sequence[str]:
+        return [sys.executable, "-c", program]
+
+    monkeypatch.setattr(tradeoff, "command", fake)
+    outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
+    assert (outcome.status, said in outcome.message) == (status, True)
+    assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
+
+
+def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
+    """Its memory is its own: this process, which has more, does not show in it."""
+    views = Geometry.parallel(SCAN.angles, SCAN.shape)
+    data = Data(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
+    data.save(tmp_path / "data.npz")
+    ballast = np.ones(150_000_000)  # 1.2 GB
+    outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
+    assert outcome.status == "done", outcome.message
+    assert outcome.quality("psnr") > 20
+    assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes

@@ -1,0 +1,121 @@
+"""One trial: the arrays come through the file as they were, the figures are those of the volume it made."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.trial_process import Data, bin_views, main, on_grid, run
+from beamline.trials import Trial
+from recon.fbp import fbp
+from recon.geometry import Geometry
+from recon.metrics import psnr
+from recon.operators import data_residual
+from recon.volume import Grid, Volume
+from tests.beamline.scans import TwoCylinders
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+
+
+@pytest.fixture
+def data() -> Data:
+    views = Geometry.parallel(SCAN.angles, SCAN.shape, 0.5, SCAN.axis_col)
+    integrals = SCAN.line_integrals().astype(np.float32)
+    held = np.arange(3, 30, 9)
+    used = np.setdiff1d(np.arange(30), held)
+    half = TwoCylinders(SCAN.angles, SCAN.shape, SCAN.axis_col, 0.5)
+    return Data(
+        integrals[used], views.select(used), (integrals[held], views.select(held)), half.truth(Grid.matching(views))
+    )
+
+
+def _silent(line: object) -> None:
+    pass
+
+
+def test_arrays_survive_the_file(tmp_path: Path, data: Data) -> None:
+    data.save(tmp_path / "data.npz")
+    back = Data.load(tmp_path / "data.npz")
+    assert data.held_out is not None and back.held_out is not None
+    for one, other in ((back.geometry, data.geometry), (back.held_out[1], data.held_out[1])):
+        for f in fields(Geometry):
+            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name))
+    np.testing.assert_array_equal(back.projections, data.projections)
+    np.testing.assert_array_equal(back.held_out[0], data.held_out[0])
+    np.testing.assert_array_equal(back.truth, data.truth)
+    Data(data.projections, data.geometry, None, None).save(tmp_path / "bare.npz")
+    bare = Data.load(tmp_path / "bare.npz")
+    assert bare.held_out is None and bare.truth is None
+
+
+def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: Data) -> None:
+    found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0, _silent)
+    expected = fbp(data.projections, data.geometry, filter="hann")
+    assert data.truth is not None and data.held_out is not None
+    assert found["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
+    volume = Volume(expected, Grid.matching(data.geometry))
+    assert found["metrics"]["residual_held_out"] == pytest.approx(data_residual(volume, *data.held_out))
+    assert 2 * 0.5 <= found["metrics"]["resolution"] < 12  # between two voxels and the inner cylinder's size
+    assert found["peak_bytes"] is None or found["peak_bytes"] > 1e7
+    assert found["seconds"] > 0 and found["gaussians"] is None
+
+
+def test_fewer_views_are_worse_and_spread_over_all_angles(data: Data) -> None:
+    all_views, few = (run(Trial("views", "fbp", n, halves=False), data, 0, _silent)["metrics"] for n in (27, 9))
+    assert few["psnr"] < all_views["psnr"] - 1
+    assert "resolution" not in few
+
+
+@pytest.mark.parametrize("change", [{}, {"binning": 2}, {"loss": "l1"}, {"sigmas": 2.5}])
+def test_a_fit_with_each_setting(data: Data, change: dict[str, Any]) -> None:
+    said: list[Any] = []
+    trial = Trial("method", "r2", 27, steps=40, gaussians=150, **change)
+    found = run(trial, data, 0, said.append)
+    assert found["metrics"]["psnr"] > 15
+    assert found["gaussians"] >= 100
+    assert found["curve"][-1][1] > found["curve"][0][1]
+    assert said and said[0]["steps"] == 40
+    json.dumps(found)
+
+
+def test_the_two_precisions(data: Data) -> None:
+    found = run(Trial("precision", "r2", 27), data, 0, _silent)
+    assert found["details"]["difference"] < 0.1
+    assert found["seconds"] == found["details"]["seconds_float32"]
+
+
+def test_joined_pixels_are_means_and_a_volume_of_them_lies_where_it_did() -> None:
+    views = np.arange(2 * 5 * 6, dtype=np.float32).reshape(2, 5, 6)
+    np.testing.assert_allclose(bin_views(views, 2)[1, 0], views[1, :2].reshape(2, 3, 2).mean(axis=(0, 2)))
+    assert bin_views(views, 2).shape == (2, 2, 3)
+    fine = Geometry.parallel([0.0], (8, 12), 0.5)
+    coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)
+
+    def ramp(on: Grid) -> np.ndarray[Any, np.dtype[np.float32]]:
+        z, y, x = on.coordinates()
+        return (z[:, None, None] + 2 * y[:, None] - 3 * x).astype(np.float32)
+
+    moved = on_grid(Volume(ramp(coarse), coarse), grid)
+    inner = (slice(1, -1),) * 3  # a linear function is interpolated exactly where nothing is beyond the ends
+    np.testing.assert_allclose(moved.data[inner], ramp(grid)[inner], atol=1e-5)
+
+
+def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str]) -> None:
+    data.save(tmp_path / "data.npz")
+    job = {"data": str(tmp_path / "data.npz"), "trial": asdict(Trial("method", "fbp", 27)), "seed": 0}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert main(tmp_path / "job.json") == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "result"
+    Data(np.zeros_like(data.projections), data.geometry, data.held_out, None).save(tmp_path / "data.npz")
+    job["trial"] = asdict(Trial("method", "r2", 27, steps=2, gaussians=10))
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert main(tmp_path / "job.json") == 1
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last["event"] == "failed" and "no matter" in last["message"]

@@ -1,0 +1,44 @@
+"""The two precisions, fitted alike, end alike; and the crop is a scan of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.splat import project
+from recon.twin import compare, small_crop
+
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 20, endpoint=False), (10, 60), 0.5, 31.0)
+
+
+def _blobs(rng: np.random.Generator, n: int = 25) -> Gaussians:
+    means = np.column_stack((rng.uniform(-8, 8, (n, 2)), rng.uniform(-2, 2, n)))
+    return Gaussians.from_physical(means, rng.uniform(0.8, 2.0, (n, 3)), rng.uniform(0.2, 1, n))
+
+
+def test_a_fit_in_float32_is_as_good_as_one_in_float64(rng: np.random.Generator) -> None:
+    data = project(_blobs(rng), VIEWS).numpy()
+    found = compare(data, VIEWS, seed=0, steps=25)
+    assert found["residual_float64"] < 0.2
+    assert found["residual_float32"] == pytest.approx(found["residual_float64"], rel=0.02)
+    assert 0 < found["difference"] < 0.02
+    assert found["seconds_float32"] > 0 and found["seconds_float64"] > 0
+
+
+def test_the_crop_shows_the_middle_of_the_scan_in_larger_pixels(rng: np.random.Generator) -> None:
+    """Rendering the same Gaussians in the crop's own geometry gives the joined pixels, up to their averaging."""
+    gaussians = _blobs(rng)
+    data = project(gaussians, VIEWS).numpy()
+    small, views = small_crop(data, VIEWS)
+    assert small.shape == (12, 5, 30)
+    assert (views.n_views, *views.detector_shape) == small.shape
+    again = project(gaussians, views).numpy()
+    assert np.linalg.norm(again - small) < 0.05 * np.linalg.norm(small)
+
+
+def test_a_detector_of_one_row_is_not_joined() -> None:
+    thin = Geometry.parallel([0.0, 1.0], (1, 200))
+    small, views = small_crop(np.ones((2, 1, 200), np.float32), thin)
+    assert small.shape == (2, 1, 200) and views.detector_shape == (1, 200)
