@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -382,23 +379,3 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="sees no CUDA device"):
         gpu.require("cuda:1")
-
-
-_WITHOUT_TRITON = """
-import sys
-import recon.backend, recon.fit
-assert "triton" not in sys.modules
-recon.backend.backend_for("cpu")
-sys.modules["triton"] = None  # as if it were not installed
-try:
-    recon.backend.backend_for("cuda")
-except ImportError as error:
-    assert "splatline[gpu]" in str(error), error
-else:
-    raise AssertionError("no error without triton")
-"""
-
-
-def test_triton_is_loaded_only_where_a_gpu_is_asked_for() -> None:
-    root = Path(__file__).parents[3]
-    subprocess.run([sys.executable, "-c", _WITHOUT_TRITON], cwd=root, check=True, timeout=120)

@@ -1,0 +1,105 @@
+"""Triton is loaded only where a GPU is asked for, and compiles every kernel for CUDA, on a machine that has none.
+
+The interpreter takes code that the compiler refuses. Triton brings its own assembler, so no driver is needed. Both
+are checked in one process of their own, since here the kernels may be interpreted.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+# What a name in a kernel's signature stands for; everything else is a float.
+_INTEGERS = "n rows cols tile_cols shares nz ny nx bricks_y bricks_x pixels voxels size0 size1 size2 size3"
+_INDICES = "boxes owners starts"
+_ARRAYS = (
+    "means scales rotations densities table moments layers gradient log_scales quaternions raw d_means d_log_scales "
+    "d_rotations d_densities d_centres d_quaternions d_raw image target out window source half target_maps partials "
+    "sums volume p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
+)
+# Those that other kernels call.
+_PARTS = {"_ray", "_slope", "_unit_quaternion", "_adam_one"}
+
+
+def _load_without_triton() -> None:
+    import recon.backend
+    import recon.fit
+
+    assert "triton" not in sys.modules
+    recon.backend.backend_for("cpu")
+    sys.modules["triton"] = None  # type: ignore[assignment] # as if it were not installed
+    with pytest.raises(ImportError, match=r"splatline\[gpu\]"):
+        recon.backend.backend_for("cuda")
+    del sys.modules["triton"]
+
+
+def _compile_all() -> None:
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    from recon.kernels.gpu import footprints, images, losses, parameters, voxels
+
+    block = {"BLOCK": 128}
+    wanted = [
+        (footprints, "_footprints", 4, block | {"CONE": False}),
+        (footprints, "_footprints", 4, block | {"CONE": True}),
+        (footprints, "_footprints_backward", 4, block | {"CONE": False}),
+        (footprints, "_footprints_backward", 4, block | {"CONE": True}),
+        (images, "_render", 2, {"EDGE": images._EDGE, "GROUP": images._GROUP}),
+        (images, "_moments", 1, {"HIGH": images._BLOCK[0], "WIDE": images._BLOCK[1]}),
+        (voxels, "_placed", 4, block),
+        (voxels, "_fill", 4, {"EDGE": voxels._EDGE, "GROUP": voxels._GROUP}),
+        (voxels, "_moments", 1, {"DEEP": voxels._DEEP, "HIGH": voxels._HIGH, "WIDE": voxels._WIDE}),
+        (voxels, "_backward", 4, block | {"MEANS": True}),
+        (losses, "_blur", 4, block | {"ACROSS": True}),
+        (losses, "_blur", 4, block | {"ACROSS": False}),
+        (losses, "_products_across", 4, block),
+        (losses, "_ssim_terms", 4, block),
+        (losses, "_combine", 4, block),
+        (losses, "_total_variation", 4, block),
+        (parameters, "_activate", 4, block),
+        (parameters, "_activation_backward", 4, block),
+        (parameters, "_adam", 4, block),
+    ]
+    modules = {module for module, *_ in wanted}
+    kernels = {
+        (module, name)
+        for module in modules
+        for name, value in vars(module).items()
+        if isinstance(value, triton.JITFunction)
+    }
+    assert {(module, name) for module, name, *_ in wanted} == {k for k in kernels if k[1] not in _PARTS}
+    for module, name, warps, constants in wanted:
+        kernel = getattr(module, name)
+        signature, values = {}, {}
+        for position, argument in enumerate(kernel.arg_names):
+            if argument in constants:
+                signature[argument], values[(position,)] = "constexpr", constants[argument]
+            elif argument in _INTEGERS.split():
+                signature[argument] = "i32"
+            elif argument in _INDICES.split():
+                signature[argument] = "*i32"
+            else:
+                signature[argument] = "*fp32" if argument in _ARRAYS.split() else "fp32"
+        source = ASTSource(kernel, signature, values)
+        compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": warps})
+        assert len(compiled.asm["cubin"]) > 0, name
+
+
+def test_triton_is_loaded_when_asked_for_and_compiles_every_kernel_for_cuda() -> None:
+    if find_spec("triton") is None:
+        pytest.skip("the GPU kernels need triton (extra gpu, Linux)")
+    root = Path(__file__).parents[3]
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"PYTHONPATH": str(root)}
+    subprocess.run([sys.executable, __file__], cwd=root, env=environment, check=True, timeout=200)
+
+
+if __name__ == "__main__":
+    _load_without_triton()
+    _compile_all()
