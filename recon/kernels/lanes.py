@@ -1,6 +1,6 @@
 """Sixteen float32 lanes as one numba value: numba's own exp is scalar, so the splat kernels carry their vector along.
 
-`Lanes` is LLVM's <16 x float>; LLVM lowers it to AVX-512, AVX2, SSE or NEON, whatever the machine has. `+ - *` work
+`Lanes` is LLVM's <16 x float>; LLVM lowers it to AVX-512, AVX2, SSE or NEON, whatever the machine has. `+ - * /` work
 between Lanes and with scalars (which are broadcast). No compiler is needed at run time.
 """
 
@@ -78,7 +78,8 @@ def _register(symbol: Callable[..., Any], implementation: Any) -> None:
         return None
 
 
-for _symbol, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+_OPERATORS = ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"))
+for _symbol, _instruction in _OPERATORS:
     _register(_symbol, _binary(_instruction))
 
 
@@ -142,6 +143,17 @@ def between(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
         return builder.select(inside, args[0], _constant(0.0))
 
     return LANES(LANES, types.intp, types.intp), code
+
+
+@intrinsic
+def sign(typing_context, lanes):  # type: ignore[no-untyped-def]
+    """-1, 0 or 1 a lane."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        below = builder.select(builder.fcmp_ordered("<", args[0], _constant(0.0)), _constant(-1.0), _constant(0.0))
+        return builder.select(builder.fcmp_ordered(">", args[0], _constant(0.0)), _constant(1.0), below)
+
+    return LANES(LANES), code
 
 
 @intrinsic

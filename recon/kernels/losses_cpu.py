@@ -6,10 +6,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from recon.kernels import lanes
 from recon.kernels.activation import F32, OPTIONS
 
 _f = np.float32
 RADIUS = 5  # an 11 x 11 window
+MARGIN = 16  # zeros to the left and right of a line
+TASK_ROWS = 8
 
 
 def gaussian_window(sigma: float = 1.5) -> F32:
@@ -18,116 +21,165 @@ def gaussian_window(sigma: float = 1.5) -> F32:
     return (taps / taps.sum()).astype(np.float32)
 
 
-@njit(**OPTIONS)
-def _blur(maps: F32, window: F32, half: F32, out: F32) -> None:
-    """Separable window over each of maps [k, row, col], zeros outside; `half` is scratch of the same shape."""
-    k_maps, rows, cols = maps.shape
-    for job in prange(k_maps * rows):
-        k, row = job // rows, job % rows
-        target = half[k, row]
-        target[:] = _f(0)
-        for tap in range(-RADIUS, RADIUS + 1):
-            other = row + tap
-            if 0 <= other < rows:
-                weight, source = window[tap + RADIUS], maps[k, other]
-                for col in range(cols):
-                    target[col] += weight * source[col]
-    for job in prange(k_maps * rows):
-        k, row = job // rows, job % rows
-        source, target = half[k, row], out[k, row]
-        target[:] = _f(0)
-        for tap in range(-RADIUS, RADIUS + 1):
-            low, high = max(0, -tap), min(cols, cols - tap)
-            weight = window[tap + RADIUS]
-            for col in range(low, high):
-                target[col] += weight * source[col + tap]
+@njit(inline="always", fastmath=True)
+def _columns(start, cols, width):  # type: ignore[no-untyped-def]
+    """Sixteen columns for the block at `start`: the first, and which lanes of them the block before did not have."""
+    first = min(start, width - lanes.WIDTH)
+    return first, start - first, cols - first
+
+
+@njit(inline="always", fastmath=True)
+def _down(plane, row, first, window):  # type: ignore[no-untyped-def]
+    """The window down the columns of plane [row, col], zeros outside, for sixteen columns."""
+    amount = lanes.zero()
+    for other in range(max(0, row - RADIUS), min(plane.shape[0], row + RADIUS + 1)):
+        amount = amount + lanes.load(plane, other, first) * window[other - row + RADIUS]
+    return amount
+
+
+@njit(inline="always", fastmath=True)
+def _across(half, k, first, window):  # type: ignore[no-untyped-def]
+    """The window along line k of half, whose column 0 stands at MARGIN between zeros, for sixteen columns."""
+    amount = lanes.zero()
+    for tap in range(2 * RADIUS + 1):
+        amount = amount + lanes.load(half, k, first + (MARGIN - RADIUS) + tap) * window[tap]
+    return amount
 
 
 @njit(**OPTIONS)
-def _products(image: F32, maps: F32, target: F32) -> None:
-    for row in prange(image.shape[0]):
-        for col in range(image.shape[1]):
-            x = image[row, col]
-            maps[0, row, col] = x
-            maps[1, row, col] = x * x
-            maps[2, row, col] = x * target[row, col]
+def _blur(plane: F32, window: F32, halves: F32, out: F32) -> None:
+    """The separable window over plane [row, col], zeros outside; halves [task, line, col] is scratch with margins."""
+    rows, width = plane.shape
+    for task in prange(halves.shape[0]):
+        half = halves[task]
+        for row in range(task * TASK_ROWS, min(rows, (task + 1) * TASK_ROWS)):
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, width, width)
+                lanes.store(half, 0, first + MARGIN, _down(plane, row, first, window))
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, width, width)
+                lanes.store(out, row, first, _across(half, 0, first, window))
 
 
 @njit(**OPTIONS)
 def _ssim_terms(
-    blurred: F32, target_blurred: F32, c1: float, c2: float, partials: F32, sums: NDArray[np.float64]
-) -> None:
-    """Partial derivatives of the SSIM map with respect to the blurred maps x, x², xy; sums [row] of the map itself."""
+    image: F32, target: F32, cols: int, target_blurred: F32, window: F32, c1: float, c2: float, halves: F32,
+    partials: F32, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Partial derivatives of the SSIM map with respect to the blurred x, x², xy; sums [row] of the map itself."""
     one, two, k1, k2 = _f(1), _f(2), _f(c1), _f(c2)
-    for row in prange(blurred.shape[1]):
-        amount = 0.0
-        for col in range(blurred.shape[2]):
-            mx, my = blurred[0, row, col], target_blurred[0, row, col]
-            vx = blurred[1, row, col] - mx * mx
-            vy = target_blurred[1, row, col] - my * my
-            vxy = blurred[2, row, col] - mx * my
-            top1, top2 = two * mx * my + k1, two * vxy + k2
-            low1, low2 = one / (mx * mx + my * my + k1), one / (vx + vy + k2)
-            value = top1 * top2 * low1 * low2
-            amount += value
-            d_vx = -value * low2
-            d_vxy = two * top1 * low1 * low2
-            d_mx = two * my * top2 * low1 * low2 - two * mx * value * low1
-            partials[0, row, col] = d_mx - two * mx * d_vx - my * d_vxy
-            partials[1, row, col] = d_vx
-            partials[2, row, col] = d_vxy
-        sums[row] = amount
+    rows, width = image.shape
+    for task in prange(halves.shape[0]):
+        half = halves[task]
+        for row in range(task * TASK_ROWS, min(rows, (task + 1) * TASK_ROWS)):
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, cols, width)
+                bx, bxx, bxy = lanes.zero(), lanes.zero(), lanes.zero()
+                for other in range(max(0, row - RADIUS), min(rows, row + RADIUS + 1)):
+                    x = lanes.load(image, other, first)
+                    weighted = x * window[other - row + RADIUS]
+                    bx, bxx = bx + weighted, bxx + weighted * x
+                    bxy = bxy + weighted * lanes.load(target, other, first)
+                lanes.store(half, 0, first + MARGIN, bx)
+                lanes.store(half, 1, first + MARGIN, bxx)
+                lanes.store(half, 2, first + MARGIN, bxy)
+            amount = lanes.zero()
+            for start in range(0, width, lanes.WIDTH):
+                first, low, high = _columns(start, cols, width)
+                mx, my = _across(half, 0, first, window), lanes.load(target_blurred[0], row, first)
+                vx = _across(half, 1, first, window) - mx * mx
+                vy = lanes.load(target_blurred[1], row, first) - my * my
+                vxy = _across(half, 2, first, window) - mx * my
+                top1, top2 = two * mx * my + k1, two * vxy + k2
+                low1, low2 = one / (mx * mx + my * my + k1), one / (vx + vy + k2)
+                part = top1 * low1 * low2
+                value = part * top2
+                d_vx = lanes.zero() - value * low2
+                d_vxy = two * part
+                d_mx = two * (my * top2 * low1 * low2 - mx * value * low1)
+                amount = amount + lanes.between(value, low, high)
+                # Columns that only fill up sixteen lanes are no part of the mean.
+                d_x = d_mx - two * mx * d_vx - my * d_vxy
+                lanes.store(partials[0], row, first, lanes.between(d_x, 0, high))
+                lanes.store(partials[1], row, first, lanes.between(d_vx, 0, high))
+                lanes.store(partials[2], row, first, lanes.between(d_vxy, 0, high))
+            sums[row] = lanes.total(amount)
 
 
 @njit(**OPTIONS)
 def _combine(
-    image: F32, target: F32, blurred: F32, l1: float, ssim: float, gradient: F32, sums: NDArray[np.float64]
-) -> None:
-    for row in prange(image.shape[0]):
-        amount = 0.0
-        for col in range(image.shape[1]):
-            x, y = image[row, col], target[row, col]
-            difference = x - y
-            amount += abs(difference)
-            sign = _f(l1) if difference > 0 else (-_f(l1) if difference < 0 else _f(0))
-            slope = blurred[0, row, col] + _f(2) * x * blurred[1, row, col] + y * blurred[2, row, col]
-            gradient[row, col] = sign - _f(ssim) * slope
-        sums[row] = amount
+    image: F32, target: F32, cols: int, partials: F32, window: F32, l1: float, ssim: float, halves: F32, gradient: F32,
+    sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """The gradient from the blurred partial derivatives and the signs of x - y; sums [row] of |x - y|."""
+    rows, width = image.shape
+    for task in prange(halves.shape[0]):
+        half = halves[task]
+        for row in range(task * TASK_ROWS, min(rows, (task + 1) * TASK_ROWS)):
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, cols, width)
+                for k in range(3):
+                    lanes.store(half, k, first + MARGIN, _down(partials[k], row, first, window))
+            amount = lanes.zero()
+            for start in range(0, width, lanes.WIDTH):
+                first, low, high = _columns(start, cols, width)
+                x, y = lanes.load(image, row, first), lanes.load(target, row, first)
+                difference = x - y
+                sign = lanes.sign(difference)
+                amount = amount + lanes.between(difference * sign, low, high)
+                slope = _across(half, 0, first, window) + y * _across(half, 2, first, window)
+                slope = slope + _f(2) * x * _across(half, 1, first, window)
+                lanes.store(gradient, row, first, sign * _f(l1) - slope * _f(ssim))
+            sums[row] = lanes.total(amount)
 
 
 class ProjectionLoss:
     """mean |x - y| + λ (1 - SSIM(x, y)) and its gradient, for many images x against few targets y.
 
-    The target's blurred maps do not change during a fit, so they are computed once per view.
+    Two passes over the rows: blurs of x, x², xy and the SSIM map's partial derivatives; blurs of these and the
+    gradient. Each task takes a few rows and blurs them first down, then along one line that stays in its cache. The
+    target's blurred maps do not change during a fit, so they are computed once per view.
     """
 
     def __init__(self, shape: tuple[int, int], ssim_weight: float, c1: float = 0.01**2, c2: float = 0.03**2) -> None:
-        rows, cols = shape
+        rows, self._cols = shape
         self.ssim_weight, self.c1, self.c2 = ssim_weight, c1, c2
         self.window = gaussian_window()
-        self._maps = np.empty((3, rows, cols), np.float32)
-        self._scratch = np.empty((3, rows, cols), np.float32)
-        self._blurred = np.empty((3, rows, cols), np.float32)
-        self._partials = np.empty((3, rows, cols), np.float32)
+        # Narrow images get columns of zeros to the right: the kernels take sixteen at a time.
+        self._width = max(self._cols, lanes.WIDTH)
+        self._halves = np.zeros((-(-rows // TASK_ROWS), 3, self._width + 2 * MARGIN), np.float32)
+        self._partials = np.empty((3, rows, self._width), np.float32)
         self._sums = np.empty(rows, np.float64)
 
+    def _wide(self, image: F32) -> F32:
+        if image.shape[1] == self._width:
+            return np.ascontiguousarray(image)
+        wide = np.zeros((image.shape[0], self._width), np.float32)
+        wide[:, : self._cols] = image
+        return wide
+
     def target_maps(self, target: F32) -> F32:
-        """Blurred y and y² [2, row, col] of a target image."""
-        maps = np.stack((target, target * target))
-        out = np.empty_like(maps)
-        _blur(maps, self.window, np.empty_like(maps), out)
+        """Blurred y and y² [2, row, col] of a target image; at least sixteen columns."""
+        wide = self._wide(target)
+        out = np.empty((2, *wide.shape), np.float32)
+        for plane, blurred in zip((wide, wide * wide), out, strict=True):
+            _blur(plane, self.window, self._halves, blurred)
         return out
 
     def __call__(self, image: F32, target: F32, target_maps: F32, gradient: F32) -> float:
         """The loss; `gradient` [row, col] receives its derivative with respect to `image`."""
         pixels = image.size
-        _products(image, self._maps, target)
-        _blur(self._maps, self.window, self._scratch, self._blurred)
-        _ssim_terms(self._blurred, target_maps, self.c1, self.c2, self._partials, self._sums)
+        x, y, cols = self._wide(image), self._wide(target), self._cols
+        whole = gradient.shape == x.shape and gradient.flags.c_contiguous
+        slope = gradient if whole else np.empty_like(x)
+        _ssim_terms(
+            x, y, cols, target_maps, self.window, self.c1, self.c2, self._halves, self._partials, self._sums
+        )  # fmt: skip
         ssim = float(self._sums.sum()) / pixels
-        _blur(self._partials, self.window, self._scratch, self._blurred)
         weight = self.ssim_weight / pixels
-        _combine(image, target, self._blurred, 1.0 / pixels, weight, gradient, self._sums)
+        _combine(x, y, cols, self._partials, self.window, 1.0 / pixels, weight, self._halves, slope, self._sums)
+        if not whole:
+            gradient[...] = slope[:, :cols]
         return float(self._sums.sum()) / pixels + self.ssim_weight * (1.0 - ssim)
 
 

@@ -15,6 +15,8 @@ def _combine(a, b, out):  # type: ignore[no-untyped-def]
     lanes.store(out, 1, 0, x - y * np.float32(2))
     lanes.store(out, 2, 0, x * y)
     lanes.store(out, 3, 0, lanes.iota() + lanes.zero())
+    lanes.store(out, 4, 0, np.float32(2) / x)
+    lanes.store(out, 5, 0, lanes.sign(y - y) + lanes.sign(x))
     return lanes.total(x)
 
 
@@ -26,13 +28,15 @@ def _exp(a, out):  # type: ignore[no-untyped-def]
 
 def test_arithmetic_loads_and_sums(rng: np.random.Generator) -> None:
     a, b = (rng.normal(size=(3, 20)).astype(np.float32) for _ in range(2))
-    out = np.zeros((4, 16), np.float32)
+    out = np.zeros((6, 16), np.float32)
     total = _combine(a, b, out)
     x, y = a[0, :16], b[1, 2:18]
     np.testing.assert_allclose(out[0], x + y, rtol=1e-6)
     np.testing.assert_allclose(out[1], x - 2 * y, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(out[2], x * y, rtol=1e-6)
     np.testing.assert_array_equal(out[3], np.arange(16))
+    np.testing.assert_allclose(out[4], 2 / x, rtol=1e-6)
+    np.testing.assert_array_equal(out[5], np.sign(x))
     assert abs(total - x.astype(np.float64).sum()) < 1e-5
 
 

@@ -17,8 +17,9 @@ def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tupl
     return (target + 0.2 * rng.normal(size=shape)).astype(np.float32), target
 
 
-def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator) -> None:
-    image, target = _images(rng)
+@pytest.mark.parametrize("shape", [(27, 33), (40, 48), (9, 16), (30, 5), (1, 40), (3, 1), (17, 31)])
+def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int]) -> None:
+    image, target = _images(rng, shape)
     loss = ProjectionLoss(image.shape, 0.25)
     gradient = np.empty_like(image)
     value = loss(image, target, loss.target_maps(target), gradient)
@@ -28,6 +29,10 @@ def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator) -
     assert value == pytest.approx(expected.item(), rel=1e-5)
     assert x.grad is not None
     np.testing.assert_allclose(gradient, x.grad.numpy(), atol=2e-5 * float(x.grad.abs().max()))
+    # Nothing of one call stays in the scratch memory for the next, and arrays in pieces serve too.
+    again = np.empty((shape[0], 2 * shape[1]), np.float32)[:, ::2]
+    assert loss(np.asfortranarray(image), target, loss.target_maps(target), again) == value
+    np.testing.assert_array_equal(again, gradient)
 
 
 def test_ssim_equals_scikit_image_in_the_interior(rng: np.random.Generator) -> None:
