@@ -5,20 +5,23 @@ Float32 tensors go to the threaded CPU kernels; float64 tensors (or `kernel="ref
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.kernels import reference
 from recon.kernels.activation import F32, activate, activation_backward
-from recon.kernels.footprints_cpu import Camera, footprint_table, footprints, footprints_backward
+from recon.kernels.footprints_cpu import HU, INEXACT, Camera, footprint_table, footprints, footprints_backward
 from recon.kernels.project_cpu import moments, render
+from recon.kernels.rays_cpu import Rays
 from recon.kernels.voxelize_cpu import Layout
 from recon.volume import Grid
 
@@ -36,6 +39,33 @@ class Truncation:
 
     sigmas: float = 3.5
     faint: float = 1e-5
+
+
+@dataclass(frozen=True)
+class RayModel:
+    """What a Gaussian gives a ray.
+
+    Attributes:
+        exact_above: in a cone, Gaussians whose affine footprint is off by more than this (an estimate of the relative
+            L2 error, see `footprints_cpu`) are integrated exactly along each ray; inf: none, 0: all. A parallel
+            beam's footprints are exact.
+        rectified: False gives the footprints of 3DGS without their correction (Zha et al. 2024, section 4.2), as
+            X-Gaussian has them: the density times one length for all, half the width of the field, however much of a
+            ray lies in the Gaussian. Kept to show the bias.
+    """
+
+    exact_above: float = math.inf
+    rectified: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.exact_above >= 0:
+            raise ValueError(f"exact_above must be a relative error >= 0 (inf: never), got {self.exact_above}")
+        if not self.rectified and self.exact_above < math.inf:
+            raise ValueError("an exact integral is rectified: leave exact_above at inf where rectified is False")
+
+    def length(self, geometry: Geometry) -> float:
+        """mm that stand in for a ray's length in a Gaussian; 0 where the true one is taken."""
+        return 0.0 if self.rectified else geometry.detector_shape[1] * geometry.sample_pitch / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,49 +117,111 @@ def camera(geometry: Geometry, view: int) -> Camera:
     return Camera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
 
 
-def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
-    """Footprints of all Gaussians in one view; `faint` in units of the image."""
+def view_table(
+    active: Active, geometry: Geometry, view: int, faint: float, sigmas: float, model: RayModel | None = None
+) -> F32:
+    """Footprints of all Gaussians in one view; `faint` in units of the image. What `model` wants exact is left out."""
     table = footprint_table(active.densities.shape[0])
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    footprints(*parameters, camera(geometry, view), faint, sigmas, table)
+    length, exact_above = (0.0, math.inf) if model is None else (model.length(geometry), model.exact_above)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table, length=length, exact_above=exact_above)
     return table
 
 
 def view_backward(
-    active: Active, geometry: Geometry, view: int, table: F32, gradient: F32, into: Gradients, centres: F32
+    active: Active,
+    geometry: Geometry,
+    view: int,
+    table: F32,
+    gradient: F32,
+    into: Gradients,
+    centres: F32,
+    model: RayModel | None = None,
 ) -> None:
     """Add one view's image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
     footprints_backward(
         table, moments(table, gradient), active.means, active.scales, active.rotations, active.densities,
         camera(geometry, view), into.means, into.log_scales, into.rotations, into.densities, centres,
+        length=0.0 if model is None else model.length(geometry),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedView:
+    """One view's image [row, col] with all that its backward pass needs."""
+
+    image: F32
+    active: Active
+    geometry: Geometry
+    view: int
+    model: RayModel
+    table: F32
+    exact: NDArray[np.intp]
+    rays: Rays | None
+
+    def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
+        """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
+        view_backward(self.active, self.geometry, self.view, self.table, gradient, into, centres, self.model)
+        if self.rays is None:
+            return
+        some = Gradients.zeros(self.exact.size)
+        moved = np.empty((self.exact.size, 2), np.float32)
+        self.rays.backward(gradient, some.means, some.log_scales, some.rotations, some.densities, moved)
+        centres[self.exact] = moved
+        into.means[self.exact] += some.means
+        into.log_scales[self.exact] += some.log_scales
+        into.rotations[self.exact] += some.rotations
+        into.densities[self.exact] += some.densities
+
+
+def render_view(
+    active: Active,
+    geometry: Geometry,
+    view: int,
+    faint: float,
+    sigmas: float,
+    model: RayModel | None = None,
+    image: F32 | None = None,
+) -> RenderedView:
+    """Line integrals of one view into `image` [row, col] (overwritten; None makes one); `faint` in its units."""
+    chosen = model or RayModel()
+    picture = np.empty(geometry.detector_shape, np.float32) if image is None else image
+    table = view_table(active, geometry, view, faint, sigmas, chosen)
+    render(table, picture)
+    exact, rays = np.empty(0, np.intp), None
+    if geometry.is_cone and chosen.exact_above < math.inf:
+        exact = np.flatnonzero(table[:, HU] == INEXACT)
+    if exact.size:
+        some = (active.means[exact], active.scales[exact], active.rotations[exact], active.densities[exact])
+        rays = Rays(*some, camera(geometry, view), geometry.detector_shape, faint, sigmas)
+        rays.add_to(picture)
+    return RenderedView(picture, active, geometry, view, chosen, table, exact, rays)
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, geometry: Geometry, truncation: Truncation,
+        unit: float, geometry: Geometry, truncation: Truncation, model: RayModel,
     ) -> Tensor:  # fmt: skip
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
         faint = truncation.faint * unit * geometry.sample_pitch * geometry.detector_shape[1]
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
-        tables = []
-        for view in range(geometry.n_views):
-            tables.append(view_table(active, geometry, view, faint, truncation.sigmas))
-            render(tables[-1], images[view])
-        ctx.state = (_array(quaternions), _array(raw), active, unit, geometry, tables)
+        views = [
+            render_view(active, geometry, view, faint, truncation.sigmas, model, image)
+            for view, image in enumerate(images)
+        ]
+        ctx.state = (_array(quaternions), _array(raw), unit, views)
         return torch.from_numpy(images)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        quaternions, raw, active, unit, geometry, tables = ctx.state
-        into = Gradients.zeros(len(active.densities))
-        centres = np.empty((len(active.densities), 2), np.float32)
-        images = gradient.contiguous().numpy()
-        for view, table in enumerate(tables):
-            view_backward(active, geometry, view, table, images[view], into, centres)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None)
+        quaternions, raw, unit, views = ctx.state
+        into = Gradients.zeros(len(raw))
+        centres = np.empty((len(raw), 2), np.float32)
+        for view, image in zip(views, gradient.contiguous().numpy(), strict=True):
+            view.backward(image, into, centres)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None)
 
 
 class _Voxelize(torch.autograd.Function):
@@ -168,19 +260,29 @@ def project(
     views: Sequence[int] | slice | None = None,
     *,
     truncation: Truncation | None = None,
+    model: RayModel | None = None,
     kernel: Kernel = "auto",
 ) -> Tensor:
     """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
 
-    Differentiable in all four parameter tensors. The reference kernel truncates nothing.
+    A cone's are those of the affine footprint, or of the true ray where `model` says so. Differentiable in all four
+    parameter tensors. The reference kernel truncates nothing.
     """
+    rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
     g = gaussians
     if _use_reference(g, kernel):
         parameters = (g.means, g.scales, g.quaternions, g.densities)
-        return torch.stack([reference.project_view(*parameters, chosen, view) for view in range(chosen.n_views)])
+        length = rays.length(chosen)
+        images = []
+        for view in range(chosen.n_views):
+            exact = None
+            if chosen.is_cone and rays.exact_above < math.inf:
+                exact = reference.affine_error(*parameters[:3], chosen, view) > rays.exact_above
+            images.append(reference.project_view(*parameters, chosen, view, exact=exact, length=length))
+        return torch.stack(images)
     cut = truncation or Truncation()
-    return _Project.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, chosen, cut)
+    return _Project.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, chosen, cut, rays)
 
 
 def voxelize(

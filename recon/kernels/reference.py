@@ -67,6 +67,28 @@ def in_front(means: Tensor, geometry: Geometry, view: int) -> Tensor:
     return geometry.sod + means.detach() @ means.new_tensor(geometry.axes(view)[2]) > 0.01 * geometry.sod
 
 
+def affine_error(means: Tensor, scales: Tensor, quaternions: Tensor, geometry: Geometry, view: int) -> Tensor:
+    """ε [n], the estimate of `footprints_cpu` for the relative L2 error of a cone's affine footprints; no gradient."""
+    means, scales, quaternions = means.detach(), scales.detach(), quaternions.detach()
+    axes = means.new_tensor(geometry.axes(view))
+    in_view, focal = means @ axes.T, geometry.sdd / geometry.pixel_pitch
+    centre, jacobian = to_detector(in_view, geometry)
+    turn = jacobian @ axes
+    flat = (turn @ covariances(scales, quaternions) @ turn.transpose(1, 2))[:, :2, :2]
+    whiten = rotation_matrices(quaternions).transpose(1, 2) / scales[:, :, None]
+    source = (whiten @ (means + geometry.sod * axes[2])[:, :, None])[..., 0]
+    eta = 1 / (source * source).sum(1)
+    step = whiten @ axes[:2].T * ((in_view[:, 2] + geometry.sod) / focal)[:, None, None]  # H moved by one pixel
+    alpha = eta[:, None] * torch.einsum("nk,nku->nu", source, step)
+    beta = centre / (focal**2 + (centre * centre).sum(1, keepdim=True))
+
+    def between(x: Tensor, y: Tensor) -> Tensor:
+        return torch.einsum("nu,nuv,nv->n", x, flat, y)
+
+    first = 0.5 * between(beta, beta) + between(alpha, beta) + 1.5 * between(alpha, alpha)
+    return torch.sqrt(first + 6 * eta**2)
+
+
 def pixels(geometry: Geometry, view: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Columns [col] and rows [row] counted from where the middle of the object's frame falls."""
     rows, cols = geometry.detector_shape
