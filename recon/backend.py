@@ -16,33 +16,38 @@ from recon.kernels import losses_cpu
 from recon.kernels.activation import F32
 from recon.kernels.adam_cpu import adam
 from recon.kernels.project_cpu import render
-from recon.kernels.voxelize_cpu import Layout
 from recon.splat import Active, Gradients, grid_layout, view_backward, view_table
 from recon.volume import Grid
 
 Array = TypeVar("Array")
 
 
+class View(Protocol[Array]):
+    """One rendered view: its image [row, col], and the way back."""
+
+    image: Array
+
+    def backward(self, gradient: Array) -> Array:
+        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
+
+
+class Box(Protocol[Array]):
+    """One box of voxels: its density [z, y, x], and the way back."""
+
+    density: Array
+
+    def backward(self, gradient: Array, *, means_too: bool = True) -> None:
+        """Add what follows from a gradient [z, y, x]; `means_too=False` leaves positions alone."""
+
+
 class Pass(Protocol[Array]):
     """Physical parameters of a model, and the gradients that views and boxes of voxels have added so far."""
 
-    def footprints(self, geometry: Geometry, view: int, faint: float, cut: float) -> Any:
-        """Footprints in one view, ending below `faint` (units of the image) and at the latest after `cut` σ."""
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float) -> View[Array]:
+        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ."""
 
-    def render(self, found: Any, geometry: Geometry) -> Array:
-        """Image [row, col]."""
-
-    def render_backward(self, found: Any, geometry: Geometry, view: int, gradient: Array) -> Array:
-        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
-
-    def place(self, grid: Grid, faint: float, cut: float) -> Any:
-        """Where the Gaussians fall on a grid; `faint` is a density."""
-
-    def fill(self, placed: Any) -> Array:
-        """Density [z, y, x]."""
-
-    def fill_backward(self, placed: Any, gradient: Array, *, means_too: bool = True) -> None:
-        """Add what follows from a gradient [z, y, x]; `means_too=False` leaves positions alone."""
+    def box(self, grid: Grid, faint: float, cut: float) -> Box[Array]:
+        """Voxelise on a grid; `faint` is a density."""
 
     def gradients(self) -> tuple[Array, Array, Array, Array]:
         """Gradients on means, log scales, quaternions and raw densities."""
@@ -141,36 +146,46 @@ class CpuPass:
 
     def __init__(self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> None:
         self._raw, self._unit = (quaternions, raw), unit
-        self._active = Active.of(means, log_scales, quaternions, raw, unit)
-        self._into = Gradients.zeros(raw.shape[0])
+        self.active = Active.of(means, log_scales, quaternions, raw, unit)
+        self.into = Gradients.zeros(raw.shape[0])
 
-    def footprints(self, geometry: Geometry, view: int, faint: float, cut: float) -> F32:
-        return view_table(self._active, geometry, view, faint, cut)
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float) -> CpuView:
+        return CpuView(self, geometry, view, faint, cut)
 
-    def render(self, found: F32, geometry: Geometry) -> F32:
-        image = np.empty(geometry.detector_shape, np.float32)
-        render(found, image)
-        return image
-
-    def render_backward(self, found: F32, geometry: Geometry, view: int, gradient: F32) -> F32:
-        centres = np.empty((found.shape[0], 2), np.float32)
-        view_backward(self._active, geometry, view, found, gradient, self._into, centres)
-        return centres
-
-    def place(self, grid: Grid, faint: float, cut: float) -> Layout:
-        return grid_layout(self._active, grid, faint, cut)
-
-    def fill(self, placed: Layout) -> F32:
-        return np.ascontiguousarray(placed.fill())
-
-    def fill_backward(self, placed: Layout, gradient: F32, *, means_too: bool = True) -> None:
-        into = self._into
-        placed.backward(
-            gradient, into.means, into.log_scales, into.rotations, into.densities, means_too=means_too
-        )  # fmt: skip
+    def box(self, grid: Grid, faint: float, cut: float) -> CpuBox:
+        return CpuBox(self, grid, faint, cut)
 
     def gradients(self) -> tuple[F32, F32, F32, F32]:
-        return self._into.to_raw(*self._raw, self._unit)
+        return self.into.to_raw(*self._raw, self._unit)
+
+
+class CpuView:
+    """A view by the numba kernels."""
+
+    def __init__(self, run: CpuPass, geometry: Geometry, view: int, faint: float, cut: float) -> None:
+        self._run, self._geometry, self._view = run, geometry, view
+        self._table = view_table(run.active, geometry, view, faint, cut)
+        self.image: F32 = np.empty(geometry.detector_shape, np.float32)
+        render(self._table, self.image)
+
+    def backward(self, gradient: F32) -> F32:
+        centres = np.empty((self._table.shape[0], 2), np.float32)
+        view_backward(self._run.active, self._geometry, self._view, self._table, gradient, self._run.into, centres)
+        return centres
+
+
+class CpuBox:
+    """A box of voxels by the numba kernels."""
+
+    def __init__(self, run: CpuPass, grid: Grid, faint: float, cut: float) -> None:
+        self._into, self._layout = run.into, grid_layout(run.active, grid, faint, cut)
+        self.density: F32 = np.ascontiguousarray(self._layout.fill())
+
+    def backward(self, gradient: F32, *, means_too: bool = True) -> None:
+        into = self._into
+        self._layout.backward(
+            gradient, into.means, into.log_scales, into.rotations, into.densities, means_too=means_too
+        )  # fmt: skip
 
 
 class CpuLoss:

@@ -16,20 +16,20 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, geometry: Geometry, faint: float, cut: float,
+        unit: float, geometry: Geometry, faint: float, cut: float, length: float,
     ) -> Tensor:  # fmt: skip
         run = _pass(means, log_scales, quaternions, raw, unit)
-        views = [run.footprints(geometry, view, faint, cut) for view in range(geometry.n_views)]
-        ctx.state = (run, views, geometry)
-        return torch.stack([run.render(found, geometry) for found in views])
+        views = [run.view(geometry, view, faint, cut, length) for view in range(geometry.n_views)]
+        ctx.state = (run, views)
+        return torch.stack([view.image for view in views])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        run, views, geometry = ctx.state
-        fresh = run.again()
-        for view, found in enumerate(views):
-            fresh.render_backward(found, geometry, view, gradient[view].contiguous())
-        return (*fresh.gradients(), None, None, None, None)
+        run, views = ctx.state
+        run.clear()
+        for view, slope in zip(views, gradient, strict=True):
+            view.backward(slope.contiguous())
+        return (*run.gradients(), None, None, None, None, None)
 
 
 class _Voxelize(torch.autograd.Function):
@@ -39,16 +39,16 @@ class _Voxelize(torch.autograd.Function):
         unit: float, grid: Grid, faint: float, cut: float,
     ) -> Tensor:  # fmt: skip
         run = _pass(means, log_scales, quaternions, raw, unit)
-        placed = run.place(grid, faint, cut)
-        ctx.state = (run, placed)
-        return run.fill(placed)
+        box = run.box(grid, faint, cut)
+        ctx.state = (run, box)
+        return box.density
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        run, placed = ctx.state
-        fresh = run.again()
-        fresh.fill_backward(placed, gradient.contiguous())
-        return (*fresh.gradients(), None, None, None, None)
+        run, box = ctx.state
+        run.clear()
+        box.backward(gradient.contiguous())
+        return (*run.gradients(), None, None, None, None)
 
 
 def _pass(means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> GpuPass:
@@ -58,10 +58,10 @@ def _pass(means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, u
 
 def project(
     means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-    unit: float, geometry: Geometry, faint: float, cut: float,
+    unit: float, geometry: Geometry, faint: float, cut: float, length: float = 0.0,
 ) -> Tensor:  # fmt: skip
     """Line integrals [view, row, col]; `faint` in units of the image, `cut` in σ; differentiable in the tensors."""
-    return _Project.apply(means, log_scales, quaternions, raw, unit, geometry, faint, cut)
+    return _Project.apply(means, log_scales, quaternions, raw, unit, geometry, faint, cut, length)
 
 
 def voxelize(

@@ -11,10 +11,10 @@ from torch import Tensor
 from recon.geometry import Geometry
 from recon.kernels.activation import F32
 from recon.kernels.gpu import losses, require
-from recon.kernels.gpu.footprints import Footprints, footprints, footprints_backward
+from recon.kernels.gpu.footprints import footprints, footprints_backward
 from recon.kernels.gpu.images import moments, render
 from recon.kernels.gpu.parameters import activate, activation_backward, adam
-from recon.kernels.gpu.voxels import Placed, fill, fill_backward, place
+from recon.kernels.gpu.voxels import fill, fill_backward, place
 from recon.volume import Grid
 
 
@@ -22,49 +22,60 @@ class GpuPass:
     """Physical parameters of raw ones, and the gradients that views and boxes of voxels have added so far."""
 
     def __init__(self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> None:
-        self.raw_parameters, self.unit = (means, log_scales, quaternions, raw), unit
+        self._raw, self._unit = (quaternions, raw), unit
         scales, rotations, densities = activate(log_scales, quaternions, raw, unit)
         self.active = (means, scales, rotations, densities)
-        self._gradients = (
+        self.into = (
             torch.zeros_like(means), torch.zeros_like(scales), torch.zeros_like(rotations), torch.zeros_like(densities)
         )  # fmt: skip
 
-    def again(self) -> GpuPass:
-        """The same parameters with gradients at zero."""
-        return GpuPass(*self.raw_parameters, self.unit)
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, length: float = 0.0) -> GpuView:
+        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ."""
+        return GpuView(self, geometry, view, faint, cut, length)
 
-    def footprints(self, geometry: Geometry, view: int, faint: float, cut: float) -> Footprints:
-        """Footprints in one view; `faint` in units of the image, `cut` in standard deviations."""
-        return footprints(*self.active, geometry, view, faint, cut)
+    def box(self, grid: Grid, faint: float, cut: float) -> GpuBox:
+        """Voxelise on a grid; `faint` is a density."""
+        return GpuBox(self, grid, faint, cut)
 
-    def render(self, found: Footprints, geometry: Geometry) -> Tensor:
-        """Image [row, col]."""
-        return render(found, geometry.detector_shape)
-
-    def render_backward(self, found: Footprints, geometry: Geometry, view: int, gradient: Tensor) -> Tensor:
-        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
-        centres = self.active[0].new_empty((self.active[3].shape[0], 2))
-        sums = moments(found, gradient)
-        footprints_backward(found, sums, *self.active, geometry, view, *self._gradients, centres)
-        return centres
-
-    def place(self, grid: Grid, faint: float, cut: float) -> Placed:
-        """Where the Gaussians fall on a grid; `faint` is a density."""
-        return place(*self.active, grid, faint, cut)
-
-    def fill(self, placed: Placed) -> Tensor:
-        """Density [z, y, x]."""
-        return fill(placed)
-
-    def fill_backward(self, placed: Placed, gradient: Tensor, *, means_too: bool = True) -> None:
-        """Add what follows from a gradient [z, y, x]."""
-        fill_backward(placed, gradient, *self.active[1:], *self._gradients, means_too=means_too)
+    def clear(self) -> None:
+        """Set the gradients to zero."""
+        for array in self.into:
+            array.zero_()
 
     def gradients(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gradients on means, log scales, quaternions and raw densities."""
-        _, _, quaternions, raw = self.raw_parameters
-        d_means, d_log_scales, d_rotations, d_densities = self._gradients
-        return d_means, d_log_scales, *activation_backward(quaternions, raw, self.unit, d_rotations, d_densities)
+        d_means, d_log_scales, d_rotations, d_densities = self.into
+        return d_means, d_log_scales, *activation_backward(*self._raw, self._unit, d_rotations, d_densities)
+
+
+class GpuView:
+    """One rendered view: its image [row, col], and the way back."""
+
+    def __init__(self, run: GpuPass, geometry: Geometry, view: int, faint: float, cut: float, length: float) -> None:
+        self._run, self._geometry, self._view, self._length = run, geometry, view, length
+        self.footprints = footprints(*run.active, geometry, view, faint, cut, length)
+        self.image = render(self.footprints, geometry.detector_shape)
+
+    def backward(self, gradient: Tensor) -> Tensor:
+        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
+        run, found = self._run, self.footprints
+        centres = found.table.new_empty((found.table.shape[0], 2))
+        footprints_backward(
+            found, moments(found, gradient), *run.active, self._geometry, self._view, *run.into, centres, self._length
+        )
+        return centres
+
+
+class GpuBox:
+    """One box of voxels: its density [z, y, x], and the way back."""
+
+    def __init__(self, run: GpuPass, grid: Grid, faint: float, cut: float) -> None:
+        self._run, self.placed = run, place(*run.active, grid, faint, cut)
+        self.density = fill(self.placed)
+
+    def backward(self, gradient: Tensor, *, means_too: bool = True) -> None:
+        """Add what follows from a gradient [z, y, x]; `means_too=False` leaves positions alone."""
+        fill_backward(self.placed, gradient, *self._run.active[1:], *self._run.into, means_too=means_too)
 
 
 class Gpu:

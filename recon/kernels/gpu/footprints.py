@@ -66,7 +66,7 @@ def _ray(  # type: ignore[no-untyped-def]
 @triton.jit(do_not_specialize=["n"])
 def _footprints(  # type: ignore[no-untyped-def]
     means, scales, rotations, densities, table, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz, col0, row0,
-    focal, sod, near, faint, cut, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    focal, sod, near, faint, cut, fixed, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -87,7 +87,7 @@ def _footprints(  # type: ignore[no-untyped-def]
         uu, uv, vv, hh, product = uu + p * p, uv + p * q, vv + q * q, hh + h * h, product * s
     length = tl.sqrt(hh)
     inverse = 1.0 / (product * length)  # 1 / sqrt(det Σ₂)
-    weight = tl.load(densities + i) * _ROOT_TWO_PI / length
+    weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI / length)
     u, v = col0 + per * across, row0 + per * up
     ka, kv = vv * inverse * inverse, 1.0 / vv
     # Comparisons with a NaN are false: what is not finite is not seen.
@@ -118,7 +118,7 @@ def _footprints(  # type: ignore[no-untyped-def]
 @triton.jit(do_not_specialize=["n"])
 def _footprints_backward(  # type: ignore[no-untyped-def]
     means, scales, rotations, densities, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n,
-    ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, fixed, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -150,9 +150,9 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
         h = (nx * r0 + ny * r1 + nz * r2) / s
         hh += h * h
     hh = tl.where(seen, hh, 1.0)
-    dense = tl.load(d_densities + i, live, 0.0) + m0 * _ROOT_TWO_PI / tl.sqrt(hh)
+    dense = tl.load(d_densities + i, live, 0.0) + m0 * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI / tl.sqrt(hh))
     tl.store(d_densities + i, dense, live)
-    pull = -w * m0 / hh  # ∂L/∂h = -W M₀ h / |h|²
+    pull = tl.where(fixed > 0.0, 0.0, -w * m0 / hh)  # ∂L/∂h = -W M₀ h / |h|²
     # Gradients on Ju, Jv and n; a parallel beam's do not depend on where a Gaussian is.
     gux, guy, guz = across * 0.0, across * 0.0, across * 0.0
     gvx, gvy, gvz = across * 0.0, across * 0.0, across * 0.0
@@ -211,9 +211,12 @@ def _beam(geometry: Geometry, view: int) -> tuple[list[float], float, float]:
 
 def footprints(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
-    geometry: Geometry, view: int, faint: float, cut: float,
+    geometry: Geometry, view: int, faint: float, cut: float, length: float = 0.0,
 ) -> Footprints:  # fmt: skip
-    """Footprints of Gaussians, ending below `faint` (units of the image) and at the latest after `cut` σ."""
+    """Footprints of Gaussians, ending below `faint` (units of the image) and at the latest after `cut` σ.
+
+    A `length` (mm) other than 0 stands in for μ: the uncorrected factor.
+    """
     n = densities.shape[0]
     found = Footprints(means.new_empty((n, 8)), torch.empty((n, 4), dtype=torch.int32, device=means.device))
     rows, cols = geometry.detector_shape
@@ -221,7 +224,7 @@ def footprints(
     if n > 0:
         _footprints[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, densities, found.table, found.boxes, n, rows, cols, *axes, *geometry.origin(view),
-            focal, sod, 0.01 * sod, faint, cut, CONE=geometry.is_cone, BLOCK=_BLOCK,
+            focal, sod, 0.01 * sod, faint, cut, length, CONE=geometry.is_cone, BLOCK=_BLOCK,
         )  # fmt: skip
     return found
 
@@ -230,6 +233,7 @@ def footprints_backward(
     found: Footprints, moments: Tensor, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
     geometry: Geometry, view: int,
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, d_centres: Tensor,
+    length: float = 0.0,
 ) -> None:  # fmt: skip
     """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
     n = densities.shape[0]
@@ -237,5 +241,5 @@ def footprints_backward(
     if n > 0:
         _footprints_backward[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, densities, found.table, moments, d_means, d_log_scales, d_rotations, d_densities,
-            d_centres, n, *axes, focal, sod, CONE=geometry.is_cone, BLOCK=_BLOCK,
+            d_centres, n, *axes, focal, sod, length, CONE=geometry.is_cone, BLOCK=_BLOCK,
         )  # fmt: skip

@@ -86,13 +86,27 @@ def test_images_and_gradients_equal_the_twins(make: object, random_gaussians: Ma
     assert_gradients(raw, twin)
 
 
+@pytest.mark.parametrize("make", [parallel, cone])
+def test_the_uncorrected_factor_equals_the_twins(make: object, random_gaussians: Make, device: torch.device) -> None:
+    geometry = make()  # type: ignore[operator]
+    g = random_gaussians(10, 9.0)
+    raw, twin = raw_of(g, device), in_double(g)
+    found = autograd.project(*raw, UNIT, geometry, *WHOLE, 5.5)[0]
+    physical = (twin.means, twin.scales, twin.quaternions, twin.densities)
+    expected = reference.project_view(*physical, geometry, 0, length=5.5)
+    assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
+    (found * found).sum().backward()
+    (expected * expected).sum().backward()
+    assert_gradients(raw, twin)
+
+
 def test_footprints_equal_the_cpus(random_gaussians: Make, device: torch.device) -> None:
     g, geometry = random_gaussians(30, 30.0), parallel()
     arrays = g.arrays()
     active = Active.of(*(arrays[k] for k in ("means", "log_scales", "quaternions", "raw_densities")), UNIT)
     expected = view_table(active, geometry, 0, 1e-3, 3.5)
     raw = [t.detach() for t in raw_of(g, device)]
-    found = engine.GpuPass(*raw, UNIT).footprints(geometry, 0, 1e-3, 3.5)
+    found = engine.GpuPass(*raw, UNIT).view(geometry, 0, 1e-3, 3.5).footprints
     table = found.table.cpu().numpy()
     hidden = expected[:, footprints_cpu.HU] < 0
     assert hidden.any() or not (table[:, footprints_cpu.HU] < 0).any()
@@ -110,12 +124,13 @@ def test_a_cut_off_ends_at_the_box_whatever_the_tiles(device: torch.device) -> N
     # One Gaussian over several tiles and image borders: exactly the pixels of its box are lit.
     g = Gaussians.from_physical([[2.3, 0.0, -3.1]], [1.4], [1.0])
     geometry = Geometry.parallel([0.0], (17, 20), axis_col=14.0)
-    run = engine.GpuPass(*(t.detach() for t in raw_of(g, device)), 1.0)
-    found = run.footprints(geometry, 0, 1e-9, 2.5)
-    image = run.render(found, geometry).cpu().numpy()
+    view = engine.GpuPass(*(t.detach() for t in raw_of(g, device)), 1.0).view(geometry, 0, 1e-9, 2.5)
+    image = view.image.cpu().numpy()
     rows, cols = np.abs(np.arange(17) - (8 - 3.1)) <= 2.5 * 1.4, np.abs(np.arange(20) - 16.3) <= 2.5 * 1.4
     np.testing.assert_array_equal(image > 0, rows[:, None] & cols[None, :])
-    assert found.boxes.tolist() == [[rows.argmax(), 17 - rows[::-1].argmax(), cols.argmax(), 20 - cols[::-1].argmax()]]
+    assert view.footprints.boxes.tolist() == [
+        [rows.argmax(), 17 - rows[::-1].argmax(), cols.argmax(), 20 - cols[::-1].argmax()]
+    ]
 
 
 def test_the_backward_pass_is_the_adjoint_where_footprints_are_cut(
@@ -256,15 +271,16 @@ def test_a_long_list_is_shared_out_and_sums_to_the_same(device: torch.device) ->
     g = Gaussians.from_physical(rng.uniform(-3, 3, (90, 3)), rng.uniform(0.8, 2, (90, 3)), rng.uniform(0.2, 1, 90))
     geometry, grid = Geometry.parallel([0.5], (7, 8)), Grid((4, 5, 6))
     run = engine.GpuPass(*(t.detach() for t in raw_of(g, device)), g.density_unit)
-    found, placed = run.footprints(geometry, 0, *WHOLE), run.place(grid, *WHOLE)
-    assert tiles.tile_lists(found.boxes, (7, 8), 8).shares > 1
-    assert tiles.tile_lists(torch.zeros_like(found.boxes), (7, 8), 8).shares == 1
+    view, box = run.view(geometry, 0, *WHOLE), run.box(grid, *WHOLE)
+    boxes = view.footprints.boxes
+    assert tiles.tile_lists(boxes, (7, 8), 8).shares > 1
+    assert tiles.tile_lists(torch.zeros_like(boxes), (7, 8), 8).shares == 1
     double = in_double(g)
     expected = twin_view(double, geometry, 0).detach()
-    np.testing.assert_allclose(run.render(found, geometry).cpu(), expected, rtol=2e-6)
+    np.testing.assert_allclose(view.image.cpu(), expected, rtol=2e-6)
     z, y, x = (torch.from_numpy(axis) for axis in grid.coordinates())
     volume = reference.voxelize(double.means, double.scales, double.quaternions, double.densities, (z, y, x)).detach()
-    np.testing.assert_allclose(run.fill(placed).cpu(), volume, rtol=2e-6)
+    np.testing.assert_allclose(box.density.cpu(), volume, rtol=2e-6)
 
 
 def test_activations_and_gradients_equal_torch(rng: np.random.Generator, device: torch.device) -> None:
@@ -346,15 +362,13 @@ def _step(backend: Backend, state: fit.FitState, problem: fit.Problem, settings:
     run = backend.begin(*(backend.array(state.parameters[name]) for name in fit.NAMES), unit)
     loss = backend.projection_loss(problem.geometry.detector_shape, settings.ssim_weight)
     target = backend.array(problem.images[0])
-    found = run.footprints(problem.geometry, 0, cut.faint, cut.sigmas)
-    image = run.render(found, problem.geometry)
-    value, slope = loss(image, target, loss.target_maps(target))
-    centres = run.render_backward(found, problem.geometry, 0, slope)
-    placed = run.place(box, cut.faint / half, cut.sigmas)
-    rough, slope = backend.total_variation(run.fill(placed) * half, settings.tv_weight)
-    run.fill_backward(placed, slope * half, means_too=settings.tv_moves)
-    found = [backend.numpy(a) for a in (image, centres, *run.gradients())]
-    return float(value) + float(rough), *found
+    view = run.view(problem.geometry, 0, cut.faint, cut.sigmas)
+    value, slope = loss(view.image, target, loss.target_maps(target))
+    centres = view.backward(slope)
+    part = run.box(box, cut.faint / half, cut.sigmas)
+    rough, slope = backend.total_variation(part.density * half, settings.tv_weight)
+    part.backward(slope * half, means_too=settings.tv_moves)
+    return float(value) + float(rough), *(backend.numpy(a) for a in (view.image, centres, *run.gradients()))
 
 
 def test_a_step_of_a_fit_is_the_same_on_both_backends(random_gaussians: Make) -> None:
