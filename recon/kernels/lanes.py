@@ -53,6 +53,11 @@ def _as_lanes(builder: Any, kind: Any, value: Any) -> Any:
     return _broadcast(builder, value if kind == types.float32 else builder.fptrunc(value, _F32))
 
 
+def _vector_function(builder: Any, name: str, arity: int) -> Any:
+    kind = ir.FunctionType(_VF, [_VF] * arity)
+    return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32")
+
+
 def _binary(instruction: str) -> Any:
     @intrinsic
     def call(typing_context, x, y):  # type: ignore[no-untyped-def]
@@ -157,6 +162,28 @@ def sign(typing_context, lanes):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def root(typing_context, lanes):  # type: ignore[no-untyped-def]
+    """The square root a lane."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.call(_vector_function(builder, "sqrt", 1), args, fastmath=_FAST)
+
+    return LANES(LANES), code
+
+
+@intrinsic
+def clamp(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
+    """min(max(x, low), high) a lane, with float32 bounds."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        value, low, high = args[0], _broadcast(builder, args[1]), _broadcast(builder, args[2])
+        value = builder.call(_vector_function(builder, "maxnum", 2), [value, low], fastmath=_FAST)
+        return builder.call(_vector_function(builder, "minnum", 2), [value, high], fastmath=_FAST)
+
+    return LANES(LANES, types.float32, types.float32), code
+
+
+@intrinsic
 def total(typing_context, lanes):  # type: ignore[no-untyped-def]
     """The sum of the lanes."""
 
@@ -200,21 +227,39 @@ def totals(typing_context, vectors):  # type: ignore[no-untyped-def]
     return LANES(vectors), code
 
 
+def _first(builder: Any, count: Any) -> Any:
+    """A mask of the lanes below `count`."""
+    count = _broadcast(builder, builder.trunc(count, _I32), _VI)
+    return builder.icmp_signed("<", ir.Constant(_VI, list(range(WIDTH))), count)
+
+
 @intrinsic
-def store_first(typing_context, array, row, lanes, count):  # type: ignore[no-untyped-def]
-    """array[row, :count] = the first lanes."""
+def load_first(typing_context, array, row, col, count):  # type: ignore[no-untyped-def]
+    """array[row, col:col + count] and zeros; no memory past that is touched."""
 
     def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        numbers, pointer = ir.Constant(_VI, list(range(WIDTH))), _VF.as_pointer()
-        count = _broadcast(builder, builder.trunc(args[3], _I32), _VI)
-        mask = builder.icmp_signed("<", numbers, count)
+        mask, pointer = _first(builder, args[3]), _VF.as_pointer()
+        kind = ir.FunctionType(_VF, [pointer, _I32, mask.type, _VF])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v16f32.p0")
+        address = _address(context, builder, signature.args[0], *args[:3])
+        return builder.call(function, [address, ir.Constant(_I32, 4), mask, _constant(0.0)])
+
+    return LANES(array, types.intp, types.intp, types.intp), code
+
+
+@intrinsic
+def store_first(typing_context, array, row, col, lanes, count):  # type: ignore[no-untyped-def]
+    """array[row, col:col + count] = the first lanes."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        mask, pointer = _first(builder, args[4]), _VF.as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [_VF, pointer, _I32, mask.type])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.store.v16f32.p0")
-        address = _address(context, builder, signature.args[0], args[0], args[1], ir.Constant(args[1].type, 0))
-        builder.call(function, [args[2], address, ir.Constant(_I32, 4), mask])
+        address = _address(context, builder, signature.args[0], *args[:3])
+        builder.call(function, [args[3], address, ir.Constant(_I32, 4), mask])
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, LANES, types.intp), code
+    return types.void(array, types.intp, types.intp, LANES, types.intp), code
 
 
 @intrinsic
@@ -231,14 +276,10 @@ def exp(typing_context, lanes):  # type: ignore[no-untyped-def]
         def add(x, y):  # type: ignore[no-untyped-def]
             return builder.fadd(x, y, flags=_FAST)
 
-        def vector_function(name, arity):  # type: ignore[no-untyped-def]
-            kind = ir.FunctionType(_VF, [_VF] * arity)
-            return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32")
-
         t = multiply(args[0], _constant(1.4426950408889634))
-        t = builder.call(vector_function("maxnum", 2), [t, _constant(-126.0)], fastmath=_FAST)
-        t = builder.call(vector_function("minnum", 2), [t, _constant(126.0)], fastmath=_FAST)
-        whole = builder.call(vector_function("rint", 1), [t])
+        t = builder.call(_vector_function(builder, "maxnum", 2), [t, _constant(-126.0)], fastmath=_FAST)
+        t = builder.call(_vector_function(builder, "minnum", 2), [t, _constant(126.0)], fastmath=_FAST)
+        whole = builder.call(_vector_function(builder, "rint", 1), [t])
         fraction = builder.fsub(t, whole, flags=_FAST)
         power = _constant(_EXP2[0])
         for coefficient in _EXP2[1:]:

@@ -122,7 +122,7 @@ def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments):  # t
             across, rise = here * dx, here * dy
             m0, mx, my = m0 + here, mx + across, my + rise
             mxx, mxy, myy = mxx + across * dx, mxy + across * dy, myy + rise * dy
-    lanes.store_first(moments, i, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
+    lanes.store_first(moments, i, 0, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
 
 
 @njit(**OPTIONS)
@@ -206,7 +206,7 @@ def _moments(table: F32, gradient: F32, rows: int, cols: int, moments: F32) -> N
                 across = dx * s0
                 m0, mx, my = m0 + s0, mx + across, my + s1
                 mxx, mxy = mxx + dx * across, mxy + dx * s1
-            lanes.store_first(moments, i, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
+            lanes.store_first(moments, i, 0, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
         else:
             _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments)
 

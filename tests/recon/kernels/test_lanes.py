@@ -17,6 +17,8 @@ def _combine(a, b, out):  # type: ignore[no-untyped-def]
     lanes.store(out, 3, 0, lanes.iota() + lanes.zero())
     lanes.store(out, 4, 0, np.float32(2) / x)
     lanes.store(out, 5, 0, lanes.sign(y - y) + lanes.sign(x))
+    lanes.store(out, 6, 0, lanes.root(x * x))
+    lanes.store(out, 7, 0, lanes.clamp(x, np.float32(-0.5), np.float32(0.25)))
     return lanes.total(x)
 
 
@@ -28,7 +30,7 @@ def _exp(a, out):  # type: ignore[no-untyped-def]
 
 def test_arithmetic_loads_and_sums(rng: np.random.Generator) -> None:
     a, b = (rng.normal(size=(3, 20)).astype(np.float32) for _ in range(2))
-    out = np.zeros((6, 16), np.float32)
+    out = np.zeros((8, 16), np.float32)
     total = _combine(a, b, out)
     x, y = a[0, :16], b[1, 2:18]
     np.testing.assert_allclose(out[0], x + y, rtol=1e-6)
@@ -37,15 +39,17 @@ def test_arithmetic_loads_and_sums(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(out[3], np.arange(16))
     np.testing.assert_allclose(out[4], 2 / x, rtol=1e-6)
     np.testing.assert_array_equal(out[5], np.sign(x))
+    np.testing.assert_allclose(out[6], np.abs(x), rtol=1e-6)
+    np.testing.assert_array_equal(out[7], np.clip(x, -0.5, 0.25))
     assert abs(total - x.astype(np.float64).sum()) < 1e-5
 
 
 @njit(fastmath=True)
 def _totals(a, out):  # type: ignore[no-untyped-def]
     one, two, three = lanes.load(a, 0, 0), lanes.load(a, 1, 0), lanes.load(a, 2, 0)
-    lanes.store_first(out, 0, lanes.totals((one, two, three)), 3)
-    lanes.store_first(out, 1, lanes.totals((one, two, three, one, two, three, one)), 7)
-    lanes.store_first(out, 2, lanes.totals((two,)), 1)
+    lanes.store_first(out, 0, 0, lanes.totals((one, two, three)), 3)
+    lanes.store_first(out, 1, 0, lanes.totals((one, two, three, one, two, three, one)), 7)
+    lanes.store_first(out, 2, 0, lanes.totals((two,)), 1)
 
 
 @njit(fastmath=True)
@@ -60,6 +64,21 @@ def test_totals_of_several_come_in_their_order_and_touch_no_more(rng: np.random.
     np.testing.assert_allclose(out[0], [*sums, *[7] * 13], atol=1e-5)
     np.testing.assert_allclose(out[1], [*sums, *sums, sums[0], *[7] * 9], atol=1e-5)
     np.testing.assert_allclose(out[2], [sums[1], *[7] * 15], atol=1e-5)
+
+
+@njit(fastmath=True)
+def _copy_first(a, col, count, out):  # type: ignore[no-untyped-def]
+    lanes.store(out, 0, 0, lanes.load_first(a, 0, col, count))
+    lanes.store_first(out, 1, col, lanes.load(a, 0, 0), count)
+
+
+def test_a_part_is_loaded_and_stored_without_its_neighbours(rng: np.random.Generator) -> None:
+    a = rng.normal(size=(1, 16)).astype(np.float32)
+    for col, count in ((0, 16), (0, 0), (3, 5), (15, 1)):
+        out = np.full((2, 16), 7, np.float32)
+        _copy_first(a, col, count, out)
+        np.testing.assert_array_equal(out[0], [*a[0, col : col + count], *np.zeros(16 - count)])
+        np.testing.assert_array_equal(out[1], [*[7] * col, *a[0, :count], *[7] * (16 - col - count)])
 
 
 def test_between_keeps_a_range_of_lanes(rng: np.random.Generator) -> None:
