@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import recon
+from beamline.budget import within
 from beamline.deliver import Target, deliver
 from beamline.errors import DataError
 from beamline.events import Event, Sink
@@ -19,6 +20,8 @@ from beamline.storage.source import Quantity, ScanSource, open_scan
 from drivers.clock import Clock
 from recon.fbp import Filter
 from recon.fit import Progress
+from recon.initialise import default_count
+from recon.quality import PRESETS, Quality
 from recon.volume import Grid
 from recon.warm_up import warm_up
 
@@ -59,6 +62,8 @@ class ReconOptions:
         method: "r2" or "fbp".
         steps: of the fit; None takes the reconstructor's own number.
         seconds: at most, for the fit; for a followed scan, after its end.
+        budget: s for everything from line integrals to volume; chooses all settings of the fit.
+        quality: a preset instead of steps and Gaussians.
         gaussians: how many to start from; None derives it from the volume.
         filter: of the FBP.
         seed: of everything random.
@@ -73,6 +78,8 @@ class ReconOptions:
     method: Method = "r2"
     steps: int | None = None
     seconds: float | None = None
+    budget: float | None = None
+    quality: Quality | None = None
     gaussians: int | None = None
     filter: Filter = "hann"
     seed: int = 0
@@ -117,12 +124,18 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = 
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
         facts = facts_of(source)
         prepared = prepare(source, options.selection, warn)
-    grid = Grid.matching(prepared.geometry)
-    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning)
+    selection = options.selection
+    if wanted is not None:  # before the work, not after it
+        fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
     with stoppable() as stopped:
-        made = reconstruct(options, prepared, grid, sink, clock, stopped)
-    context = Context(facts, options.selection, options.command, options.seed, warn.said, started)
+        if options.budget is None:
+            made = reconstruct(options, prepared, Grid.matching(prepared.geometry), sink, clock, stopped)
+        else:
+            made, prepared, factor = spend(options, options.budget, prepared, sink, clock, stopped)
+            selection = replace(selection, binning=selection.binning * factor)
+    truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
+    context = Context(facts, selection, options.command, options.seed, warn.said, started)
     return deliver(made, prepared, truth, options.target, context, sink, clock)
 
 
@@ -144,16 +157,22 @@ def reconstruct(
     options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sink, clock: Clock, stopped: Callable[[], bool]
 ) -> Made:
     """Run the reconstructor on prepared views."""
+    steps, gaussians, said = options.steps, options.gaussians, ""
     if options.method == "r2":
         warm_up()  # so that the fit's time, and the time it says is left, hold no compilation
+    if options.quality is not None:
+        preset = PRESETS[options.quality]
+        steps = preset.steps
+        gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
+        said = f"{options.quality}: {steps} steps from {gaussians} Gaussians"
     try:
         result = recon.reconstruct(
             prepared.projections.data,
             prepared.geometry,
             grid,
             method=options.method,
-            steps=options.steps,
-            gaussians=options.gaussians,
+            steps=steps,
+            gaussians=gaussians,
             seed=options.seed,
             filter=options.filter,
             seconds=options.seconds,
@@ -170,7 +189,30 @@ def reconstruct(
         history=result.history,
         settings={**result.settings, **({"ended_early": True} if stopped() and options.method != "fbp" else {})},
         filter=options.filter,
+        chosen=said,
     )
+
+
+def spend(
+    options: ReconOptions, budget: float, prepared: Prepared, sink: Sink, clock: Clock, stopped: Callable[[], bool]
+) -> tuple[Made, Prepared, int]:
+    """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
+    warm_up()  # compilation happens once on a machine; no budget pays for it
+    try:
+        done = within(budget, prepared, options.seed, options.filter, clock.now, progress_events(sink, clock), stopped)
+    except ValueError as error:
+        raise DataError(f"{options.source.path} cannot be reconstructed: {error}") from error
+    early = {"ended_early": True} if stopped() and done.choice.method != "fbp" else {}
+    made = Made(
+        volume=done.result.volume,
+        method=done.choice.method,
+        seconds=done.seconds,
+        history=done.result.history,
+        settings={**done.result.settings, **done.settings(budget), **early},
+        filter=options.filter,
+        chosen=done.said(budget),
+    )
+    return made, done.prepared, done.choice.binning
 
 
 def progress_events(sink: Sink, clock: Clock) -> Callable[[Progress], None]:

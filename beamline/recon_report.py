@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from beamline.storage.source import ScanSource
 from drivers.frame import FrameKind
 from recon.fbp import Filter
 from recon.fit import Progress
+from recon.quality import NextDecibel, next_decibel, parts_of
 from recon.volume import Volume
 
 _HISTORY = ("step", "steps", "seconds", "loss", "residual", "n_gaussians", "n_views")
@@ -55,6 +57,7 @@ class Made:
         settings: every setting of the reconstructor, by name.
         filter: of the FBP (also of the one it is compared with).
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
+        chosen: what a budget or a preset chose, in a line; empty where the settings were given.
     """
 
     volume: Volume
@@ -64,6 +67,14 @@ class Made:
     settings: Mapping[str, Any]
     filter: Filter = "hann"
     psnr: Sequence[tuple[float, float]] = ()
+    chosen: str = ""
+
+    @property
+    def next_decibel(self) -> NextDecibel | None:
+        """What another dB would cost by the fit's own record; None for a direct method."""
+        if not self.history:
+            return None
+        return next_decibel([p.seconds for p in self.history], [p.residual for p in self.history])
 
 
 @dataclass(frozen=True)
@@ -122,6 +133,10 @@ def compose(
     )
     if "fbp" in metrics and made.method != "fbp":
         summary += f" (FBP of the same views: {formatted(best, metrics['fbp'][best])})"
+    if made.chosen:
+        summary += f". Chosen: {made.chosen}"
+    if made.next_decibel is not None:
+        summary += f". The next dB: {what_next(made.next_decibel)}"
     settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
@@ -147,6 +162,14 @@ def compose(
         command=context.command,
         footnotes=footnotes,
     )
+
+
+def what_next(found: NextDecibel) -> str:
+    """What another dB of the fit's residual would cost, in words."""
+    if not found.measurable:
+        return "none measurable from this fit's record"
+    high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
+    return f"about {parts_of(found.seconds)} more ({parts_of(found.low)} {high}), by this fit's own record"
 
 
 def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:

@@ -22,6 +22,7 @@ import recon
 from beamline.memory import peak_memory
 from beamline.trials import Trial, decibels
 from recon import metrics
+from recon.binning import bin_views
 from recon.fit import FitSettings
 from recon.geometry import Geometry
 from recon.operators import data_residual
@@ -165,16 +166,6 @@ def warm_up(trial: Trial) -> None:
     if trial.method == "r2":
         compile_fit()
     reconstruct(short, views, toy, Grid.matching(toy), None, 0, None)
-
-
-def bin_views(projections: F32, factor: int) -> F32:
-    """Means of factor x factor line integrals, [view, row, col]; trailing pixels that fill no bin go."""
-    if factor == 1:
-        return projections
-    n, rows, cols = projections.shape
-    rows, cols = rows // factor, cols // factor
-    kept = projections[:, : rows * factor, : cols * factor]
-    return kept.reshape(n, rows, factor, cols, factor).mean(axis=(2, 4), dtype=np.float32)
 
 
 def on_grid(volume: Volume, grid: Grid) -> Volume:

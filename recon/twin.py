@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from recon.binning import bin_views
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import place
@@ -28,9 +29,7 @@ def small_crop(projections: NDArray[np.float32], geometry: Geometry) -> tuple[ND
     first = (geometry.detector_shape[0] - rows) // 2
     views = np.unique(np.linspace(0, geometry.n_views - 1, min(_VIEWS, geometry.n_views)).round().astype(int))
     coarse = geometry.select(views).rows(first, first + rows).binned(factor)
-    n_rows, n_cols = coarse.detector_shape
-    part = projections[views, first : first + rows, : n_cols * factor]
-    return part.reshape(len(views), n_rows, factor, n_cols, factor).mean(axis=(2, 4), dtype=np.float32), coarse
+    return bin_views(projections[views, first : first + rows], factor), coarse
 
 
 def compare(

@@ -15,6 +15,9 @@ def results(data: Mapping[str, Any]) -> str:
         lines.append(f"{'report':<10}{data['report']}")
     lines.append(f"{'volume':<10}{' x '.join(str(n) for n in data['shape'])} in {data['units']}")
     lines.append(f"{'axis_col':<10}{data['axis_col']:.2f}")
+    for name, key in (("chosen", "chosen"), ("next dB", "next_db_said")):
+        if key in data:
+            lines.append(f"{name:<10}{data[key]}")
     columns = {str(data["method"]): data}
     if "fbp" in data:
         columns["fbp"] = data["fbp"]

@@ -21,6 +21,17 @@ from beamline.offline import Method, ReconOptions, run
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock
 from recon.fbp import Filter
+from recon.quality import PRESETS, Quality, parse_budget
+
+
+def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
+    """A time such as 30s, 2m or 1h, in s."""
+    if value is None:
+        return None
+    try:
+        return parse_budget(value)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
@@ -46,6 +57,17 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     "--seconds",
     type=click.FloatRange(min=0, min_open=True),
     help="Time for the fit (r2), instead of --steps; with --follow, after the scan has ended.",
+)
+@click.option(
+    "--budget",
+    callback=time_given,
+    metavar="30s|2m|1h",
+    help="Time from line integrals to volume; chooses method, Gaussians, steps and binning, and ends in time.",
+)
+@click.option(
+    "--quality",
+    type=click.Choice(list(PRESETS)),
+    help="A preset of steps and Gaussians, instead of naming them.",
 )
 @click.option("--gaussians", type=click.IntRange(min=1), help="How many to start from (r2).")
 @click.option(
@@ -80,6 +102,8 @@ def recon(
     method: Method,
     steps: int | None,
     seconds: float | None,
+    budget: float | None,
+    quality: Quality | None,
     gaussians: int | None,
     ramp: Filter,
     max_residual: float | None,
@@ -102,6 +126,7 @@ def recon(
         raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
     if method != "r2" and any(value is not None for value in (steps, seconds, gaussians)):
         raise click.UsageError(f"--steps, --seconds and --gaussians are of the r2 fit; {method} has none.")
+    refuse_contradictions(method, follow, {"--budget": budget, "--quality": quality}, steps, seconds, gaussians)
     output = output or Path(f"{file.stem}_{method}.h5")
     source, selection = chosen(file, seed, said)
     options = ReconOptions(
@@ -111,6 +136,8 @@ def recon(
         method=method,
         steps=steps,
         seconds=seconds,
+        budget=budget,
+        quality=quality,
         gaussians=gaussians,
         filter=ramp,
         seed=seed,
@@ -129,6 +156,30 @@ def recon(
         raise ScanStopped(f"The fit was ended early; {output} holds the volume as it then was.")
     if max_residual is not None:
         require(metrics, max_residual)
+
+
+def refuse_contradictions(
+    method: str,
+    follow: bool,
+    plans: Mapping[str, object | None],
+    steps: int | None,
+    seconds: float | None,
+    gaussians: int | None,
+) -> None:
+    """Raises UsageError where `plans` (--budget, --quality) would choose what was also given."""
+    wanted = [name for name, value in plans.items() if value is not None]
+    if not wanted:
+        return
+    given = {"--steps": steps, "--seconds": seconds, "--gaussians": gaussians}
+    others = [*wanted[1:], *(name for name, value in given.items() if value is not None)]
+    if others:
+        raise click.UsageError(
+            f"{wanted[0]} and {others[0]} exclude each other: {wanted[0]} chooses what the other says."
+        )
+    if method != "r2":
+        raise click.UsageError(f"{wanted[0]} chooses settings of the r2 fit; it does not go with --method {method}.")
+    if follow:
+        raise click.UsageError(f"{wanted[0]} is for a finished scan; with --follow give --seconds.")
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:

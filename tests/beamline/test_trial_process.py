@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.trial_process import Data, bin_views, main, on_grid, run
+from beamline.trial_process import Data, main, on_grid, run
 from beamline.trials import Trial
 from recon.fbp import fbp
 from recon.geometry import Geometry
@@ -91,10 +91,7 @@ def test_the_two_precisions(data: Data) -> None:
     assert found["seconds"] == found["details"]["seconds_float32"]
 
 
-def test_joined_pixels_are_means_and_a_volume_of_them_lies_where_it_did() -> None:
-    views = np.arange(2 * 5 * 6, dtype=np.float32).reshape(2, 5, 6)
-    np.testing.assert_allclose(bin_views(views, 2)[1, 0], views[1, :2].reshape(2, 3, 2).mean(axis=(0, 2)))
-    assert bin_views(views, 2).shape == (2, 2, 3)
+def test_a_volume_of_joined_pixels_lies_where_the_fine_one_does() -> None:
     fine = Geometry.parallel([0.0], (8, 12), 0.5)
     coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)
 

@@ -124,6 +124,11 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "air misspelt": ({}, ["--air", "some"], 2, "LEFT,RIGHT"),
     "air too wide": ({}, ["--air", "30,30"], 5, "40 columns"),
     "two budgets": ({}, ["--steps", "5", "--seconds", "5"], 2, "exclude"),
+    "budget and steps": ({}, ["--budget", "30s", "--steps", "5"], 2, "exclude"),
+    "budget and quality": ({}, ["--budget", "30s", "--quality", "best"], 2, "exclude"),
+    "quality and Gaussians": ({}, ["--quality", "best", "--gaussians", "5"], 2, "exclude"),
+    "budget misspelt": ({}, ["--budget", "soon"], 2, "such as 30s"),
+    "quality misspelt": ({}, ["--quality", "superb"], 2, "preview"),
     "truth missing": ({}, ["--truth", "truth.npz"], 2, "truth.npz"),
     "truth of another shape": ({}, ["--truth", "scan.npy"], 2, "shape"),
     "of the other method": ({}, ["--gaussians", "5"], 2, "r2"),
@@ -144,7 +149,9 @@ def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str,
     write_exchange(folder / "scan.h5", SCAN, changes)
     np.save(folder / "scan.npy", np.arange(8.0).reshape(2, 2, 2))
     before = _left(folder)
-    result = _beamline("recon", "scan.h5", "-m", method, *options)
+    # A budget and a preset are of the fit, whose settings they choose.
+    chosen = [] if {"--budget", "--quality"} & set(options) else ["-m", method]
+    result = _beamline("recon", "scan.h5", *chosen, *options)
     assert result.exit_code == code, result.output
     assert result.stdout == ""
     assert said in result.stderr
@@ -273,6 +280,23 @@ def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path,
     assert _left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html"}
     assert json.loads(result.stdout.splitlines()[-1])["event"] == "done"
     assert ("views held out" in result.stderr) is (code == 6)
+
+
+def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> None:
+    result = _beamline("recon", "scan.h5", "--axis", "20.7", "--budget", "1.5s", "--no-report")
+    assert result.exit_code == 0, result.output
+    lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines() if line.startswith("chosen"))
+    assert lines["chosen"].startswith("r2, ") and "of 1.5 s" in lines["chosen"]
+    assert any(line.startswith("next dB   ") for line in result.stdout.splitlines())
+    parameters = read_reconstruction(folder / "scan_r2.h5").parameters
+    assert parameters["budget"] == 1.5 and parameters["chosen_method"] == "r2"
+
+
+@pytest.mark.parametrize("options", [["-m", "fbp"], ["--follow"]])
+def test_budgets_are_of_finished_scans_and_the_fit(folder: Path, options: list[str]) -> None:
+    result = _beamline("recon", "scan.h5", "--budget", "1m", *options)
+    assert result.exit_code == 2
+    assert "--budget" in result.stderr and _left(folder) == {"scan.h5"}
 
 
 def test_names() -> None:

@@ -1,0 +1,124 @@
+"""How fast this machine is on this very scan: a second or so of small runs, scaled to the whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.binning import bin_views
+from recon.fbp import fbp
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.initialise import MATTER, default_count, density_unit, sample_gaussians
+from recon.quality import Speeds
+from recon.reconstruction import reconstruct
+from recon.splat import voxelize
+from recon.volume import Grid, Volume
+
+F32 = NDArray[np.float32]
+Clock = Callable[[], float]
+
+_SLAB_ROWS, _SLAB_VIEWS = 16, 16
+_COARSE_COLS, _COARSE_VIEWS = 64, 60
+_STEP_VIEWS, _STEPS = 4, 6
+
+
+def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
+    """Measure each part of a reconstruction on a part of the scan.
+
+    FBP, placing and filling on a slab of rows; the step on whole views, with the number of Gaussians that a fit would
+    start from, spread over what a coarse FBP shows as matter: how much they overlap decides how long a step takes.
+
+    Args:
+        projections: [view, row, col], line integrals.
+        geometry: of the views; a parallel beam.
+        grid: of the volume that is wanted.
+        now: a clock in s.
+
+    Raises:
+        ValueError: the scan holds no matter.
+    """
+    field = Grid.of_field(geometry, max(geometry.pixel_pitch, grid.voxel_size))
+    count = default_count(field)
+    slab, part = _slab(projections, geometry)
+    slices = Grid.matching(part)
+    whole = field.shape[0] / slices.shape[0]
+    views = geometry.n_views / part.n_views
+    fbp(slab, part, slices, "hann")  # threads wake up and pages come in
+    begin = now()
+    data = fbp(slab, part, slices, "hann")
+    fbp_seconds = (now() - begin) * whole * views
+
+    begin = now()
+    placed = sample_gaussians(
+        Volume(data, slices), max(1, round(count / whole)), np.random.default_rng(0), field_radius=_radius(geometry)
+    )
+    start_seconds = (now() - begin) * whole
+    voxelize(placed, slices)
+    begin = now()
+    voxelize(placed, slices)
+    fill_seconds = (now() - begin) * grid.shape[0] / slices.shape[0]
+
+    step_seconds, view_seconds = _step(projections, geometry, grid, _spread_out(projections, geometry, count), now)
+    # Placing scales its densities by a projection of twelve views, which is about a third of as many steps.
+    start_seconds += 4 * step_seconds + view_seconds * geometry.n_views
+    return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds)
+
+
+def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
+    """A few views of the rows with most in them."""
+    rows = geometry.detector_shape[0]
+    height = min(_SLAB_ROWS, rows)
+    views = _some(geometry.n_views, _SLAB_VIEWS)
+    weight = projections[views].sum(axis=(0, 2), dtype=np.float64)
+    sums = np.convolve(weight, np.ones(height), "valid")
+    first = int(np.argmax(sums))
+    return (
+        np.ascontiguousarray(projections[views, first : first + height]),
+        geometry.select(views).rows(first, first + height),
+    )
+
+
+def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
+    """So many Gaussians where a coarse FBP shows matter, as wide as placing makes them."""
+    factor = max(1, min(-(-geometry.detector_shape[1] // _COARSE_COLS), geometry.detector_shape[0]))
+    views = _some(geometry.n_views, _COARSE_VIEWS)
+    coarse = geometry.select(views).binned(factor)
+    grid = Grid.matching(coarse)
+    volume = Volume(np.maximum(fbp(bin_views(projections[views], factor), coarse, grid, "hann"), 0), grid)
+    unit = density_unit(volume)
+    cells = np.flatnonzero(volume.data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
+    if cells.size == 0:
+        raise ValueError("a coarse FBP shows no matter: are the projections line integrals (-log of the transmission)?")
+    rng = np.random.default_rng(0)
+    k, j, i = np.unravel_index(rng.choice(cells, count), grid.shape)
+    z, y, x = grid.coordinates()
+    means = np.stack((x[i], y[j], z[k]), 1) + (rng.random((count, 3)) - 0.5) * grid.spacing[::-1]
+    # Root mean square distance of a random point to its three nearest neighbours: 0.75 of a cell for one of them each.
+    distance = 0.75 * (cells.size * float(np.prod(grid.spacing)) / count) ** (1 / 3)
+    width = max(0.8 * distance, 0.5 * geometry.pixel_pitch)
+    return Gaussians.from_physical(means, np.full((count, 3), width), np.full(count, 0.5 * unit), density_unit=unit)
+
+
+def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians, now: Clock) -> tuple[float, float]:
+    """(s a step, s for each view before the first one): what a short fit's own record says."""
+    views = _some(geometry.n_views, _STEP_VIEWS)
+    point = Grid((1, 1, 1), grid.voxel_size)  # filling a volume is measured elsewhere
+    made = reconstruct(
+        np.ascontiguousarray(projections[views]), geometry.select(views), point, steps=_STEPS, gaussians=gaussians,
+        densify=False, now=now,
+    )  # fmt: skip
+    first, last = made.history[0], made.history[-1]
+    step = (last.seconds - first.seconds) / max(1, last.step - first.step)
+    return step, max(0.0, first.seconds - step) / len(views)
+
+
+def _some(n: int, most: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
+
+
+def _radius(geometry: Geometry) -> float:
+    cols, axis = geometry.detector_shape[1], geometry.axis_col
+    return max(axis + 0.5, cols - axis - 0.5) * geometry.pixel_pitch

@@ -1,0 +1,235 @@
+"""Quality for time: presets, the choice of settings for a budget, and what the next decibel would cost; pure values."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Quality = Literal["preview", "standard", "best"]
+
+_REACH = 10.0  # a curve is not followed further than to so many times the time it covers
+_POINTS = 24  # neighbours in a fit's record share their running mean, so that more are not more evidence
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Quality against steps of one kind of fit, measured by tests/bench/test_quality_curves.py.
+
+    Attributes:
+        binning: detector pixels joined a side.
+        share: Gaussians at the start over those that the volume would get by itself.
+        pace: time of a step over that of a step with binning 1 and share 1.
+        points: (steps, dB above the FBP of the unbinned views), steps rising.
+    """
+
+    binning: int
+    share: float
+    pace: float
+    points: tuple[tuple[int, float], ...]
+
+    def gain(self, steps: float) -> float:
+        """dB above FBP after so many steps, interpolated in their logarithm; -inf below the first point."""
+        if steps < self.points[0][0]:
+            return -math.inf
+        at, gains = zip(*self.points, strict=True)
+        return float(np.interp(math.log(steps), np.log(at), gains))
+
+
+# A slab of a measured walnut, 40 rows of 256 columns, 60 views.
+CURVES: tuple[Curve, ...] = (
+    Curve(1, 0.25, 0.4, ((60, -4.78), (125, -2.63), (250, -0.67), (500, 0.79), (1000, 2.21), (2000, 3.07))),
+    Curve(1, 0.5, 0.65, ((60, -3.46), (125, -1.06), (250, 0.61), (500, 1.79), (1000, 2.73), (2000, 3.21))),
+    Curve(1, 1.0, 1.0, ((60, -2.7), (125, -0.12), (250, 1.54), (500, 2.5), (1000, 3.09), (2000, 3.21))),
+)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What a word for quality stands for.
+
+    Attributes:
+        steps: of the fit.
+        share: Gaussians at the start over those that the volume would get by itself.
+    """
+
+    steps: int
+    share: float
+
+
+PRESETS: dict[Quality, Preset] = {
+    "preview": Preset(250, 0.5),
+    "standard": Preset(2000, 1.0),
+    "best": Preset(8000, 2.0),
+}
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """What this machine needs for this scan, in s; measured.
+
+    Attributes:
+        fbp: of the whole volume, unbinned.
+        start: of placing the Gaussians, FBP excluded, unbinned.
+        step: of the fit, unbinned, with as many Gaussians as the volume would get by itself.
+        fill: of the final volume, with the same.
+    """
+
+    fbp: float
+    start: float
+    step: float
+    fill: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to do with a budget.
+
+    Attributes:
+        method: "r2" or "fbp".
+        binning: detector pixels joined a side, on top of the selection's.
+        share: Gaussians at the start over those that the unbinned volume would get by itself; 0 for FBP.
+        steps: how many will fit in; 0 for FBP.
+        gain: dB above the FBP of the unbinned views that the measured curve promises.
+    """
+
+    method: Literal["r2", "fbp"]
+    binning: int
+    share: float
+    steps: int
+    gain: float
+
+
+def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
+    """The settings that promise most within `budget` seconds.
+
+    Each measured curve says what a kind of fit reaches in the steps that fit in; FBP, where it alone fits in, promises
+    0 dB. Where not even a FBP of binned views fits in, the smallest one is taken and will be late.
+
+    Args:
+        budget: s, for all of it: FBP, placing, fitting and filling the volume.
+        speeds: of this machine and scan.
+        largest_binning: that the detector allows.
+
+    Raises:
+        ValueError: for a budget that is not positive.
+    """
+    if not (math.isfinite(budget) and budget > 0):
+        raise ValueError(f"a budget is a positive time in s, got {budget}")
+    candidates: list[Choice] = []
+    for binning in (n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)):
+        # Halving the detail twice and more is below what was measured: each halving is taken to cost 3 dB, as between
+        # an FBP of all and one of joined pixels.
+        loss = 3.0 * math.log2(binning)
+        fbp = speeds.fbp / binning**3
+        if fbp <= budget:
+            candidates.append(Choice("fbp", binning, 0.0, 0, -loss))
+        for curve in CURVES:
+            if binning % curve.binning:
+                continue
+            further = binning // curve.binning
+            share, fixed = curve.share / further**3, fbp + speeds.start * curve.share / further**3
+            left = budget - fixed - speeds.fill * curve.share / further**3
+            steps = left / (speeds.step * curve.pace / further**2)
+            gain = curve.gain(steps) - 3.0 * math.log2(further)
+            if math.isfinite(gain):
+                candidates.append(Choice("r2", binning, share, int(steps), gain))
+    if not candidates:
+        return Choice("fbp", min(8, max(1, largest_binning)), 0.0, 0, -math.inf)
+    # Of equal promises the finer volume, then the fewer Gaussians.
+    return max(candidates, key=lambda c: (c.gain, -c.binning, -c.share))
+
+
+@dataclass(frozen=True)
+class NextDecibel:
+    """How long a fit would have to go on to gain another dB, from its own record.
+
+    Attributes:
+        seconds: more; infinite where the record shows no gain that could be told from its scatter, or where it lies
+            beyond ten times the time so far.
+        low, high: two standard errors of the slope to either side.
+    """
+
+    seconds: float
+    low: float
+    high: float
+
+    @property
+    def measurable(self) -> bool:
+        return math.isfinite(self.seconds)
+
+
+def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
+    """Extrapolate a fit's record of residual against time by one decibel.
+
+    In the second half of the time -20 log10 of the residual is fitted by a line in log t, which is how fits slow down.
+    The line is followed no further than to ten times the time so far. A longer fit would also lower its rates later, so
+    this is what that fit would need roughly, not a promise.
+
+    Args:
+        seconds: since the start of the reconstruction, rising.
+        residuals: of the same length; values that are not positive numbers are left out.
+    """
+    t, q = record(seconds, residuals)
+    none = NextDecibel(math.inf, math.inf, math.inf)
+    late = t >= 0.5 * t[-1] if t.size else np.zeros(0, bool)
+    t, q = t[late], q[late]
+    if t.size < 6:
+        return none
+    groups = np.array_split(np.arange(t.size), min(_POINTS, t.size // 2))
+    x = np.array([np.log(t[g]).mean() for g in groups])
+    y = np.array([q[g].mean() for g in groups])
+    if x.size < 3 or np.ptp(x) == 0:
+        return none
+    x -= x.mean()
+    slope = float(x @ y / (x @ x))  # dB for each factor of e in time
+    scatter = y - y.mean() - slope * x
+    error = math.sqrt(float(scatter @ scatter) / (x.size - 2) / float(x @ x))
+    # A record without scatter, of two dozen points: still no better known than that.
+    error = max(error, 1e-3 * abs(slope))
+    if slope <= 2 * error:
+        return none
+    end = float(t[-1])
+    middle, low, high = (_time_of(end, s) for s in (slope, slope + 2 * error, slope - 2 * error))
+    return NextDecibel(middle, low, high) if math.isfinite(middle) else none
+
+
+def _time_of(end: float, slope: float) -> float:
+    if slope <= 1 / math.log(_REACH):
+        return math.inf
+    return end * math.expm1(1 / slope)
+
+
+def record(seconds: ArrayLike, residuals: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(s, -20 log10 of the residual) of what is known of a fit's record."""
+    t, r = np.asarray(seconds, np.float64), np.asarray(residuals, np.float64)
+    known = np.isfinite(t) & (t > 0) & np.isfinite(r) & (r > 0)
+    return t[known], -20 * np.log10(r[known])
+
+
+def parse_budget(text: str) -> float:
+    """Seconds of "30s", "2m", "1.5h" or a bare number of seconds.
+
+    Raises:
+        ValueError: for anything else, and for a time that is not positive and finite.
+    """
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    said = text.strip()
+    unit = units.get(said[-1:].lower())
+    try:
+        seconds = float(said if unit is None else said[:-1]) * (unit or 1.0)
+    except ValueError:
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"{text!r} is not a time: expected a positive number with s, m or h, such as 30s, 2m or 1h")
+    return seconds
+
+
+def parts_of(seconds: float) -> str:
+    """A time as people read it."""
+    if seconds < 100:
+        return f"{seconds:.3g} s"
+    return f"{seconds / 60:.3g} min" if seconds < 6000 else f"{seconds / 3600:.3g} h"

@@ -1,0 +1,135 @@
+"""A budget is kept, on a clock that ticks at each look and on a real one; and what was chosen is told."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline import budget as module
+from beamline.budget import Budgeted, joined, within
+from beamline.deliver import Target
+from beamline.events import Event
+from beamline.offline import ReconOptions, SourceOptions, run
+from beamline.pipeline import Prepared, Selection, prepare
+from beamline.storage.recon_file import read_reconstruction
+from drivers.clock import SystemClock
+from recon.quality import Choice, Speeds
+from recon.volume import Grid
+from recon.warm_up import warm_up
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
+
+
+class Ticking:
+    """A clock by which every look takes as long."""
+
+    def __init__(self, tick: float) -> None:
+        self.time, self.tick = 100.0, tick
+
+    def __call__(self) -> float:
+        self.time += self.tick
+        return self.time
+
+
+@pytest.fixture
+def prepared(tmp_path: Path) -> Prepared:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        return prepare(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
+
+
+def _spend(prepared: Prepared, budget: float, now: Ticking) -> Budgeted:
+    return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False)
+
+
+@pytest.mark.parametrize("budget", [2.0, 5.0, 12.0])
+def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+    """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    done = _spend(prepared, budget, Ticking(0.01))
+    assert done.choice.method == "r2"
+    assert 0.9 * budget < done.seconds <= budget
+    assert done.result.volume.grid == Grid.matching(prepared.geometry)
+    assert f"of {budget:.3g} s" in done.said(budget)
+    assert done.settings(budget)["measured_step_s"] == 0.01
+
+
+def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    done = _spend(prepared, 5.0, Ticking(0.01))
+    assert (done.choice.method, done.choice.binning) == ("fbp", 2)
+    assert done.result.volume.grid.shape == (3, 20, 20)
+    assert "pixels joined 2 x 2" in done.said(5.0) and done.said(5.0).startswith("fbp")
+
+
+def test_joined_views_keep_their_scale_and_place(prepared: Prepared) -> None:
+    assert joined(prepared, 1) is prepared
+    half = joined(prepared, 2)
+    assert half.geometry.pixel_pitch == 2 * prepared.geometry.pixel_pitch
+    assert half.projections.data.shape == (24, 3, 20)
+    assert half.projections.data.mean() == pytest.approx(prepared.projections.data.mean(), rel=1e-5)
+    assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
+
+
+def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    monkeypatch.setattr(module, "choose", lambda *_: Choice("r2", 2, 1.0, 100, 1.0))
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        grid = Grid.matching(prepare(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
+    np.save(tmp_path / "truth.npy", SCAN.truth(grid))
+    options = ReconOptions(
+        SourceOptions(tmp_path / "scan.h5"), Target(tmp_path / "out.h5", tmp_path / "out.html"),
+        Selection(axis_col=SCAN.axis_col), budget=1.0, truth=str(tmp_path / "truth.npy"),
+    )  # fmt: skip
+    events: list[Event] = []
+    metrics = run(options, events.append, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.volume.grid.shape == (3, 20, 20)
+    assert (record.parameters["binning"], record.parameters["budget"]) == (2, 1.0)
+    assert metrics["psnr"] > 15
+    done = events[-1].data
+    assert "pixels joined 2 x 2" in done["chosen"]
+    assert {"seconds", "low", "high"} == set(done["next_db"])
+    page = (tmp_path / "out.html").read_text(encoding="utf-8")
+    assert done["chosen"] in page and "The next dB" in page
+
+
+def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    options = ReconOptions(
+        SourceOptions(tmp_path / "scan.h5"), Target(tmp_path / "out.h5", None), Selection(axis_col=SCAN.axis_col),
+        quality="preview",
+    )  # fmt: skip
+    events: list[Event] = []
+    run(options, events.append, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.parameters["steps"] == 250
+    assert events[-1].data["chosen"].startswith("preview: 250 steps from 1000 Gaussians")
+    assert "chosen" not in run_plain(options, tmp_path)
+
+
+def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
+    events: list[Event] = []
+    plain = replace(options, quality=None, steps=5, target=Target(tmp_path / "plain.h5", None))
+    run(plain, events.append, SystemClock())
+    return dict(events[-1].data)
+
+
+def test_a_real_budget_on_a_real_clock(prepared: Prepared) -> None:
+    """Four seconds, and a tenth of grace; a machine busy with other work may stop this process for a while."""
+    warm_up()
+    begin = time.perf_counter()
+    done = within(4.0, prepared, 0, "hann", time.perf_counter, lambda p: None, lambda: False)
+    took = time.perf_counter() - begin
+    assert done.choice.method == "r2"
+    assert 3.0 < took < 4.4
+    assert done.seconds == pytest.approx(took, abs=0.2)
+    assert done.result.history[-1].residual < 0.2
