@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from recon.geometry import Geometry
 from recon.kernels import reference
 from recon.kernels.activation import F32, activate, activation_backward
 from recon.kernels.footprints_cpu import HU, INEXACT, Camera, footprint_table, footprints, footprints_backward
-from recon.kernels.project_cpu import moments, render
+from recon.kernels.project_cpu import moments, render, render_layers
 from recon.kernels.rays_cpu import Rays
 from recon.kernels.voxelize_cpu import Layout
 from recon.volume import Grid
@@ -117,55 +117,67 @@ def camera(geometry: Geometry, view: int) -> Camera:
     return Camera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
 
 
-def view_table(
-    active: Active, geometry: Geometry, view: int, faint: float, sigmas: float, model: RayModel | None = None
-) -> F32:
-    """Footprints of all Gaussians in one view; `faint` in units of the image. What `model` wants exact is left out."""
+def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
+    """Footprints of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
     table = footprint_table(active.densities.shape[0])
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    length, exact_above = (0.0, math.inf) if model is None else (model.length(geometry), model.exact_above)
-    footprints(*parameters, camera(geometry, view), faint, sigmas, table, length=length, exact_above=exact_above)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table)
     return table
 
 
 def view_backward(
-    active: Active,
-    geometry: Geometry,
-    view: int,
-    table: F32,
-    gradient: F32,
-    into: Gradients,
-    centres: F32,
-    model: RayModel | None = None,
+    active: Active, geometry: Geometry, view: int, table: F32, gradient: F32, into: Gradients, centres: F32
 ) -> None:
     """Add one view's image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
     footprints_backward(
         table, moments(table, gradient), active.means, active.scales, active.rotations, active.densities,
         camera(geometry, view), into.means, into.log_scales, into.rotations, into.densities, centres,
-        length=0.0 if model is None else model.length(geometry),
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
+class Room:
+    """Memory that views of n Gaussians may share, one after the other: a step on 50k of them allocates several MB."""
+
+    table: F32
+    moments: F32
+    layers: F32
+
+    @classmethod
+    def of(cls, n: int, detector_shape: tuple[int, int]) -> Room:
+        return cls(footprint_table(n), np.empty((n, 6), np.float32), render_layers(*detector_shape))
+
+
+@dataclass(frozen=True, eq=False)
 class RenderedView:
-    """One view's image [row, col] with all that its backward pass needs."""
+    """One view's image [row, col] with all that its backward pass needs.
+
+    Attributes:
+        image: line integrals [row, col].
+        active: the Gaussians; neither they nor `room` may change before `backward`.
+        camera, length: the view, and what stands in for a ray's length in a Gaussian.
+        room: holds the table of footprints.
+        exact, rays: positions of the Gaussians that are integrated ray by ray, and their rays (None: there are none).
+    """
 
     image: F32
     active: Active
-    geometry: Geometry
-    view: int
-    model: RayModel
-    table: F32
+    camera: Camera
+    length: float
+    room: Room
     exact: NDArray[np.intp]
     rays: Rays | None
 
     def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
         """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
-        view_backward(self.active, self.geometry, self.view, self.table, gradient, into, centres, self.model)
+        a, table = self.active, self.room.table
+        footprints_backward(
+            table, moments(table, gradient, self.room.moments), a.means, a.scales, a.rotations, a.densities,
+            self.camera, into.means, into.log_scales, into.rotations, into.densities, centres, length=self.length,
+        )  # fmt: skip
         if self.rays is None:
             return
-        some = Gradients.zeros(self.exact.size)
-        moved = np.empty((self.exact.size, 2), np.float32)
+        some, moved = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
         self.rays.backward(gradient, some.means, some.log_scales, some.rotations, some.densities, moved)
         centres[self.exact] = moved
         into.means[self.exact] += some.means
@@ -181,21 +193,31 @@ def render_view(
     faint: float,
     sigmas: float,
     model: RayModel | None = None,
+    *,
     image: F32 | None = None,
+    room: Room | None = None,
 ) -> RenderedView:
-    """Line integrals of one view into `image` [row, col] (overwritten; None makes one); `faint` in its units."""
-    chosen = model or RayModel()
-    picture = np.empty(geometry.detector_shape, np.float32) if image is None else image
-    table = view_table(active, geometry, view, faint, sigmas, chosen)
-    render(table, picture)
+    """Line integrals of one view into `image` [row, col] (overwritten; None makes one); `faint` in its units.
+
+    `room` is overwritten, too: a view that shares it has to be done with before the next one.
+    """
+    chosen, shape, a = model or RayModel(), geometry.detector_shape, active
+    picture = np.empty(shape, np.float32) if image is None else image
+    space = Room.of(len(a.densities), shape) if room is None else room
+    seen, length = camera(geometry, view), chosen.length(geometry)
+    footprints(
+        a.means, a.scales, a.rotations, a.densities, seen, faint, sigmas, space.table,
+        length=length, exact_above=chosen.exact_above,
+    )  # fmt: skip
+    render(space.table, picture, space.layers)
     exact, rays = np.empty(0, np.intp), None
     if geometry.is_cone and chosen.exact_above < math.inf:
-        exact = np.flatnonzero(table[:, HU] == INEXACT)
+        exact = np.flatnonzero(space.table[:, HU] == INEXACT)
     if exact.size:
-        some = (active.means[exact], active.scales[exact], active.rotations[exact], active.densities[exact])
-        rays = Rays(*some, camera(geometry, view), geometry.detector_shape, faint, sigmas)
+        some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
+        rays = Rays(*some, seen, shape, faint, sigmas)
         rays.add_to(picture)
-    return RenderedView(picture, active, geometry, view, chosen, table, exact, rays)
+    return RenderedView(picture, active, seen, length, space, exact, rays)
 
 
 class _Project(torch.autograd.Function):
@@ -207,10 +229,12 @@ class _Project(torch.autograd.Function):
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
         faint = truncation.faint * unit * geometry.sample_pitch * geometry.detector_shape[1]
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
-        views = [
-            render_view(active, geometry, view, faint, truncation.sigmas, model, image)
-            for view, image in enumerate(images)
-        ]
+        shared, views = Room.of(len(active.densities), geometry.detector_shape), []
+        for view, image in enumerate(images):  # each keeps its own table until it goes back
+            room = replace(shared, table=footprint_table(len(active.densities)))
+            views.append(
+                render_view(active, geometry, view, faint, truncation.sigmas, model, image=image, room=room)
+            )  # fmt: skip
         ctx.state = (_array(quaternions), _array(raw), unit, views)
         return torch.from_numpy(images)
 
@@ -248,7 +272,16 @@ def _array(tensor: Tensor) -> F32:
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
-    """Where Gaussians fall on a grid; `faint` is a density."""
+    """Where Gaussians fall on a grid; `faint` is a density.
+
+    Raises:
+        ValueError: for a grid whose voxels are no cubes: the kernel has one edge for all axes.
+    """
+    if grid.spacing[0] != grid.voxel_size:
+        raise ValueError(
+            f"Gaussians fill cubic voxels only, this grid's are {grid.spacing} mm (z, y, x); "
+            "leave out slice_pitch, or use the reference kernel"
+        )
     z, y, x = (float(axis[0]) for axis in grid.coordinates())
     parameters = (active.means, active.scales, active.rotations, active.densities)
     return Layout(*parameters, (x, y, z), grid.voxel_size, grid.shape, faint, sigmas)

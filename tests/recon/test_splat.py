@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.splat import Active, RayModel, Truncation, project, render_view, voxelize
+from recon.splat import Active, Gradients, RayModel, Room, Truncation, project, render_view, voxelize
 from recon.volume import Grid
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
@@ -142,6 +142,33 @@ def test_projection_is_linear_in_density_and_its_adjoint_is_the_density_gradient
     left = float((image.detach().double() * y).sum())
     right = float((g.densities.detach().double() * back).sum())
     assert left == pytest.approx(right, rel=3e-5)
+
+
+def test_views_that_share_memory_give_what_views_of_their_own_give(
+    random_gaussians: Make, rng: np.random.Generator
+) -> None:
+    views, model = PATHS["cone, some exact"]
+    a = random_gaussians().arrays()
+    active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], 0.7)
+    room, y = Room.of(40, SHAPE), rng.normal(size=SHAPE).astype(np.float32)
+    for view in range(views.n_views):
+        found = []
+        for space in (room, None):
+            into, centres = Gradients.zeros(40), np.empty((40, 2), np.float32)
+            seen = render_view(active, views, view, 1e-6, 3.5, model, room=space)
+            seen.backward(y, into, centres)
+            found.append((seen.image, into.means, into.log_scales, into.rotations, into.densities, centres))
+        for shared, own in zip(*found, strict=True):
+            np.testing.assert_array_equal(shared, own)
+
+
+def test_voxels_that_are_no_cubes_are_refused_by_the_kernel_and_filled_by_the_twin(random_gaussians: Make) -> None:
+    g, grid = random_gaussians(3), Grid((4, 5, 6), 0.5, slice_pitch=1.0)
+    with pytest.raises(ValueError, match="cubic"):
+        voxelize(g, grid)
+    whole = voxelize(g, Grid((8, 5, 6), 0.5), kernel="reference")
+    centres = voxelize(g, Grid((3, 5, 6), 0.5, slice_pitch=1.0, centre=(-0.25, 0.0, 0.0)), kernel="reference")
+    torch.testing.assert_close(centres, whole[[1, 3, 5]])
 
 
 def test_a_sub_volume_is_the_cut_out_of_the_volume(random_gaussians: Make) -> None:
