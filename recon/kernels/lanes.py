@@ -184,6 +184,16 @@ def clamp(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def lowest(typing_context, lanes):  # type: ignore[no-untyped-def]
+    """Lane 0."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.extract_element(args[0], ir.Constant(_I32, 0))
+
+    return types.float32(LANES), code
+
+
+@intrinsic
 def total(typing_context, lanes):  # type: ignore[no-untyped-def]
     """The sum of the lanes."""
 

@@ -125,31 +125,69 @@ def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments):  # t
     lanes.store_first(moments, i, 0, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
 
 
+@njit(inline="always", fastmath=True)
+def add_footprint(table, i, rows, cols, image):  # type: ignore[no-untyped-def]
+    """Add footprint i to an image of rows x cols in an array of its `padded_shape`."""
+    height, width = image.shape
+    row0, row1, col0, col1 = _box(table, i, rows, cols, height)
+    weight = table[i, W]
+    if _is_smooth(table, i, row0):
+        for start in range(col0, col1, lanes.WIDTH):
+            first = min(start, width - lanes.WIDTH)
+            dx = lanes.iota() + (_f(first) - table[i, U])
+            for anchor in range(row0, row1, ANCHOR):
+                value, factor, change = _start(table, i, dx, _f(anchor) - table[i, V])
+                value = lanes.between(value * weight, start - first, col1 - first)
+                for group in range(anchor, min(row1, anchor + ANCHOR), GROUP):
+                    for step in range(GROUP):
+                        row = group + step
+                        lanes.store(image, row, first, lanes.load(image, row, first) + value)
+                        value = value * factor
+                        factor = factor * change
+    else:
+        _add_by_pixels(table, i, row0, row1, col0, col1, image)
+
+
+@njit(inline="always", fastmath=True)
+def gather_footprint(table, i, rows, cols, gradient, moments):  # type: ignore[no-untyped-def]
+    """Fill moments [i] of a gradient of rows x cols in an array of its `padded_shape`, with G of weight 1."""
+    height, width = gradient.shape
+    row0, row1, col0, col1 = _box(table, i, rows, cols, height)
+    if _is_smooth(table, i, row0):
+        m0, mx, my = lanes.zero(), lanes.zero(), lanes.zero()
+        mxx, mxy, myy = lanes.zero(), lanes.zero(), lanes.zero()
+        for start in range(col0, col1, lanes.WIDTH):
+            first = min(start, width - lanes.WIDTH)
+            dx = lanes.iota() + (_f(first) - table[i, U])
+            s0, s1 = lanes.zero(), lanes.zero()
+            for anchor in range(row0, row1, ANCHOR):
+                value, factor, change = _start(table, i, dx, _f(anchor) - table[i, V])
+                value = lanes.between(value, start - first, col1 - first)
+                for group in range(anchor, min(row1, anchor + ANCHOR), GROUP):
+                    dy = _f(group) - table[i, V]
+                    for step in range(GROUP):
+                        here = lanes.load(gradient, group + step, first) * value
+                        rise = here * (dy + _f(step))
+                        s0, s1, myy = s0 + here, s1 + rise, myy + rise * (dy + _f(step))
+                        value = value * factor
+                        factor = factor * change
+            across = dx * s0
+            m0, mx, my = m0 + s0, mx + across, my + s1
+            mxx, mxy = mxx + dx * across, mxy + dx * s1
+        lanes.store_first(moments, i, 0, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
+    else:
+        _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments)
+
+
 @njit(**OPTIONS)
 def _render(table: F32, rows: int, cols: int, layers: F32) -> None:
-    n, (threads, height, width) = table.shape[0], layers.shape
+    n, threads = table.shape[0], layers.shape[0]
     share = (n + threads - 1) // threads
     for t in prange(threads):
         image = layers[t]
         image[:] = _f(0)
         for i in range(t * share, min(n, (t + 1) * share)):
-            row0, row1, col0, col1 = _box(table, i, rows, cols, height)
-            weight = table[i, W]
-            if _is_smooth(table, i, row0):
-                for start in range(col0, col1, lanes.WIDTH):
-                    first = min(start, width - lanes.WIDTH)
-                    dx = lanes.iota() + (_f(first) - table[i, U])
-                    for anchor in range(row0, row1, ANCHOR):
-                        value, factor, change = _start(table, i, dx, _f(anchor) - table[i, V])
-                        value = lanes.between(value * weight, start - first, col1 - first)
-                        for group in range(anchor, min(row1, anchor + ANCHOR), GROUP):
-                            for step in range(GROUP):
-                                row = group + step
-                                lanes.store(image, row, first, lanes.load(image, row, first) + value)
-                                value = value * factor
-                                factor = factor * change
-            else:
-                _add_by_pixels(table, i, row0, row1, col0, col1, image)
+            add_footprint(table, i, rows, cols, image)
 
 
 @njit(**OPTIONS)
@@ -167,6 +205,17 @@ def padded_shape(rows: int, cols: int) -> tuple[int, int]:
     return -(-rows // GROUP) * GROUP, max(cols, lanes.WIDTH)
 
 
+def padded(images: F32) -> F32:
+    """Images [..., row, col] with zeros up to their `padded_shape`; what is C-contiguous and has it is not copied."""
+    rows, cols = images.shape[-2:]
+    shape = padded_shape(rows, cols)
+    if shape == (rows, cols):
+        return np.ascontiguousarray(images)
+    room = np.zeros((*images.shape[:-2], *shape), np.float32)
+    room[..., :rows, :cols] = images
+    return room
+
+
 def render_layers(rows: int, cols: int) -> F32:
     """Room for the private images of the threads, [thread, row, col]; one serves any number of renderings."""
     return np.empty((get_num_threads(), *padded_shape(rows, cols)), np.float32)
@@ -182,33 +231,8 @@ def render(table: F32, image: F32, layers: F32 | None = None) -> None:
 
 @njit(**OPTIONS)
 def _moments(table: F32, gradient: F32, rows: int, cols: int, moments: F32) -> None:
-    height, width = gradient.shape
     for i in prange(table.shape[0]):
-        row0, row1, col0, col1 = _box(table, i, rows, cols, height)
-        if _is_smooth(table, i, row0):
-            m0, mx, my = lanes.zero(), lanes.zero(), lanes.zero()
-            mxx, mxy, myy = lanes.zero(), lanes.zero(), lanes.zero()
-            for start in range(col0, col1, lanes.WIDTH):
-                first = min(start, width - lanes.WIDTH)
-                dx = lanes.iota() + (_f(first) - table[i, U])
-                s0, s1 = lanes.zero(), lanes.zero()
-                for anchor in range(row0, row1, ANCHOR):
-                    value, factor, change = _start(table, i, dx, _f(anchor) - table[i, V])
-                    value = lanes.between(value, start - first, col1 - first)
-                    for group in range(anchor, min(row1, anchor + ANCHOR), GROUP):
-                        dy = _f(group) - table[i, V]
-                        for step in range(GROUP):
-                            here = lanes.load(gradient, group + step, first) * value
-                            rise = here * (dy + _f(step))
-                            s0, s1, myy = s0 + here, s1 + rise, myy + rise * (dy + _f(step))
-                            value = value * factor
-                            factor = factor * change
-                across = dx * s0
-                m0, mx, my = m0 + s0, mx + across, my + s1
-                mxx, mxy = mxx + dx * across, mxy + dx * s1
-            lanes.store_first(moments, i, 0, lanes.totals((m0, mx, my, mxx, mxy, myy)), 6)
-        else:
-            _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments)
+        gather_footprint(table, i, rows, cols, gradient, moments)
 
 
 def moments(table: F32, gradient: F32, result: F32 | None = None) -> F32:
@@ -217,11 +241,6 @@ def moments(table: F32, gradient: F32, result: F32 | None = None) -> F32:
     A C-contiguous gradient whose shape is its own `padded_shape` is read where it lies, any other is copied.
     """
     rows, cols = gradient.shape
-    height, width = padded_shape(rows, cols)
-    room = np.ascontiguousarray(gradient)
-    if (height, width) != (rows, cols):
-        room = np.zeros((height, width), np.float32)
-        room[:rows, :cols] = gradient
     found = np.empty((table.shape[0], 6), np.float32) if result is None else result
-    _moments(table, room, rows, cols, found)
+    _moments(table, padded(gradient), rows, cols, found)
     return found

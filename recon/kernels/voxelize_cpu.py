@@ -1,8 +1,16 @@
-"""Voxelisation of Gaussians on the CPU: any box of voxels, sixteen lanes along x, ten-moment backward.
+"""Voxelisation of Gaussians on the CPU: any box, each slice of a Gaussian drawn as a footprint (numba, threaded).
 
-With H = S⁻¹ Rᵀ the exponent is -1/2 |H δ|². Its gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G δ, N₂ = Σ g G δδᵀ:
+With the rows a, b, c (x, y, z) of R S in voxels, the exponent is a sum of squares without any subtraction of them:
 
-    ∂ρ = N₀,   ∂p = ρ HᵀH N₁,   ∂H = -ρ H N₂
+    -2 E = k (δx - s δy - t δz)² + l (δy - r δz)² + δz² / Σzz
+    Σzz = |c|²    l = Σzz / |b x c|²    k = |b x c|² / (s₁ s₂ s₃)²    r = b·c / Σzz    s = (a x c)·(b x c) / |b x c|²
+
+At one δz this is a footprint in (x, y) whose centre has moved by δz (a·c, b·c) / Σzz, as `project_cpu` draws it.
+
+The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G δ, N₂ = Σ g G δδᵀ, put together from each slice's moments; with
+H = S⁻¹ Rᵀ per voxel the exponent is -1/2 |H δ|², and
+
+    ∂ρ = N₀,   ∂p = ρ Hᵀ H N₁,   ∂H = -ρ H N₂
 """
 
 from __future__ import annotations
@@ -15,154 +23,181 @@ from numpy.typing import NDArray
 
 from recon.kernels import lanes
 from recon.kernels.activation import F32, OPTIONS
+from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W
+from recon.kernels.project_cpu import add_footprint, gather_footprint, padded, padded_shape
 
 _f = np.float32
 _SLAB = 4  # slices a task: small enough to share out a 32-voxel cube, large enough to keep the rows in cache
+_TASK = 1024  # Gaussians a task of the search
+_SHARE = 16  # Gaussians a task of the backward pass
+# Columns of the table, beside K, SHEAR and KV of the footprints: centre, drift of the centre per slice, 1 / Σzz, half
+# widths of the middle slice over the reach, reach in standard deviations.
+_X, _Y, _Z, _DRIFT_X, _DRIFT_Y, _KZ, _WIDE_X, _WIDE_Y, _REACH = 0, 1, 5, 6, 7, 8, 9, 10, 11
+_FARTHEST = 1e30  # keeps float32 from infinity
 
 
 @njit(**OPTIONS)
-def _boxes(
+def _near(
+    means: F32, scales: F32, low: NDArray[np.float64], high: NDArray[np.float64], cut: float, found: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Gaussians whose sphere of the largest reach meets the box low..high; each task fills its piece of `found`."""
+    n = means.shape[0]
+    x0, y0, z0 = _f(low[0]), _f(low[1]), _f(low[2])
+    x1, y1, z1 = _f(high[0]), _f(high[1]), _f(high[2])
+    for task in prange(counts.shape[0]):
+        begin = task * _TASK
+        k = begin
+        for i in range(begin, min(n, begin + _TASK)):
+            reach = _f(cut) * max(scales[i, 0], scales[i, 1], scales[i, 2])
+            x, y, z = means[i, 0], means[i, 1], means[i, 2]
+            across = (x + reach >= x0) & (x - reach <= x1) & (y + reach >= y0) & (y - reach <= y1)
+            found[k] = i  # overwritten by the next where this one is out: no branch
+            k += across & (z + reach >= z0) & (z - reach <= z1)
+        counts[task] = k - begin
+
+
+@njit(**OPTIONS)
+def _place(
+    near: NDArray[np.int64],
     means: F32,
     scales: F32,
     rotations: F32,
     densities: F32,
     origin: NDArray[np.float64],
-    per_mm: float,
+    spacing: NDArray[np.float64],
     shape: tuple[int, int, int],
     faint: float,
     cut: float,
     table: F32,
-    boxes: NDArray[np.int32],
+    slices: NDArray[np.int32],
 ) -> None:
-    """Voxel-unit centre, precision (6) and box of each Gaussian; an empty box where it misses the grid or is faint."""
-    per = _f(per_mm)
-    for i in prange(densities.shape[0]):
-        for k in range(6):
-            boxes[i, k] = 0
+    """Fill table [k, 12] and slices [k, 2] (first, last + 1) of Gaussians `near`; none where one misses the grid."""
+    nz, ny, nx = shape
+    for j in prange(near.shape[0]):
+        i = near[j]
+        slices[j, 0] = slices[j, 1] = 0
         density = densities[i]
         if not density > _f(faint):
             continue
-        reach = min(_f(cut), np.sqrt(_f(2) * np.log(density / _f(faint)))) * per
+        reach = min(cut, math.sqrt(2 * math.log(density / faint))) if faint > 0 else cut
         r, sc = rotations[i], scales[i]
-        hit = True
-        for axis in range(3):
-            r0, r1, r2 = r[3 * axis] * sc[0], r[3 * axis + 1] * sc[1], r[3 * axis + 2] * sc[2]
-            half = reach * np.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
-            centre = _f((means[i, axis] - origin[axis]) * per_mm)
-            size = shape[2 - axis]
-            table[i, axis] = centre
-            if not (centre + half >= 0 and centre - half <= size - 1):
-                hit = False
-                break
-            boxes[i, 2 * axis] = max(0, math.ceil(centre - half))
-            boxes[i, 2 * axis + 1] = min(size, math.floor(centre + half) + 1)
-        if not hit:
-            boxes[i, 4] = boxes[i, 5] = 0
+        s0, s1, s2 = np.float64(sc[0]), np.float64(sc[1]), np.float64(sc[2])
+        px, py, pz = 1 / spacing[2], 1 / spacing[1], 1 / spacing[0]
+        a0, a1, a2 = px * r[0] * s0, px * r[1] * s1, px * r[2] * s2
+        b0, b1, b2 = py * r[3] * s0, py * r[4] * s1, py * r[5] * s2
+        c0, c1, c2 = pz * r[6] * s0, pz * r[7] * s1, pz * r[8] * s2
+        x, y, z = px * (means[i, 0] - origin[0]), py * (means[i, 1] - origin[1]), pz * (means[i, 2] - origin[2])
+        zz = c0 * c0 + c1 * c1 + c2 * c2
+        half_x = reach * math.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
+        half_y = reach * math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
+        half_z = reach * math.sqrt(zz)
+        if not (x + half_x >= 0 and x - half_x <= nx - 1 and y + half_y >= 0 and y - half_y <= ny - 1):
             continue
-        h = np.empty((3, 3), np.float32)
-        for k in range(3):
-            inverse = _f(1) / (sc[k] * per)
-            for j in range(3):
-                h[k, j] = r[3 * j + k] * inverse
-        table[i, 3] = h[0, 0] * h[0, 0] + h[1, 0] * h[1, 0] + h[2, 0] * h[2, 0]  # xx
-        table[i, 4] = h[0, 0] * h[0, 1] + h[1, 0] * h[1, 1] + h[2, 0] * h[2, 1]  # xy
-        table[i, 5] = h[0, 0] * h[0, 2] + h[1, 0] * h[1, 2] + h[2, 0] * h[2, 2]  # xz
-        table[i, 6] = h[0, 1] * h[0, 1] + h[1, 1] * h[1, 1] + h[2, 1] * h[2, 1]  # yy
-        table[i, 7] = h[0, 1] * h[0, 2] + h[1, 1] * h[1, 2] + h[2, 1] * h[2, 2]  # yz
-        table[i, 8] = h[0, 2] * h[0, 2] + h[1, 2] * h[1, 2] + h[2, 2] * h[2, 2]  # zz
+        if not (z + half_z >= 0 and z - half_z <= nz - 1):
+            continue
+        slices[j, 0] = math.ceil(max(z - half_z, 0.0))
+        slices[j, 1] = math.floor(min(z + half_z, nz - 1.0)) + 1
+        ac0, ac1, ac2 = a1 * c2 - a2 * c1, a2 * c0 - a0 * c2, a0 * c1 - a1 * c0
+        bc0, bc1, bc2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
+        aca = ac0 * ac0 + ac1 * ac1 + ac2 * ac2
+        bcb = bc0 * bc0 + bc1 * bc1 + bc2 * bc2
+        volume = s0 * s1 * s2 * px * py * pz
+        table[j, _X], table[j, _Y], table[j, _Z] = x, y, z
+        table[j, K] = min(bcb / (volume * volume), _FARTHEST)
+        table[j, KV] = min(zz / bcb, _FARTHEST)
+        table[j, _KZ] = min(1 / zz, _FARTHEST)
+        table[j, SHEAR] = (ac0 * bc0 + ac1 * bc1 + ac2 * bc2) / bcb
+        table[j, _DRIFT_X] = (a0 * c0 + a1 * c1 + a2 * c2) / zz
+        table[j, _DRIFT_Y] = (b0 * c0 + b1 * c1 + b2 * c2) / zz
+        table[j, _WIDE_X], table[j, _WIDE_Y] = math.sqrt(aca / zz), math.sqrt(bcb / zz)
+        table[j, _REACH] = reach
 
 
 @njit(inline="always", fastmath=True)
-def _exponents(table, i, z, y):  # type: ignore[no-untyped-def]
-    """Row (z, y) of Gaussian i: exponent = a dx² + b dx + c."""
-    dy, dz = _f(y) - table[i, 1], _f(z) - table[i, 2]
-    b = -(table[i, 4] * dy + table[i, 5] * dz)
-    c = _f(-0.5) * (table[i, 6] * dy * dy + _f(2) * table[i, 7] * dy * dz + table[i, 8] * dz * dz)
-    return b, c
+def _cut(table, j, z, weight, piece):  # type: ignore[no-untyped-def]
+    """Slice z of Gaussian j as a footprint, piece [1, 8]; returns δz."""
+    dz = _f(z) - table[j, _Z]
+    down = table[j, _KZ] * dz * dz
+    reach = np.sqrt(max(table[j, _REACH] * table[j, _REACH] - down, _f(0)))
+    piece[0, U] = table[j, _X] + table[j, _DRIFT_X] * dz
+    piece[0, V] = table[j, _Y] + table[j, _DRIFT_Y] * dz
+    piece[0, K], piece[0, SHEAR], piece[0, KV] = table[j, K], table[j, SHEAR], table[j, KV]
+    piece[0, HU], piece[0, HV] = reach * table[j, _WIDE_X], reach * table[j, _WIDE_Y]
+    # numba's own exp is a call that empties the vector registers.
+    piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * down))
+    return dz
 
 
 @njit(**OPTIONS)
-def _fill(table: F32, boxes: NDArray[np.int32], densities: F32, hits: NDArray[np.int64], volume: F32, ny: int) -> None:
-    """volume [z * y, x + 16]: each task owns `_SLAB` slices, so nothing is shared."""
-    nz = volume.shape[0] // ny
-    for task in prange((nz + _SLAB - 1) // _SLAB):
-        z_low, z_high = task * _SLAB, min(nz, (task + 1) * _SLAB)
-        for position in range(hits.shape[0]):
-            i = hits[position]
-            z0, z1 = max(z_low, boxes[i, 4]), min(z_high, boxes[i, 5])
-            a, density = _f(-0.5) * table[i, 3], densities[i]
-            for z in range(z0, z1):
-                for y in range(boxes[i, 2], boxes[i, 3]):
-                    b, c = _exponents(table, i, z, y)
-                    for start in range(boxes[i, 0], boxes[i, 1], 16):
-                        dx = lanes.iota() + (_f(start) - table[i, 0])
-                        value = lanes.exp(dx * (dx * a + b) + c) * density
-                        row = z * ny + y
-                        lanes.store(volume, row, start, lanes.load(volume, row, start) + value)
+def _fill(table: F32, slices: NDArray[np.int32], hits: NDArray[np.int64], densities: F32, volume: F32,
+          ny: int, nx: int, pieces: F32) -> None:  # fmt: skip
+    """volume [z, y, x] of padded slices: each task owns `_SLAB` of them, so nothing is shared."""
+    for task in prange(pieces.shape[0]):
+        low, high = task * _SLAB, min(volume.shape[0], (task + 1) * _SLAB)
+        piece = pieces[task]
+        volume[low:high] = _f(0)
+        for j in range(hits.shape[0]):
+            for z in range(max(low, slices[j, 0]), min(high, slices[j, 1])):
+                _cut(table, j, z, densities[hits[j]], piece)
+                add_footprint(piece, 0, ny, nx, volume[z])
 
 
 @njit(**OPTIONS)
 def _gather(
     table: F32,
-    boxes: NDArray[np.int32],
+    slices: NDArray[np.int32],
     hits: NDArray[np.int64],
     gradient: F32,
     ny: int,
+    nx: int,
     scales: F32,
     rotations: F32,
     densities: F32,
-    per_mm: float,
+    spacing: NDArray[np.float64],
     means_too: bool,
+    pieces: F32,
     d_means: F32,
     d_log_scales: F32,
     d_rotations: F32,
     d_densities: F32,
 ) -> None:
-    per = _f(per_mm)
-    for position in prange(hits.shape[0]):
-        i = hits[position]
-        n0 = nx = ny1 = nz1 = xx = xy = xz = yy = yz = zz = _f(0)
-        a = _f(-0.5) * table[i, 3]
-        for start in range(boxes[i, 0], boxes[i, 1], 16):
-            dx = lanes.iota() + (_f(start) - table[i, 0])
-            s0, sy, sz = lanes.zero(), lanes.zero(), lanes.zero()
-            syy, syz, szz = lanes.zero(), lanes.zero(), lanes.zero()
-            for z in range(boxes[i, 4], boxes[i, 5]):
-                dz = _f(z) - table[i, 2]
-                for y in range(boxes[i, 2], boxes[i, 3]):
-                    dy = _f(y) - table[i, 1]
-                    b, c = _exponents(table, i, z, y)
-                    value = lanes.load(gradient, z * ny + y, start) * lanes.exp(dx * (dx * a + b) + c)
-                    s0, sy, sz = s0 + value, sy + value * dy, sz + value * dz
-                    syy, syz, szz = syy + value * (dy * dy), syz + value * (dy * dz), szz + value * (dz * dz)
-            first = dx * s0
-            n0 += lanes.total(s0)
-            nx += lanes.total(first)
-            ny1 += lanes.total(sy)
-            nz1 += lanes.total(sz)
-            xx += lanes.total(dx * first)
-            xy += lanes.total(dx * sy)
-            xz += lanes.total(dx * sz)
-            yy += lanes.total(syy)
-            yz += lanes.total(syz)
-            zz += lanes.total(szz)
-        density, r, sc = densities[i], rotations[i], scales[i]
-        d_densities[i] += n0
-        if means_too:
-            factor = density * per
-            d_means[i, 0] += factor * (table[i, 3] * nx + table[i, 4] * ny1 + table[i, 5] * nz1)
-            d_means[i, 1] += factor * (table[i, 4] * nx + table[i, 6] * ny1 + table[i, 7] * nz1)
-            d_means[i, 2] += factor * (table[i, 5] * nx + table[i, 7] * ny1 + table[i, 8] * nz1)
-        for k in range(3):
-            inverse = _f(1) / (sc[k] * per)
-            h0, h1, h2 = r[k] * inverse, r[3 + k] * inverse, r[6 + k] * inverse
-            g0 = -density * (h0 * xx + h1 * xy + h2 * xz)
-            g1 = -density * (h0 * xy + h1 * yy + h2 * yz)
-            g2 = -density * (h0 * xz + h1 * yz + h2 * zz)
-            d_log_scales[i, k] -= g0 * h0 + g1 * h1 + g2 * h2
-            d_rotations[i, k] += g0 * inverse
-            d_rotations[i, 3 + k] += g1 * inverse
-            d_rotations[i, 6 + k] += g2 * inverse
+    ex, ey, ez = _f(spacing[2]), _f(spacing[1]), _f(spacing[0])
+    for task in prange(pieces.shape[0]):
+        piece, found = pieces[task, :1], pieces[task, 1:]
+        for j in range(task * _SHARE, min(hits.shape[0], (task + 1) * _SHARE)):
+            i = hits[j]
+            n0 = nx1 = ny1 = nz1 = xx = xy = xz = yy = yz = zz = _f(0)
+            for z in range(slices[j, 0], slices[j, 1]):
+                dz = _cut(table, j, z, _f(1), piece)
+                gather_footprint(piece, 0, ny, nx, gradient[z], found)
+                weight = piece[0, W]
+                # From the slice's own centre to the Gaussian's.
+                sx, sy = table[j, _DRIFT_X] * dz, table[j, _DRIFT_Y] * dz
+                m0, mx, my = weight * found[0, 0], weight * found[0, 1], weight * found[0, 2]
+                xx += weight * found[0, 3] + sx * (_f(2) * mx + sx * m0)
+                xy += weight * found[0, 4] + sx * my + sy * (mx + sx * m0)
+                yy += weight * found[0, 5] + sy * (_f(2) * my + sy * m0)
+                mx, my = mx + sx * m0, my + sy * m0
+                n0, nx1, ny1, nz1 = n0 + m0, nx1 + mx, ny1 + my, nz1 + dz * m0
+                xz, yz, zz = xz + dz * mx, yz + dz * my, zz + dz * dz * m0
+            density, r, sc = densities[i], rotations[i], scales[i]
+            d_densities[i] += n0
+            for k in range(3):
+                inverse = _f(1) / sc[k]
+                h0, h1, h2 = ex * r[k] * inverse, ey * r[3 + k] * inverse, ez * r[6 + k] * inverse
+                if means_too:
+                    pull = density * (h0 * nx1 + h1 * ny1 + h2 * nz1) * inverse
+                    d_means[i, 0] += pull * r[k]
+                    d_means[i, 1] += pull * r[3 + k]
+                    d_means[i, 2] += pull * r[6 + k]
+                g0 = -density * (h0 * xx + h1 * xy + h2 * xz)
+                g1 = -density * (h0 * xy + h1 * yy + h2 * yz)
+                g2 = -density * (h0 * xz + h1 * yz + h2 * zz)
+                d_log_scales[i, k] -= g0 * h0 + g1 * h1 + g2 * h2
+                d_rotations[i, k] += g0 * inverse * ex
+                d_rotations[i, 3 + k] += g1 * inverse * ey
+                d_rotations[i, 6 + k] += g2 * inverse * ez
 
 
 class Layout:
@@ -175,28 +210,37 @@ class Layout:
         rotations: F32,
         densities: F32,
         origin: tuple[float, float, float],
-        voxel_size: float,
+        spacing: float | tuple[float, float, float],
         shape: tuple[int, int, int],
         faint: float,
         cut: float,
     ) -> None:
-        """`origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm; a Gaussian ends where it falls
-        below `faint` (a density) and at the latest after `cut` standard deviations."""
-        self.parameters = (means, scales, rotations, densities)
-        self.per_mm, self.shape = 1.0 / voxel_size, shape
-        self.table = np.empty((densities.shape[0], 9), np.float32)
-        self.boxes = np.empty((densities.shape[0], 6), np.int32)
+        """`origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm, `spacing` the voxels' edge or edges (z, y, x).
+
+        A Gaussian ends where it falls below `faint` (a density) and at the latest after `cut` standard deviations.
+        """
+        n = densities.shape[0]
+        self.parameters, self.shape = (means, scales, rotations, densities), shape
+        self._spacing = np.broadcast_to(np.asarray(spacing, np.float64), 3).copy()
         corner = np.asarray(origin, np.float64)
-        _boxes(means, scales, rotations, densities, corner, self.per_mm, shape, faint, cut, self.table, self.boxes)
-        extent = self.boxes[:, 1::2] - self.boxes[:, 0::2]
-        self.hits = np.flatnonzero((extent > 0).all(axis=1))
+        edge = self._spacing[::-1]
+        found, counts = np.empty(n, np.int64), np.empty(-(-n // _TASK), np.int64)
+        # Half a voxel more on all sides: the search rounds to float32.
+        _near(means, scales, corner - edge / 2, corner + (np.asarray(shape[::-1]) - 0.5) * edge, cut, found, counts)
+        pieces = [found[k * _TASK : k * _TASK + count] for k, count in enumerate(counts)]
+        near = np.concatenate(pieces) if pieces else found
+        table, slices = np.empty((near.size, 12), np.float32), np.empty((near.size, 2), np.int32)
+        _place(near, *self.parameters, corner, self._spacing, shape, faint, cut, table, slices)
+        hit = slices[:, 1] > slices[:, 0]
+        self.hits, self._table, self._slices = near[hit], table[hit], slices[hit]
 
     def fill(self) -> F32:
         """Density [z, y, x] at the voxel centres."""
         nz, ny, nx = self.shape
-        padded = np.zeros((nz * ny, nx + lanes.WIDTH), np.float32)
-        _fill(self.table, self.boxes, self.parameters[3], self.hits, padded, ny)
-        return padded.reshape(nz, ny, -1)[:, :, :nx]
+        volume = np.empty((nz, *padded_shape(ny, nx)), np.float32)
+        pieces = np.empty((-(-nz // _SLAB), 1, 16), np.float32)
+        _fill(self._table, self._slices, self.hits, self.parameters[3], volume, ny, nx, pieces)
+        return volume[:, :ny, :nx]
 
     def backward(
         self,
@@ -209,12 +253,10 @@ class Layout:
         means_too: bool = True,
     ) -> None:
         """Add the gradients that follow from `gradient` [z, y, x]; `means_too=False` leaves positions alone."""
-        nz, ny, nx = self.shape
-        padded = np.zeros((nz, ny, nx + lanes.WIDTH), np.float32)
-        padded[:, :, :nx] = gradient
+        _, ny, nx = self.shape
         _, scales, rotations, densities = self.parameters
-        flat = padded.reshape(nz * ny, -1)
+        pieces = np.empty((-(-self.hits.size // _SHARE), 2, 16), np.float32)
         _gather(
-            self.table, self.boxes, self.hits, flat, ny, scales, rotations, densities, self.per_mm, means_too,
-            d_means, d_log_scales, d_rotations, d_densities,
+            self._table, self._slices, self.hits, padded(gradient), ny, nx, scales, rotations, densities,
+            self._spacing, means_too, pieces, d_means, d_log_scales, d_rotations, d_densities,
         )  # fmt: skip

@@ -19,7 +19,7 @@ def _combine(a, b, out):  # type: ignore[no-untyped-def]
     lanes.store(out, 5, 0, lanes.sign(y - y) + lanes.sign(x))
     lanes.store(out, 6, 0, lanes.root(x * x))
     lanes.store(out, 7, 0, lanes.clamp(x, np.float32(-0.5), np.float32(0.25)))
-    return lanes.total(x)
+    return lanes.total(x), lanes.lowest(x)
 
 
 @njit(fastmath=True)
@@ -31,7 +31,7 @@ def _exp(a, out):  # type: ignore[no-untyped-def]
 def test_arithmetic_loads_and_sums(rng: np.random.Generator) -> None:
     a, b = (rng.normal(size=(3, 20)).astype(np.float32) for _ in range(2))
     out = np.zeros((8, 16), np.float32)
-    total = _combine(a, b, out)
+    total, lowest = _combine(a, b, out)
     x, y = a[0, :16], b[1, 2:18]
     np.testing.assert_allclose(out[0], x + y, rtol=1e-6)
     np.testing.assert_allclose(out[1], x - 2 * y, rtol=1e-5, atol=1e-6)
@@ -42,6 +42,7 @@ def test_arithmetic_loads_and_sums(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(out[6], np.abs(x), rtol=1e-6)
     np.testing.assert_array_equal(out[7], np.clip(x, -0.5, 0.25))
     assert abs(total - x.astype(np.float64).sum()) < 1e-5
+    assert lowest == x[0]
 
 
 @njit(fastmath=True)
