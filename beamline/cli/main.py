@@ -32,6 +32,7 @@ _COMMANDS = {
     "scan": _Entry("scan", "Run a scan (or, with --dry-run, say what it would do)."),
     "recon": _Entry("recon", "Reconstruct a scan, finished or still growing."),
     "tradeoff": _Entry("tradeoff", "What accuracy costs in time: many reconstructions of a scan, compared."),
+    "bench": _Entry("bench", "Measure this machine: kernels, fits, and the quality they give in a time."),
     "info": _Entry("files", "Say what a scan file holds."),
     "validate": _Entry("files", "Check a scan file against the rules that readers rely on."),
     "ingest": _Entry("files", "Turn a multi-page TIFF into an HDF5 scan, page by page."),
