@@ -35,13 +35,13 @@ def test_a_step_along_a_line_shrinks_by_the_closed_form(axis: int) -> None:
     """Two plateaus of n₁ and n₂ samples move towards each other by t / n₁ and t / n₂ (Condat 2013)."""
     line = np.r_[np.full(2, 1.0), np.full(4, 3.0)].astype(np.float32)
     x = np.moveaxis(line.reshape(6, 1, 1), 0, axis).copy()
-    TotalVariationProx(x.shape, CUBES, True, steps=400)(x, 1.2)
+    TotalVariationProx(x.shape, CUBES, True, steps=150)(x, 1.2)
     np.testing.assert_allclose(x.ravel(), np.r_[np.full(2, 1.0 + 1.2 / 2), np.full(4, 3.0 - 1.2 / 4)], atol=2e-3)
 
 
 def test_a_large_threshold_leaves_the_mean() -> None:
     x = np.arange(6, dtype=np.float32).reshape(6, 1, 1)
-    TotalVariationProx(x.shape, CUBES, False, steps=400)(x, 50.0)
+    TotalVariationProx(x.shape, CUBES, False, steps=200)(x, 50.0)
     np.testing.assert_allclose(x.ravel(), 2.5, atol=1e-3)
 
 
