@@ -86,12 +86,21 @@ class FistaTv:
 
 @dataclass(frozen=True)
 class OsSirtTv:
-    """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections."""
+    """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
 
-    iterations: int = 80
+    Attributes:
+        tv_weight: the threshold of that step in density units. Best of 0.002, 0.004 and 0.008 for 60 views, for a
+            measured walnut (0.15 to 0.25 dB to its neighbours) and a simulated battery (1.0 to 1.5 dB).
+        momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
+            167), for two volumes more. After 10 sweeps +4 dB (battery) and +2 dB (walnut), after 40 nothing: for a
+            quick volume.
+    """
+
+    iterations: int = 40
     subsets: int = 9
-    tv_weight: float = 0.002
+    tv_weight: float = 0.004
     tv_steps: int = 5
+    momentum: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,12 +162,16 @@ def os_sirt_tv(problem: Problem, settings: OsSirtTv, x: F32) -> F32:
     weights = difference_weights(projector.grid)
     prox = TotalVariationProx(_shape(x), weights, problem.nonnegative, settings.tv_steps)
     scale = problem.scale
+    ahead = Momentum(x) if settings.momentum else None
     for k in range(settings.iterations):
         error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
         # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
         prox(x, settings.tv_weight * density_unit(x))
-        if not problem.go_on(k + 1, math.sqrt(error) / scale):
+        go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
+        if not go_on or k + 1 == settings.iterations:
             break
+        if ahead is not None:
+            ahead(x)
     return x
 
 
@@ -236,26 +249,40 @@ def fista(problem: Problem, iterations: int, threshold: float, tv_steps: int, x:
     projector = problem.projector
     step = 1 / largest_eigenvalue(projector, problem.weight)
     prox = TotalVariationProx(_shape(x), difference_weights(projector.grid), problem.nonnegative, tv_steps)
-    y, new = x.copy(), np.empty_like(x)
-    t, scale = 1.0, problem.scale
+    gradient, ahead, scale = np.empty_like(x), Momentum(x), problem.scale
     for k in range(iterations):
-        model = projector.forward_lines(y)
+        model = projector.forward_lines(x)
         error = misfit(problem.data, model, problem.weight, problem.weight)
-        projector.adjoint_lines(model, new)
-        combine(1.0, y, step, new, new)
-        prox(new, threshold)
-        # Momentum that points uphill starts anew.
-        combine(1.0, y, -1.0, new, y)
-        combine(-1.0, x, 1.0, new, x)
-        if dot(y, x) > 0:
-            t = 1.0
-        after = (1 + math.sqrt(1 + 4 * t * t)) / 2
-        combine(1.0, new, (t - 1) / after, x, y)
-        t = after
-        x, new = new, x
-        if not problem.go_on(k + 1, math.sqrt(error) / scale):
+        projector.adjoint_lines(model, gradient)
+        combine(1.0, x, step, gradient, x)
+        prox(x, threshold)
+        if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == iterations:
             break
+        ahead(x)
     return x
+
+
+class Momentum:
+    """Nesterov's extrapolation between the steps of a descent, which starts anew where it points uphill.
+
+    O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes.
+    """
+
+    def __init__(self, start: F32) -> None:
+        self._last, self._from, self._t = start.copy(), start.copy(), 1.0
+
+    def __call__(self, x: F32) -> None:
+        """From the point x that a step has reached to the one where the next step starts, in place."""
+        combine(1.0, self._from, -1.0, x, self._from)  # back along the step
+        combine(1.0, x, -1.0, self._last, self._last)  # from the last point reached to this one
+        if dot(self._from, self._last) > 0:
+            self._t = 1.0
+        after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
+        change, self._last = self._last, self._from
+        self._last[...] = x
+        combine(1.0, x, (self._t - 1) / after, change, x)
+        change[...] = x
+        self._from, self._t = change, after
 
 
 def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6) -> float:

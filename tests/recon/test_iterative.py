@@ -191,6 +191,14 @@ def test_tv_suits_a_piecewise_constant_object(method: Settings) -> None:
     assert error(solve(method, projector, views), truth) < 0.6 * sirt
 
 
+def test_momentum_saves_sweeps() -> None:
+    projector, truth, views = parallel_case(n_views=7, noise=0.02)
+    few = [solve(OsSirtTv(iterations=8, tv_weight=0.01, momentum=m), projector, views) for m in (False, True)]
+    many = solve(OsSirtTv(iterations=20, tv_weight=0.01), projector, views)
+    assert error(few[1], truth) < 0.9 * error(few[0], truth)
+    assert error(few[1], truth) < 1.1 * error(many, truth)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_the_unit_of_attenuation_does_not_matter(method: Method) -> None:
     projector, _, views = parallel_case(noise=0.02)
