@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from beamline.events import Event, Sink
+from beamline.history import history_arrays
 from beamline.measure import measure, regions
 from beamline.pipeline import Prepared
-from beamline.recon_report import METHOD_NAMES, Context, Made, compose, history_arrays, what_next
+from beamline.recon_report import METHOD_NAMES, Context, Made, compose
 from beamline.report import write_report
 from beamline.storage.recon_file import ReconRecord, Value, refuse_existing, write_reconstruction
 from drivers.clock import Clock
@@ -92,7 +93,7 @@ def deliver(
     if made.chosen:
         summary["chosen"] = made.chosen
     if (further := made.next_decibel) is not None:
-        summary |= {"next_db": asdict(further), "next_db_said": what_next(further)}
+        summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_said}
     if len(metrics) > 1:
         summary["fbp"] = metrics["fbp"]
     sink(Event("done", clock.now(), summary))

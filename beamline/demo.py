@@ -11,10 +11,11 @@ from beamline.deliver import Target, axis_of, deliver
 from beamline.devices import connect
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event, Sink, fan_out
+from beamline.history import history_of
 from beamline.live import follow_command
 from beamline.narration import sentence
 from beamline.pipeline import Selection, prepare
-from beamline.recon_report import Context, Made, facts_of, history_of
+from beamline.recon_report import Context, Made, facts_of
 from beamline.run import RECON, RECON_LOG, run_scan
 from beamline.stop import StopRequest
 from beamline.storage.recon_file import read_reconstruction

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,7 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
+from beamline.history import judged_by, judged_views
 from recon.geometry import Geometry
+from recon.quality import NextDecibel, parts_of, record
 from recon.volume import Volume
 
 Window = tuple[float, float]
@@ -141,13 +144,16 @@ def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], valu
 
 
 def quality_against_time(
-    history: Mapping[str, NDArray[np.floating]], psnr: Sequence[tuple[float, float]] = ()
+    history: Mapping[str, NDArray[np.floating]],
+    psnr: Sequence[tuple[float, float]] = (),
+    further: NextDecibel | None = None,
 ) -> bytes:
-    """Loss and residual of the fit against time; PSNR of snapshots where there is a truth; views where they grow.
+    """The fit against time: loss and residuals, the residual as dB, PSNR of snapshots, and what grew.
 
     Args:
-        history: equally long "seconds", "loss", and where known "residual", "n_views", "n_gaussians".
-        psnr: (seconds, dB) of each snapshot.
+        history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
+        psnr: (seconds, dB) of each snapshot; none without a truth.
+        further: what another dB would cost; marked where it is known.
     """
     seconds = history["seconds"]
     growing = [
@@ -155,12 +161,18 @@ def quality_against_time(
         for name, label in (("n_views", "views"), ("n_gaussians", "Gaussians"))
         if name in history and np.ptp(history[name]) > 0
     ]
-    panels = 1 + bool(psnr) + bool(growing)
-    figure = Figure(figsize=(_WIDTH, 3.1), dpi=_DPI, layout="constrained")
-    left, *others = np.atleast_1d(figure.subplots(1, panels))
-    for name, colour in (("loss", "tab:blue"), ("residual", "tab:orange")):
+    judge = judged_by(history)
+    panels = 1 + (judge is not None) + bool(psnr) + bool(growing)
+    down, across = (1, panels) if panels < 4 else (2, 2)
+    figure = Figure(figsize=(_WIDTH, 3.1 * down), dpi=_DPI, layout="constrained")
+    left, *others = np.ravel(figure.subplots(down, across))
+    for name, label, colour in (
+        ("loss", "loss", "tab:blue"),
+        ("residual", "residual", "tab:orange"),
+        ("held_out", "residual, held out", "tab:red"),
+    ):
         if name in history and np.any(np.isfinite(history[name])):
-            left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=name)
+            left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in left.get_lines()])
     if values.min(initial=np.inf) > 0 and values.max() > 10 * values.min():
         left.set_yscale("log")
@@ -171,6 +183,8 @@ def quality_against_time(
         left.set_ylim(bottom=0)
     left.set(xlabel="time (s)", title="Misfit")
     left.legend(fontsize=8)
+    if judge is not None:
+        _decibels(others.pop(0), *record(seconds, history[judge]), judged_views(judge), further)
     if psnr:
         axes = others.pop(0)
         axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
@@ -186,6 +200,26 @@ def quality_against_time(
         panel.grid(alpha=0.3)
         panel.tick_params(labelsize=8)
     return png(figure)
+
+
+def _decibels(
+    axes: Axes, seconds: NDArray[np.float64], quality: NDArray[np.float64], views: str, further: NextDecibel | None
+) -> None:
+    """The residual as dB below the data, and where the next one is expected."""
+    axes.plot(seconds, quality, color="tab:green", lw=1.2, marker=".", ms=3)
+    axes.set(xlabel="time (s)", ylabel="dB below the data", title=f"Residual, {views}")
+    if further is None or seconds.size == 0:
+        return
+    if not further.measurable:
+        axes.text(0.97, 0.05, "next dB: none measurable", ha="right", fontsize=8, transform=axes.transAxes)
+        return
+    end, top = float(seconds[-1]), float(quality[-1])
+    axes.plot([end, end + further.seconds], [top, top + 1], color="tab:green", lw=1, ls=":")
+    high = further.high if math.isfinite(further.high) else 3 * further.seconds
+    axes.plot([end + further.low, end + high], [top + 1, top + 1], color="0.4", lw=1)
+    axes.plot([end + further.seconds], [top + 1], color="0.4", marker="|", ms=8)
+    axes.text(0.97, 0.05, f"next dB: about {parts_of(further.seconds)} more", ha="right", fontsize=8,
+              transform=axes.transAxes)  # fmt: skip
 
 
 def _bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline import figures
+from beamline.history import history_arrays, judged_by, judged_views
 from beamline.pipeline import Prepared, Selection
 from beamline.report import METRICS, Picture, Report, formatted
 from beamline.storage.recon_file import Value
@@ -22,7 +22,6 @@ from recon.fit import Progress
 from recon.quality import NextDecibel, next_decibel, parts_of
 from recon.volume import Volume
 
-_HISTORY = ("step", "steps", "seconds", "loss", "residual", "n_gaussians", "n_views")
 METHOD_NAMES = {"fbp": "FBP", "r2": "R²-Gaussian"}
 
 
@@ -71,10 +70,24 @@ class Made:
 
     @property
     def next_decibel(self) -> NextDecibel | None:
-        """What another dB would cost by the fit's own record; None for a direct method."""
-        if not self.history:
+        """What another dB would cost by the fit's own record; None for a direct method, and while views still came."""
+        arrays = history_arrays(self.history)
+        name = judged_by(arrays)
+        if name is None or _grew(self):
             return None
-        return next_decibel([p.seconds for p in self.history], [p.residual for p in self.history])
+        return next_decibel(arrays["seconds"], arrays[name])
+
+    @property
+    def next_decibel_said(self) -> str:
+        """The same in words; empty where there is nothing to say."""
+        found, name = self.next_decibel, judged_by(history_arrays(self.history))
+        if found is None or name is None:
+            return ""
+        if not found.measurable:
+            return f"none measurable in the residual of {judged_views(name)}"
+        high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
+        span = f"{parts_of(found.low)} {high}"
+        return f"about {parts_of(found.seconds)} more ({span}), from the residual of {judged_views(name)} as it fell"
 
 
 @dataclass(frozen=True)
@@ -135,8 +148,8 @@ def compose(
         summary += f" (FBP of the same views: {formatted(best, metrics['fbp'][best])})"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
-    if made.next_decibel is not None:
-        summary += f". The next dB: {what_next(made.next_decibel)}"
+    if made.next_decibel_said:
+        summary += f". The next dB: {made.next_decibel_said}"
     settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
@@ -164,14 +177,6 @@ def compose(
     )
 
 
-def what_next(found: NextDecibel) -> str:
-    """What another dB of the fit's residual would cost, in words."""
-    if not found.measurable:
-        return "none measurable from this fit's record"
-    high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
-    return f"about {parts_of(found.seconds)} more ({parts_of(found.low)} {high}), by this fit's own record"
-
-
 def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
     row = geometry.detector_shape[0] // 2
@@ -190,7 +195,7 @@ def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Map
             Picture(
                 "Quality against time",
                 _told_by_history(made),
-                figures.quality_against_time(history_arrays(made.history), made.psnr),
+                figures.quality_against_time(history_arrays(made.history), made.psnr, made.next_decibel),
             )
         )
     pictures += [
@@ -223,6 +228,8 @@ def _told_by_history(made: Made) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit of the model to the views it had"]
+    if (name := judged_by(history_arrays(made.history))) is not None:
+        parts.append(f"the same residual of {judged_views(name)} as dB below the data")
     parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
     parts += [f"how many {' and '.join(growing)} there were"] if growing else []
     return f"{', '.join(parts)}, in the time since {'the file was first seen' if _grew(made) else 'the fit began'}."
@@ -233,21 +240,3 @@ def _text(value: object) -> str:
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
-
-
-def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
-    """The history of a fit as equally long arrays, by name; empty where there is none."""
-    if not history:
-        return {}
-    return {name: np.array([getattr(p, name) for p in history], dtype=np.float64) for name in _HISTORY}
-
-
-def history_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
-    """The history of a fit from `history_arrays`."""
-    if not arrays:
-        return ()
-    columns = {name: arrays[name].tolist() for name in _HISTORY}
-    return tuple(
-        Progress(int(step), int(steps), seconds, loss, residual, int(n_gaussians), int(n_views))
-        for step, steps, seconds, loss, residual, n_gaussians, n_views in zip(*columns.values(), strict=True)
-    )

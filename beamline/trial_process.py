@@ -19,13 +19,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import recon
+from beamline.history import history_arrays, judged_by
 from beamline.memory import peak_memory
-from beamline.trials import Trial, decibels
+from beamline.trials import Trial
 from recon import metrics
 from recon.binning import bin_views
 from recon.fit import FitSettings
 from recon.geometry import Geometry
 from recon.operators import data_residual
+from recon.quality import record
 from recon.reconstruction import Reconstruction
 from recon.resolution import fourier_shell_correlation, soft_cylinder
 from recon.splat import Truncation
@@ -185,9 +187,13 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
 
 
 def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
-    """(seconds, dB) of the fit's own record: the residual of the views it used."""
-    pairs = [(p.seconds, decibels("residual_held_out", p.residual)) for p in result.history]
-    return [(seconds, db) for seconds, db in pairs if math.isfinite(db)]
+    """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
+    arrays = history_arrays(result.history)
+    name = judged_by(arrays)
+    if name is None:
+        return []
+    seconds, quality = record(arrays["seconds"], arrays[name])
+    return list(zip(seconds.tolist(), quality.tolist(), strict=True))
 
 
 def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:

@@ -1,0 +1,76 @@
+"""A fit's record goes into a file and comes back; the residual that judges it is that of views held out, if any."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from beamline.figures import quality_against_time
+from beamline.history import history_arrays, history_of, judged_by, judged_views
+from beamline.recon_report import Made
+from recon.fit import Progress
+from recon.quality import next_decibel
+from recon.volume import Grid, Volume
+
+GRID = Grid((1, 1, 1))
+
+
+def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
+    """Falls by `slope` dB for each factor of e in time."""
+    times = np.linspace(0.5, 30, n)
+    residuals = 10 ** (-(20 + slope * np.log(times)) / 20)
+    pairs = zip(times.tolist(), residuals.tolist(), strict=True)
+    return tuple(Progress(k + 1, n, t, r / 2, r, 100, views) for k, (t, r) in enumerate(pairs))
+
+
+def _made(history: tuple[Progress, ...]) -> Made:
+    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), "r2", 1.0, history, {})
+
+
+def test_there_and_back() -> None:
+    history = _record(3.0)
+    arrays = history_arrays(history)
+    assert {len(values) for values in arrays.values()} == {len(history)}
+    assert [p.step for p in history_of(arrays)] == [p.step for p in history]
+    np.testing.assert_array_equal(history_arrays(history_of(arrays))["residual"], arrays["residual"])
+    assert history_arrays(()) == {} and history_of({}) == ()
+
+
+def test_what_was_not_recorded_is_not_a_number() -> None:
+    arrays = history_arrays(_record(3.0))
+    del arrays["loss"]
+    assert all(math.isnan(p.loss) for p in history_of(arrays))
+
+
+def test_views_held_out_judge_before_views_used() -> None:
+    seconds = np.arange(3.0)
+    assert judged_by({"seconds": seconds, "residual": seconds, "held_out": seconds}) == "held_out"
+    assert judged_by({"seconds": seconds, "residual": seconds, "held_out": np.full(3, np.nan)}) == "residual"
+    assert judged_by({"seconds": seconds}) is None
+    assert judged_views("held_out") == "views held out"
+
+
+def test_a_fit_says_what_another_decibel_would_cost() -> None:
+    made = _made(_record(3.0))
+    assert made.next_decibel is not None
+    assert made.next_decibel.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
+    assert made.next_decibel_said.startswith("about 11.9 s more (")
+    assert "none measurable" in _made(_record(0.0)).next_decibel_said
+    assert _made(()).next_decibel is None and _made(()).next_decibel_said == ""
+
+
+def test_while_views_still_come_nothing_is_extrapolated() -> None:
+    grown = (*_record(3.0), *_record(3.0, views=20))
+    assert _made(grown).next_decibel is None
+
+
+@pytest.mark.parametrize("slope", [3.0, 0.0])
+@pytest.mark.parametrize("psnr", [(), ((5.0, 25.0), (30.0, 31.0))])
+def test_the_picture_has_room_for_all_of_it(slope: float, psnr: tuple[tuple[float, float], ...]) -> None:
+    arrays = history_arrays(_record(slope))
+    arrays["held_out"] = 1.3 * arrays["residual"]
+    arrays["n_gaussians"][30:] *= 2
+    further = next_decibel(arrays["seconds"], arrays["held_out"])
+    assert quality_against_time(arrays, psnr, further).startswith(b"\x89PNG")
