@@ -46,7 +46,7 @@ class Cgls:
     there the residual is that of one iteration less. Memory: 3 volumes, 3 x the projections.
     """
 
-    iterations: int = 20
+    iterations: int = 10
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,14 @@ class FistaTv:
     """min ½||A x - p||² + μ TV(x), x >= 0, by FISTA with restarts (Beck & Teboulle 2009; O'Donoghue & Candès 2015).
 
     μ = tv_weight x density unit x ||A||², so `tv_weight` is the threshold of one proximal step in density units.
-    Memory: 8 volumes, 2 x the projections.
+    Memory: 7 volumes, 2 x the projections.
+
+    The weight: 60 views of a simulated battery give 29.3, 32.6, 35.0, 32.9 dB at 0.0002, 0.0005, 0.001, 0.002, of a
+    measured walnut 28.2, 28.6, 28.9, 29.6.
     """
 
     iterations: int = 100
-    tv_weight: float = 2e-4
+    tv_weight: float = 1e-3
     tv_steps: int = 5
 
 
