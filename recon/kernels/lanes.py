@@ -50,6 +50,8 @@ def _broadcast(builder: Any, scalar: Any, kind: Any = _VF) -> Any:
 def _as_lanes(builder: Any, kind: Any, value: Any) -> Any:
     if isinstance(kind, LanesType):
         return value
+    if isinstance(kind, types.Integer):
+        return _broadcast(builder, builder.sitofp(value, _F32))
     return _broadcast(builder, value if kind == types.float32 else builder.fptrunc(value, _F32))
 
 

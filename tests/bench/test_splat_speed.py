@@ -1,55 +1,236 @@
-"""How fast the splat kernels are; run with  pytest -m bench -s tests/bench."""
+"""How fast a step on the CPU is and where its time goes; run with  pytest -m bench -s tests/bench/test_splat_speed.py.
+
+Each time is the best with the median and the quartiles behind it; ratios are of bests in the same run, since other
+work on the machine only ever adds (set GOMP_SPINCOUNT=2000 where there is any). The floor is what the machine's
+multiply-adds alone would take: RENDER_OPERATIONS or MOMENTS_OPERATIONS a pair of pixel and Gaussian, sixteen at once.
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from numba import get_num_threads, njit, prange
+from numpy.typing import NDArray
 
+from recon import fit
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.kernels.project_cpu import moments, render
-from recon.splat import Active, view_table
+from recon.kernels import lanes
+from recon.kernels.activation import OPTIONS, activation_backward
+from recon.kernels.adam_cpu import adam_all
+from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W
+from recon.kernels.losses_cpu import ProjectionLoss, total_variation
+from recon.kernels.project_cpu import moments, render, render_layers
+from recon.splat import Active, Gradients, grid_layout, project, view_backward, view_table
+from recon.volume import Grid
 
+F32 = NDArray[np.float32]
 N, SIDE = 50_000, 256
+RENDER_OPERATIONS, MOMENTS_OPERATIONS = 3, 7  # two products of the recurrence and the sums
+Timing = tuple[float, ...]
 
 
-def _median_ms(call: Callable[[], object], repeats: int = 31) -> tuple[float, float]:
-    """Median and the spread between the quartiles, in ms; the first call compiles and does not count."""
+def _times(call: Callable[[], object], repeats: int = 21) -> Timing:
+    """Best, median and quartiles in ms; the first call compiles and does not count."""
     call()
     times = []
     for _ in range(repeats):
         begin = time.perf_counter()
         call()
         times.append(1e3 * (time.perf_counter() - begin))
-    low, middle, high = np.percentile(times, (25, 50, 75))
-    return float(middle), float(high - low)
+    return tuple(float(t) for t in np.percentile(times, (0, 50, 25, 75)))
+
+
+def _line(name: str, timing: Timing, note: str = "") -> None:
+    print(f"{name:28s} {timing[0]:8.3f} ms (median {timing[1]:.3f}, {timing[2]:.3f} .. {timing[3]:.3f}) {note}")
+
+
+def _model(n: int, side: int) -> Gaussians:
+    """Gaussians with boxes of 9 to 15 pixels that fill the field, ordered in space: the project's standard case."""
+    rng = np.random.default_rng(0)
+    means = (rng.random((n, 3)) - 0.5) * 220 * side / 256
+    means = means[np.argsort((means[:, 2] // 16) * 1000 + means[:, 0] // 16)]
+    return Gaussians.from_physical(
+        means, rng.uniform(1.2, 2.2, (n, 3)), rng.uniform(0.5, 1, n) / side, rng.normal(size=(n, 4))
+    )
+
+
+def _active(g: Gaussians) -> Active:
+    a = g.arrays()
+    return Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], g.density_unit)
+
+
+def _table(n: int, side: int) -> tuple[Active, F32, float]:
+    """A model, its footprints in one view, and the number of pairs in their boxes."""
+    active = _active(_model(n, side))
+    table = view_table(active, Geometry.parallel([0.7], (side, side)), 0, 1e-5, 3.5)
+    return active, table, float((4 * np.maximum(table[:, HU], 0) * np.maximum(table[:, HV], 0)).sum())
+
+
+@njit(**OPTIONS)
+def _multiply_add(rounds: int, out: F32) -> None:
+    for thread in prange(out.shape[0]):
+        a = lanes.iota() * np.float32(1e-3)
+        # Eight chains that differ, or they would be folded into one.
+        c0, c1, c2, c3, c4, c5, c6, c7 = a, a * 2, a * 3, a * 4, a * 5, a * 6, a * 7, a * 8
+        for _ in range(rounds):
+            c0, c1, c2, c3 = c0 * a + a, c1 * a + a, c2 * a + a, c3 * a + a
+            c4, c5, c6, c7 = c4 * a + a, c5 * a + a, c6 * a + a, c7 * a + a
+        lanes.store(out, thread, 0, c0 + c1 * c2 + c3 * c4 + c5 * c6 + c7)
+
+
+def _multiply_adds_a_ms() -> float:
+    rounds, out = 200_000, np.empty((get_num_threads(), 16), np.float32)
+    return 8 * 16 * rounds * out.shape[0] / _times(lambda: _multiply_add(rounds, out), 15)[0]
+
+
+def _scatter(table: torch.Tensor, side: int) -> torch.Tensor:
+    """The readable way: every box as indices and values, added into the image by index; buckets of equal boxes."""
+    image = torch.zeros((side + 32) * (side + 32))
+    radii = torch.maximum(table[:, HU], table[:, HV]).detach().ceil().long()
+    for radius in radii.unique().tolist():
+        t = table[radii == radius]
+        steps = torch.arange(-radius, radius + 1)
+        cols, rows = (t[:, c].detach().round().long()[:, None] + steps for c in (U, V))
+        across, down = (cols - t[:, U, None])[:, None, :], (rows - t[:, V, None])[:, :, None]
+        k, shear, kv, w = (t[:, c, None, None] for c in (K, SHEAR, KV, W))
+        value = w * torch.exp(-0.5 * (k * (across - shear * down) ** 2 + kv * down**2))
+        index = (rows + 16)[:, :, None] * (side + 32) + (cols + 16)[:, None, :]
+        image = image.index_add(0, index.reshape(-1), value.reshape(-1))
+    return image.reshape(side + 32, side + 32)[16:-16, 16:-16]
 
 
 @pytest.mark.bench
-def test_projection_and_its_backward_pass() -> None:
-    # 50k Gaussians with boxes of 9 to 15 pixels, ordered in space, on 256 x 256: the standard case of the project.
-    rng = np.random.default_rng(0)
-    means = (rng.random((N, 3)) - 0.5) * 220
-    means = means[np.argsort((means[:, 2] // 16) * 1000 + means[:, 0] // 16)]
-    g = Gaussians.from_physical(means, rng.uniform(1.2, 2.2, (N, 3)), rng.uniform(0.5, 1, N), rng.normal(size=(N, 4)))
-    a = g.arrays()
-    active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], g.density_unit)
-    view = Geometry.parallel([0.7], (SIDE, SIDE))
-    table = view_table(active, view, 0, 1e-3, 3.5)
-    image = np.empty((SIDE, SIDE), np.float32)
-    slope = rng.normal(size=image.shape).astype(np.float32)
-    pairs = float((2 * np.maximum(table[:, 6], 0) * 2 * np.maximum(table[:, 7], 0)).sum())
-    for name, call in (
-        ("footprints", lambda: view_table(active, view, 0, 1e-3, 3.5)),
-        ("render", lambda: render(table, image)),
-        ("moments", lambda: moments(table, slope)),
+def test_projection_against_the_machine_and_the_scatter_twin() -> None:
+    _, table, pairs = _table(N, SIDE)
+    image, layers = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE)
+    slope, room = np.random.default_rng(1).normal(size=image.shape).astype(np.float32), np.empty((N, 6), np.float32)
+    rate = _multiply_adds_a_ms()
+    print(f"\n{N} Gaussians, {pairs:.3g} pairs on {SIDE}², {get_num_threads()} threads, {rate / 1e6:.0f} GFMA/s")
+    total = 0.0
+    for name, call, operations in (
+        ("render", lambda: render(table, image, layers), RENDER_OPERATIONS),
+        ("moments", lambda: moments(table, slope, room), MOMENTS_OPERATIONS),
     ):
-        middle, spread = _median_ms(call)
-        print(
-            f"{name:11s} {middle:6.2f} ms (quartiles {spread:.2f}), {1e6 * middle / pairs:.3f} ns a pair of {pairs:.3g}"
+        timing = _times(call, 41)
+        floor = operations * pairs / rate
+        _line(
+            name, timing, f"{1e6 * timing[0] / pairs:.3f} ns a pair, {timing[0] / floor:.1f} x its floor {floor:.3f} ms"
         )
-        assert math.isfinite(middle)
+        total += timing[0]
+    leaf = torch.from_numpy(table).requires_grad_()
+
+    def there_and_back() -> None:
+        leaf.grad = None
+        _scatter(leaf, SIDE).backward(torch.from_numpy(slope))
+
+    twin = _times(there_and_back, 5)
+    _line("render + moments", (total,) * 4)
+    _line("scatter twin, with autograd", twin, f"{twin[0] / total:.0f} x as long")
+    render(table, image, layers)
+    np.testing.assert_allclose(image, _scatter(leaf, SIDE).detach().numpy(), atol=0.01 * float(image.max()))
+    assert twin[0] > 10 * total
+
+
+@pytest.mark.bench
+def test_a_whole_step_and_its_parts() -> None:
+    g = _model(N, SIDE)
+    views = Geometry.parallel(np.linspace(0, math.pi, 4, endpoint=False), (SIDE, SIDE))
+    noise = np.random.default_rng(2).normal(1, 0.05, (4, SIDE, SIDE)).astype(np.float32)
+    data = project(g, views).numpy() * noise
+    settings = fit.FitSettings(policy=None)
+    problem = fit.make_problem(data, views, Grid.matching(views), g.density_unit, settings)
+    state = fit.init(g, 0)
+    p, unit, n = state.parameters, 1 / problem.half_field, state.n
+    step = _times(lambda: fit.step(state, problem, settings, 0.3, view=2))
+    active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], unit)
+    cut = settings.truncation
+    table = view_table(active, views, 2, cut.faint, cut.sigmas)
+    image, layers = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE)
+    slope, into, centres = np.empty_like(image), Gradients.zeros(n), np.empty((n, 2), np.float32)
+    render(table, image, layers)
+    loss = ProjectionLoss((SIDE, SIDE), 0.25)
+    loss(image, problem.images[2], problem.target_maps[2], slope)
+    box = Grid((32, 32, 32))
+    layout = grid_layout(active, box, 1e-7, cut.sigmas)
+    density = np.ascontiguousarray(layout.fill())
+    tv = np.empty_like(density)
+    total_variation(density, tv, 0.1)
+    gradients, d_raw, d_q = (
+        [np.zeros_like(p[k]) for k in fit.NAMES],
+        np.empty_like(p["raw"]),
+        np.empty((n, 4), np.float32),
+    )
+    arrays = [[a.copy() for a in gradients] for _ in range(3)]
+    found = np.empty((n, 6), np.float32)
+    parts: dict[str, Timing] = {}
+    for name, call in (
+        ("activate", lambda: Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], unit)),
+        ("footprints", lambda: view_table(active, views, 2, cut.faint, cut.sigmas)),
+        ("render", lambda: render(table, image, layers)),
+        ("loss (L1, SSIM)", lambda: loss(image, problem.images[2], problem.target_maps[2], slope)),
+        ("moments", lambda: moments(table, slope, found)),
+        ("moments, footprints back", lambda: view_backward(active, views, 2, table, slope, into, centres)),
+        ("TV box: find", lambda: grid_layout(active, box, 1e-7, cut.sigmas)),
+        ("TV box: fill", layout.fill),
+        ("TV box: loss", lambda: total_variation(density, tv, 0.1)),
+        ("TV box: back", lambda: layout.backward(tv, into.means, into.log_scales, into.rotations, into.densities)),
+        ("activation back", lambda: activation_backward(
+            p["quaternions"], p["raw"], unit, into.rotations, into.densities, d_q, d_raw)),
+        ("Adam", lambda: adam_all(arrays[0], gradients, arrays[1], arrays[2], (0.1,) * 4, 9)),
+    ):  # fmt: skip
+        parts[name] = _times(call)
+    print(f"\na step at {N} Gaussians on {SIDE}²")
+    for name, timing in parts.items():
+        _line("  " + name, timing)
+    pair = parts["render"][0] + parts["moments"][0]
+    once = sum(t[0] for name, t in parts.items() if name != "moments")
+    _line("whole step", step, f"{step[0] / pair:.2f} x render + moments; its parts {once:.2f} ms")
+    grid = Grid((SIDE, SIDE, SIDE))
+    layout = grid_layout(active, grid, 1e-7, cut.sigmas)
+    _line(f"voxelise {SIDE}³", _times(layout.fill, 3))
+    assert step[0] > pair
+
+
+@pytest.mark.bench
+def test_time_is_linear_in_pairs() -> None:
+    print("\nGaussians   side     Mpairs  render + moments ms   ms/Mpair    MB held")
+    found = []
+    for n, side in ((10_000, 256), (50_000, 128), (50_000, 256), (50_000, 512), (100_000, 256), (400_000, 512)):
+        active, table, pairs = _table(n, side)
+        image, layers = np.empty((side, side), np.float32), render_layers(side, side)
+        result = np.empty((n, 6), np.float32)
+        both = _times(lambda: (render(table, image, layers), moments(table, image, result)), 9)[0]  # noqa: B023
+        held = sum(
+            a.nbytes for a in (table, layers, result, *vars(active).values(), *vars(Gradients.zeros(n)).values())
+        )
+        print(f"{n:9d} {side:6d} {pairs / 1e6:10.2f} {both:21.3f} {1e6 * both / pairs:10.4f} {held / 1e6:10.1f}")
+        found.append((pairs, both))
+    pairs, both = np.array(found).T
+    slope, start = np.polyfit(pairs / 1e6, both, 1, w=1 / both)
+    print(f"slope {slope:.4f} ms a million pairs, start {start:.3f} ms")
+    assert slope > 0
+
+
+@pytest.mark.bench
+def test_first_use_compiles_outside_of_fits(tmp_path: Path) -> None:
+    code = (
+        "import time; from recon.warm_up import warm_up; t = time.perf_counter(); warm_up();"
+        "print(f'{time.perf_counter() - t:.1f}')"
+    )
+    seconds = []
+    for _ in range(2):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+        seconds.append(float(done.stdout))
+    print(f"\nwarm_up: {seconds[0]} s where nothing is compiled yet, {seconds[1]} s afterwards")
+    assert seconds[1] < seconds[0]

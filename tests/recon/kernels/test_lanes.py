@@ -12,7 +12,7 @@ from recon.kernels import lanes
 def _combine(a, b, out):  # type: ignore[no-untyped-def]
     x, y = lanes.load(a, 0, 0), lanes.load(b, 1, 2)
     lanes.store(out, 0, 0, x + y)
-    lanes.store(out, 1, 0, x - y * np.float32(2))
+    lanes.store(out, 1, 0, x - y * 2)  # a whole number, as float32 and float64, is broadcast
     lanes.store(out, 2, 0, x * y)
     lanes.store(out, 3, 0, lanes.iota() + lanes.zero())
     lanes.store(out, 4, 0, np.float32(2) / x)
