@@ -269,3 +269,10 @@ def test_names_have_settings(method: Method) -> None:
     projector, _, views = parallel_case()
     named = solve(method, projector, views, iterations=2)
     np.testing.assert_array_equal(named.data, solve(settings, projector, views, iterations=2).data)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_box_that_no_ray_meets_stays_empty(method: Method) -> None:
+    projector, _, views = parallel_case()
+    aside = Projector(projector.geometry, Grid((4, 5, 6), 0.5, (90.0, 0.0, 0.0)))
+    assert not solve(method, aside, views, iterations=2).data.any()
