@@ -92,7 +92,9 @@ def text(table: Table) -> str:
     lines = [machine_line(dict(table.machine)), ""]
     width = max(len(outcome.trial.label) for outcome in table.outcomes)
     names = _metric_names(table)
-    lines.append(f"  {'trial':<{width}}{'s':>9}{'MB':>8}" + "".join(f"{_heading(n, table):>15}" for n in names))
+    lines.append(
+        f"  {'trial':<{width}}{'s':>9}{'CPU s':>9}{'MB':>8}" + "".join(f"{_heading(n, table):>15}" for n in names)
+    )
     best = {table.compared[i].trial for i in table.front("seconds")}
     for outcome in table.outcomes:
         if outcome.trial.group == "precision" and outcome.status == "done":
@@ -100,7 +102,7 @@ def text(table: Table) -> str:
         mark = "*" if outcome.trial in best else " "
         row = f"{mark} {outcome.trial.label:<{width}}"
         if outcome.status == "done":
-            row += f"{outcome.seconds:9.2f}{_megabytes(outcome):>8}"
+            row += f"{outcome.seconds:9.2f}{outcome.cpu_seconds:9.2f}{_megabytes(outcome):>8}"
             row += "".join(f"{_cell(n, outcome):>15}" for n in names)
         else:
             row += f"  {outcome.status}" + (f": {outcome.message}" if outcome.message else "")
@@ -158,10 +160,12 @@ def to_csv(table: Table) -> str:
     names = _metric_names(table)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*_FIELDS, "status", "seconds", "peak_bytes", "gaussians_end", *names, "quality_db", "message"])
+    writer.writerow(
+        [*_FIELDS, "status", "seconds", "cpu_seconds", "peak_bytes", "gaussians_end", *names, "quality_db", "message"]
+    )
     for outcome in table.outcomes:
         values = [getattr(outcome.trial, name) for name in _FIELDS]
-        values += [outcome.status, outcome.seconds, outcome.peak_bytes, outcome.gaussians]
+        values += [outcome.status, outcome.seconds, outcome.cpu_seconds, outcome.peak_bytes, outcome.gaussians]
         values += [outcome.metrics.get(name) for name in names]
         writer.writerow([finite(v) for v in (*values, outcome.quality(table.by), outcome.message)])
     return out.getvalue()
@@ -201,7 +205,9 @@ def to_html(table: Table, pictures: Sequence[Picture]) -> str:
     """The page."""
     names = _metric_names(table)
     best = {table.compared[i].trial for i in table.front("seconds")}
-    head = "".join(f"<th scope='col'>{escape(h)}</th>" for h in ("s", "MB", *(_heading(n, table) for n in names)))
+    head = "".join(
+        f"<th scope='col'>{escape(h)}</th>" for h in ("s", "CPU s", "MB", *(_heading(n, table) for n in names))
+    )
     rows = []
     for o in table.outcomes:
         if o.trial.group == "precision":
@@ -210,11 +216,12 @@ def to_html(table: Table, pictures: Sequence[Picture]) -> str:
         label = f"<strong>{label}</strong>" if o.trial in best else label
         if o.status == "done":
             cells = "".join(
-                f"<td>{escape(c)}</td>" for c in (f"{o.seconds:.2f}", _megabytes(o), *(_cell(n, o) for n in names))
+                f"<td>{escape(c)}</td>"
+                for c in (f"{o.seconds:.2f}", f"{o.cpu_seconds:.2f}", _megabytes(o), *(_cell(n, o) for n in names))
             )
         else:
             why = escape(f"{o.status}: {o.message}".rstrip(": "))
-            cells = f"<td colspan='{len(names) + 2}'>{why}</td>"
+            cells = f"<td colspan='{len(names) + 3}'>{why}</td>"
         rows.append(f"<tr><th scope='row'>{label}</th>{cells}</tr>")
     body = "".join(rows)
     summary = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."

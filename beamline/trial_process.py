@@ -85,7 +85,14 @@ def _geometry(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Geometry:
     return Geometry(detector_shape=(rows, cols), **plain)
 
 
-def run(trial: Trial, data: Data, seed: int, say: Say, now: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
+def run(
+    trial: Trial,
+    data: Data,
+    seed: int,
+    say: Say,
+    now: Callable[[], float] = time.perf_counter,
+    cpu: Callable[[], float] = time.process_time,
+) -> dict[str, Any]:
     """Make a trial's reconstruction and measure it; the fields of an Outcome.
 
     Raises:
@@ -98,7 +105,9 @@ def run(trial: Trial, data: Data, seed: int, say: Say, now: Callable[[], float] 
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)
     warm_up(trial)
+    before = cpu()
     result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
+    cpu_seconds = cpu() - before
     peak = peak_memory()  # before measuring, which has needs of its own
     volume = on_grid(result.volume, grid)
     found = {}
@@ -111,6 +120,7 @@ def run(trial: Trial, data: Data, seed: int, say: Say, now: Callable[[], float] 
         found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed)
     return {
         "seconds": result.seconds,
+        "cpu_seconds": cpu_seconds,
         "peak_bytes": peak,
         "metrics": {name: float(value) for name, value in found.items()},
         "gaussians": None if result.gaussians is None else result.gaussians.n,
@@ -146,7 +156,8 @@ def reconstruct(
     binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
     if trial.method != "r2":
         target = grid if trial.binning == 1 else Grid.matching(coarse)
-        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed)  # type: ignore[arg-type]
+        own: dict[str, Any] = {} if trial.iterations is None else {"iterations": trial.iterations}
+        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, **own)  # type: ignore[arg-type]
     settings = FitSettings(truncation=replace(Truncation(), sigmas=trial.sigmas))
     if trial.loss == "l1":
         settings = replace(settings, ssim_weight=0.0)

@@ -79,13 +79,14 @@ class Outcome:
     Attributes:
         trial: what was tried.
         status: only "done" comes with figures.
-        seconds: of the reconstruction, without compilation and measuring.
+        seconds: wall time of the reconstruction, without compilation and measuring.
         peak_bytes: of its process; None where the system does not tell.
         metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), by name.
         gaussians: in the model at the end; None for voxel methods.
         curve: (seconds, dB) of the fit's own record.
         message: why there are no figures.
         details: of the comparison with the float64 twin.
+        cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
     """
 
     trial: Trial
@@ -97,6 +98,7 @@ class Outcome:
     curve: Sequence[tuple[float, float]] = ()
     message: str = ""
     details: Mapping[str, float] = field(default_factory=dict)
+    cpu_seconds: float = math.nan
 
     def quality(self, by: str) -> float:
         """dB by "psnr", or by "residual_held_out" as -20 log10 of it; NaN where it is not known."""
