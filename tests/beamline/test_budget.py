@@ -49,7 +49,7 @@ def _spend(prepared: Prepared, budget: float, now: Ticking) -> Budgeted:
     return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False)
 
 
-@pytest.mark.parametrize("budget", [2.0, 5.0, 12.0])
+@pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
 def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))

@@ -24,9 +24,8 @@ def _cost(choice: Choice, speeds: Speeds) -> float:
     if choice.method == "r2":
         ratios = [(c, choice.binning // c.binning) for c in CURVES if choice.binning % c.binning == 0]
         kinds = [(c, n) for c, n in ratios if math.isclose(c.share, choice.share * n**3)]
-        assert kinds
-        curve, further = kinds[0]
-        time += (speeds.start + speeds.fill) * choice.share + choice.steps * speeds.step * curve.pace / further**2
+        paces = [curve.pace / further**2 for curve, further in kinds]  # two kinds may come to the same share
+        time += (speeds.start + speeds.fill) * choice.share + choice.steps * speeds.step * min(paces)
     return time
 
 
