@@ -79,7 +79,7 @@ class FistaTv:
     Memory: 7 volumes, 2 x the projections.
 
     The weight: 60 views of a simulated battery give 29.3, 32.6, 35.0, 32.9 dB at 0.0002, 0.0005, 0.001, 0.002, of a
-    measured walnut 28.2, 28.6, 28.9, 29.6.
+    measured walnut 28.2, 28.6, 28.9 and (after 40 iterations) 29.6.
     """
 
     iterations: int = 100
@@ -95,8 +95,8 @@ class OsSirtTv:
         tv_weight: the threshold of that step in density units. Best of 0.002, 0.004 and 0.008 for 60 views, for a
             measured walnut (0.15 to 0.25 dB to its neighbours) and a simulated battery (1.0 to 1.5 dB).
         momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
-            167), for two volumes more. After 10 sweeps +4 dB (battery) and +2 dB (walnut), after 40 nothing: for a
-            quick volume.
+            167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
+            -0.1 and -1.0 dB: noise comes in sooner, too.
     """
 
     iterations: int = 40
