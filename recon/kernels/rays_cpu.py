@@ -12,7 +12,8 @@ quadratic form N = δᵀKδ measures, its part along e is α·δ. So
 
 with W, K from `footprints_cpu`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All are sums of
 squares: no digits are lost where Gaussians are thin. The rays with N / Q <= c² pass within c standard deviations; they
-fill a conic, and each row of pixels is cut where it leaves it.
+fill an ellipse, and each row of pixels is cut where it leaves it; whole rows are drawn where the Gaussian reaches the
+plane of the source.
 
 The integral runs over the whole line, also behind the source: a Gaussian that reaches the source is out of bounds.
 """

@@ -86,7 +86,8 @@ def test_rays_are_linear_in_density_and_the_density_gradient_is_the_adjoint(rng:
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), cut=st.floats(1.0, 4.0), largest=st.sampled_from([0.5, 2.0, 6.0]))
 def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: float, largest: float) -> None:
-    # The rays within `cut` standard deviations, and no others: what is missing is what the twin has beyond the cut.
+    # The rays within `cut` standard deviations: what is missing is what the twin has beyond them, and what is there is
+    # within, but for Gaussians that reach the source's plane, whose rays fill no ellipse.
     parameters = raw(np.random.default_rng(seed), 1, 9.0, largest)
     active = Active.of(*parameters, UNIT)
     image = np.zeros(SHAPE, np.float32)
@@ -98,7 +99,10 @@ def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: floa
     assert (whole[~seen] <= edge * 1.001 + 1e-6).all()
     np.testing.assert_allclose(image[seen], whole[seen], atol=1e-5 * float(peak))
     thinnest = float(peak) * float(active.scales[0].min() / active.scales[0].max())
-    assert (whole[seen] >= thinnest * math.exp(-(cut**2) / 2) * 0.999 - 1e-6).all()
+    beam = WIDE.axes(0)[2]
+    reach = cut * np.linalg.norm(active.scales[0] * (beam @ active.rotations[0].reshape(3, 3)))
+    if WIDE.sod + beam @ active.means[0] > 1.001 * reach:
+        assert (whole[seen] >= thinnest * math.exp(-(cut**2) / 2) * 0.999 - 1e-6).all()
 
 
 def test_many_rays_in_bands_sum_to_the_same_as_one_by_one(rng: np.random.Generator) -> None:
