@@ -124,14 +124,14 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
         raise ValueError(f"a budget is a positive time in s, got {budget}")
     candidates: list[Choice] = []
     for binning in (n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)):
-        # Halving the detail twice and more is below what was measured: each halving is taken to cost 3 dB, as between
-        # an FBP of all and one of joined pixels.
+        # More than two pixels joined a side were not measured: each halving of the detail is taken to cost 3 dB, about
+        # what the first one does.
         loss = 3.0 * math.log2(binning)
         fbp = speeds.fbp / binning**3
         if fbp <= budget:
             candidates.append(Choice("fbp", binning, 0.0, 0, -loss))
         for curve in CURVES:
-            if binning % curve.binning:
+            if curve.binning != min(binning, 2):
                 continue
             further = binning // curve.binning
             share, fixed = curve.share / further**3, fbp + speeds.start * curve.share / further**3

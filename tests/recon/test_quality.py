@@ -22,10 +22,11 @@ def _cost(choice: Choice, speeds: Speeds) -> float:
     """What a choice takes by the speeds it was made from, written out once more."""
     time = speeds.fbp / choice.binning**3
     if choice.method == "r2":
-        ratios = [(c, choice.binning // c.binning) for c in CURVES if choice.binning % c.binning == 0]
+        ratios = [(c, choice.binning // c.binning) for c in CURVES if c.binning == min(choice.binning, 2)]
         kinds = [(c, n) for c, n in ratios if math.isclose(c.share, choice.share * n**3)]
-        paces = [curve.pace / further**2 for curve, further in kinds]  # two kinds may come to the same share
-        time += (speeds.start + speeds.fill) * choice.share + choice.steps * speeds.step * min(paces)
+        assert len(kinds) == 1
+        ((curve, further),) = kinds
+        time += (speeds.start + speeds.fill) * choice.share + choice.steps * speeds.step * curve.pace / further**2
     return time
 
 
