@@ -14,7 +14,7 @@ from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import morton_order
 from recon.kernels.activation import F32
-from recon.kernels.adam_cpu import adam
+from recon.kernels.adam_cpu import adam_all, add_lengths
 from recon.kernels.losses_cpu import ProjectionLoss, total_variation
 from recon.kernels.project_cpu import render
 from recon.splat import Active, Gradients, Truncation, grid_layout, view_backward, view_table, voxelize
@@ -218,7 +218,7 @@ def step(
     gradients = dict(zip(NAMES, into.to_raw(p["quaternions"], p["raw"], 1 / problem.half_field), strict=True))
     state.step += 1
     _update(state, gradients, problem, settings, fraction)
-    state.statistic += np.hypot(centres[:, 0], centres[:, 1]) * np.float32(geometry.detector_shape[1] / 2)
+    add_lengths(centres, geometry.detector_shape[1] / 2, state.statistic)
     state.seen += 1
     power = float(np.vdot(target, target))
     off = float(np.vdot(image - target, image - target))
@@ -296,13 +296,14 @@ def _update(
     state: FitState, gradients: dict[str, F32], problem: Problem, settings: FitSettings, fraction: float
 ) -> None:
     shrink = settings.pace * settings.decay**fraction
-    for name, rate in zip(NAMES, settings.rates, strict=True):
-        scale = problem.half_field if name == "means" else 1.0
-        arrays = (state.parameters[name], gradients[name], state.first[name], state.second[name])
-        parameter, gradient, first, second = (a.reshape(state.n, -1) for a in arrays)
-        adam(parameter, gradient, first, second, rate * shrink * scale, state.step)
-    low = np.log(settings.smallest * problem.geometry.pixel_pitch)
-    np.clip(state.parameters["log_scales"], low, np.log(problem.half_field), out=state.parameters["log_scales"])
+    rates = [
+        rate * shrink * (problem.half_field if name == "means" else 1.0)
+        for name, rate in zip(NAMES, settings.rates, strict=True)
+    ]
+    lists = (state.parameters, gradients, state.first, state.second)
+    parameters, slopes, first, second = ([arrays[name] for name in NAMES] for arrays in lists)
+    widths = (float(np.log(settings.smallest * problem.geometry.pixel_pitch)), float(np.log(problem.half_field)))
+    adam_all(parameters, slopes, first, second, rates, state.step, (None, widths, None, None))
 
 
 def _grow(state: FitState, problem: Problem, policy: DensityPolicy) -> None:

@@ -213,7 +213,7 @@ def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     views = Geometry.parallel(SCAN.angles, SCAN.shape)
     data = Data(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
     data.save(tmp_path / "data.npz")
-    ballast = np.ones(150_000_000)  # 1.2 GB
+    ballast = np.ones(90_000_000)  # 720 MB
     outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
     assert outcome.status == "done", outcome.message
     assert outcome.quality("psnr") > 20
