@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-Loss = Literal["l1+ssim", "l1", "l2"]
+Loss = Literal["l1+ssim", "l1"]
 Depth = Literal["quick", "full"]
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
@@ -20,7 +20,7 @@ _BINNED_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (500,), "full": (250,
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 _FACTORS: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.5, 2.0)}
 _SIGMAS: Mapping[Depth, tuple[float, ...]] = {"quick": (3.0,), "full": (2.5, 3.0, 4.5)}
-_LOSSES: Mapping[Depth, tuple[Loss, ...]] = {"quick": ("l1",), "full": ("l1", "l2")}
+_LOSSES: Mapping[Depth, tuple[Loss, ...]] = {"quick": ("l1",), "full": ("l1",)}
 # Passes over the data; about what each method needs to get near its best, and a few fewer and more.
 _ITERATIONS: Mapping[str, Mapping[Depth, tuple[int, ...]]] = {
     "sirt": {"quick": (20, 60), "full": (10, 30, 100, 300)},
