@@ -9,7 +9,12 @@ from recon.kernels.losses_cpu import gaussian_window
 
 
 def ssim(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2) -> Tensor:
-    """Mean structural similarity of two images [row, col] (Wang et al. 2004): 11 x 11 Gaussian window, zeros outside.
+    """Mean of `ssim_map`."""
+    return ssim_map(image, target, c1, c2).mean()
+
+
+def ssim_map(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2) -> Tensor:
+    """Structural similarity [row, col] of two images (Wang et al. 2004): 11 x 11 Gaussian window, zeros outside.
 
     c1 and c2 are (0.01 L)² and (0.03 L)² for a data range L; the fit works on data scaled so that L is about 1.
     """
@@ -25,12 +30,19 @@ def ssim(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2
     covariance = blur(image * target) - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * covariance + c2) / (var_x + var_y + c2)
-    return (luminance * structure).mean()
+    return luminance * structure
 
 
-def projection_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """mean |image - target| + ssim_weight (1 - SSIM)   (Zha et al. 2024)."""
-    return (image - target).abs().mean() + ssim_weight * (1 - ssim(image, target))
+def projection_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
+    """mean w (|x - y| + ssim_weight (1 - SSIM))   (Zha et al. 2024, with weights w [row, col] >= 0; None: all 1).
+
+    Pixels of no weight are left out: SSIM's windows take them for zeros in both images, as they do what lies outside.
+    """
+    if weights is None:
+        return (image - target).abs().mean() + ssim_weight * (1 - ssim(image, target))
+    seen = weights > 0
+    x, y = (torch.where(seen, a, torch.zeros_like(a)) for a in (image, target))
+    return (weights * ((x - y).abs() + ssim_weight * (1 - ssim_map(x, y)))).mean()
 
 
 def total_variation(volume: Tensor) -> Tensor:

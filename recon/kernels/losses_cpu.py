@@ -63,10 +63,13 @@ def _blur(plane: F32, window: F32, halves: F32, out: F32) -> None:
 
 @njit(**OPTIONS)
 def _ssim_terms(
-    image: F32, target: F32, cols: int, target_blurred: F32, window: F32, c1: float, c2: float, halves: F32,
-    partials: F32, sums: NDArray[np.float64],
+    image: F32, target: F32, weights: F32 | None, cols: int, target_blurred: F32, window: F32, c1: float, c2: float,
+    halves: F32, partials: F32, sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Partial derivatives of the SSIM map with respect to the blurred x, x², xy; sums [row] of the map itself."""
+    """Partial derivatives of the SSIM map with respect to the blurred x, x², xy; sums [row] of the map itself.
+
+    With weights (None is settled when the kernel is compiled: that loop has no trace of them) the map is w SSIM.
+    """
     one, two, k1, k2 = _f(1), _f(2), _f(c1), _f(c2)
     rows, width = image.shape
     for task in prange(halves.shape[0]):
@@ -85,19 +88,22 @@ def _ssim_terms(
                 lanes.store(half, 2, first + MARGIN, bxy)
             amount = lanes.zero()
             for start in range(0, width, lanes.WIDTH):
-                first, low, high = _columns(start, cols, width)
+                first, fresh, high = _columns(start, cols, width)
                 mx, my = _across(half, 0, first, window), lanes.load(target_blurred[0], row, first)
                 vx = _across(half, 1, first, window) - mx * mx
                 vy = lanes.load(target_blurred[1], row, first) - my * my
                 vxy = _across(half, 2, first, window) - mx * my
                 top1, top2 = two * mx * my + k1, two * vxy + k2
                 low1, low2 = one / (mx * mx + my * my + k1), one / (vx + vy + k2)
-                part = top1 * low1 * low2
+                low = low1 * low2
+                if weights is not None:
+                    low = low * lanes.load(weights, row, first)
+                part = top1 * low
                 value = part * top2
                 d_vx = lanes.zero() - value * low2
                 d_vxy = two * part
-                d_mx = two * (my * top2 * low1 * low2 - mx * value * low1)
-                amount = amount + lanes.between(value, low, high)
+                d_mx = two * (my * top2 * low - mx * value * low1)
+                amount = amount + lanes.between(value, fresh, high)
                 # Columns that only fill up sixteen lanes are no part of the mean.
                 d_x = d_mx - two * mx * d_vx - my * d_vxy
                 lanes.store(partials[0], row, first, lanes.between(d_x, 0, high))
@@ -108,10 +114,10 @@ def _ssim_terms(
 
 @njit(**OPTIONS)
 def _combine(
-    image: F32, target: F32, cols: int, partials: F32, window: F32, l1: float, ssim: float, halves: F32, gradient: F32,
-    sums: NDArray[np.float64],
+    image: F32, target: F32, weights: F32 | None, cols: int, partials: F32, window: F32, l1: float, ssim: float,
+    halves: F32, gradient: F32, sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """The gradient from the blurred partial derivatives and the signs of x - y; sums [row] of |x - y|."""
+    """The gradient from the blurred partial derivatives and the signs of x - y; sums [row] of w |x - y|."""
     rows, width = image.shape
     for task in prange(halves.shape[0]):
         half = halves[task]
@@ -126,9 +132,12 @@ def _combine(
                 x, y = lanes.load(image, row, first), lanes.load(target, row, first)
                 difference = x - y
                 sign = lanes.sign(difference)
-                amount = amount + lanes.between(difference * sign, low, high)
                 slope = _across(half, 0, first, window) + y * _across(half, 2, first, window)
                 slope = slope + _f(2) * x * _across(half, 1, first, window)
+                if weights is not None:
+                    weight = lanes.load(weights, row, first)
+                    sign, slope = sign * weight, slope * lanes.sign(weight)
+                amount = amount + lanes.between(difference * sign, low, high)
                 lanes.store(gradient, row, first, sign * _f(l1) - slope * _f(ssim))
             sums[row] = lanes.total(amount)
 
@@ -139,6 +148,10 @@ class ProjectionLoss:
     Two passes over the rows: blurs of x, x², xy and the SSIM map's partial derivatives; blurs of these and the
     gradient. Each task takes a few rows and blurs them first down, then along one line that stays in its cache. The
     target's blurred maps do not change during a fit, so they are computed once per view.
+
+    With weights w [row, col] >= 0 it is mean w (|x - y| + λ (1 - SSIM(m x, m y))), m = 1 where w > 0 and 0 elsewhere:
+    a pixel of no weight is for SSIM's windows what lies outside the image, and its gradient is exactly 0. The mean
+    counts all pixels, so that a ray pulls alike in whole views and in masked ones.
     """
 
     def __init__(self, shape: tuple[int, int], ssim_weight: float, c1: float = 0.01**2, c2: float = 0.03**2) -> None:
@@ -158,29 +171,39 @@ class ProjectionLoss:
         wide[:, : self._cols] = image
         return wide
 
-    def target_maps(self, target: F32) -> F32:
-        """Blurred y and y² [2, row, col] of a target image; at least sixteen columns."""
-        wide = self._wide(target)
+    def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
+        """Blurred m y and m y² [2, row, col] of a target image; at least sixteen columns."""
+        wide = self._wide(target if weights is None else target * (weights > 0))
         out = np.empty((2, *wide.shape), np.float32)
         for plane, blurred in zip((wide, wide * wide), out, strict=True):
             _blur(plane, self.window, self._halves, blurred)
         return out
 
-    def __call__(self, image: F32, target: F32, target_maps: F32, gradient: F32) -> float:
-        """The loss; `gradient` [row, col] receives its derivative with respect to `image`."""
+    def __call__(
+        self, image: F32, target: F32, target_maps: F32, gradient: F32, weights: F32 | None = None
+    ) -> float:  # fmt: skip
+        """The loss; `gradient` [row, col] receives its derivative with respect to `image`.
+
+        `target_maps` are those of the same weights. Image and target must be finite also where the weight is 0.
+        """
         pixels = image.size
         x, y, cols = self._wide(image), self._wide(target), self._cols
         whole = gradient.shape == x.shape and gradient.flags.c_contiguous
         slope = gradient if whole else np.empty_like(x)
+        w, seen = None, x
+        if weights is not None:
+            w = self._wide(weights)
+            seen = x * (w > 0)
         _ssim_terms(
-            x, y, cols, target_maps, self.window, self.c1, self.c2, self._halves, self._partials, self._sums
+            seen, y, w, cols, target_maps, self.window, self.c1, self.c2, self._halves, self._partials, self._sums
         )  # fmt: skip
         ssim = float(self._sums.sum()) / pixels
+        share = 1.0 if weights is None else float(weights.mean(dtype=np.float64))
         weight = self.ssim_weight / pixels
-        _combine(x, y, cols, self._partials, self.window, 1.0 / pixels, weight, self._halves, slope, self._sums)
+        _combine(x, y, w, cols, self._partials, self.window, 1.0 / pixels, weight, self._halves, slope, self._sums)
         if not whole:
             gradient[...] = slope[:, :cols]
-        return float(self._sums.sum()) / pixels + self.ssim_weight * (1.0 - ssim)
+        return float(self._sums.sum()) / pixels + self.ssim_weight * (share - ssim)
 
 
 @njit(**OPTIONS)

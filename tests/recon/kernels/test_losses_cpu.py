@@ -35,6 +35,48 @@ def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator, s
     np.testing.assert_array_equal(again, gradient)
 
 
+@pytest.mark.parametrize("shape", [(27, 33), (40, 48), (30, 5), (1, 40), (3, 1)])
+def test_weighted_loss_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int]) -> None:
+    image, target = _images(rng, shape)
+    weights = (rng.random(shape) * (rng.random(shape) > 0.3)).astype(np.float32)
+    weights[: shape[0] // 3] = 0  # whole rows, more than a window can look across where there are so many
+    weights[:, -1] = 0.5
+    loss, gradient = ProjectionLoss(image.shape, 0.25), np.empty_like(image)
+    value = loss(image, target, loss.target_maps(target, weights), gradient, weights)
+    x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
+    # The twin cannot see what is masked, not even a NaN.
+    hidden = torch.from_numpy(np.where(weights > 0, target, np.nan).astype(np.float64))
+    expected = projection_loss(x, hidden, 0.25, torch.from_numpy(weights.astype(np.float64)))
+    expected.backward()
+    assert value == pytest.approx(expected.item(), rel=1e-5)
+    assert x.grad is not None
+    np.testing.assert_allclose(gradient, x.grad.numpy(), atol=2e-5 * float(x.grad.abs().max()))
+    assert not gradient[weights == 0].any()
+    # What stands in masked pixels, of either image, changes no bit.
+    other, marred = np.empty_like(image), [np.where(weights > 0, a, np.float32(1e6)) for a in (image, target)]
+    assert loss(marred[0], marred[1], loss.target_maps(marred[1], weights), other, weights) == value
+    np.testing.assert_array_equal(other, gradient)
+
+
+def test_weights_of_one_change_nothing_and_of_none_leave_nothing(rng: np.random.Generator) -> None:
+    image, target = _images(rng)
+    loss, plain, weighted = ProjectionLoss(image.shape, 0.25), np.empty_like(image), np.empty_like(image)
+    value = loss(image, target, loss.target_maps(target), plain)
+    ones, none = np.ones_like(image), np.zeros_like(image)
+    assert loss(image, target, loss.target_maps(target, ones), weighted, ones) == pytest.approx(value, rel=1e-6)
+    np.testing.assert_allclose(weighted, plain, atol=1e-6 * float(np.abs(plain).max()))
+    assert loss(image, target, loss.target_maps(target, none), weighted, none) == 0
+    assert not weighted.any()
+
+
+def test_the_weighted_loss_has_the_gradient_of_its_finite_differences(rng: np.random.Generator) -> None:
+    image, target = (torch.from_numpy(a.astype(np.float64)) for a in _images(rng, (7, 9)))
+    weights = torch.from_numpy(np.where(rng.random((7, 9)) > 0.4, rng.random((7, 9)), 0.0))
+    assert torch.autograd.gradcheck(
+        lambda x: projection_loss(x, target, 0.25, weights), image.requires_grad_(), eps=1e-7, atol=1e-7
+    )
+
+
 def test_ssim_equals_scikit_image_in_the_interior(rng: np.random.Generator) -> None:
     # The borders differ by choice (zeros there, reflection here), so only the inside is compared.
     image, target = (a.astype(np.float64) for a in _images(rng, (60, 60)))
