@@ -272,19 +272,10 @@ def _array(tensor: Tensor) -> F32:
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
-    """Where Gaussians fall on a grid; `faint` is a density.
-
-    Raises:
-        ValueError: for a grid whose voxels are no cubes: the kernel has one edge for all axes.
-    """
-    if grid.spacing[0] != grid.voxel_size:
-        raise ValueError(
-            f"Gaussians fill cubic voxels only, this grid's are {grid.spacing} mm (z, y, x); "
-            "leave out slice_pitch, or use the reference kernel"
-        )
+    """Where Gaussians fall on a grid; `faint` is a density."""
     z, y, x = (float(axis[0]) for axis in grid.coordinates())
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    return Layout(*parameters, (x, y, z), grid.voxel_size, grid.shape, faint, sigmas)
+    return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas)
 
 
 def project(
