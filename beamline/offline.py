@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import recon
 from beamline.budget import within
@@ -22,10 +21,9 @@ from recon.fbp import Filter
 from recon.fit import Progress
 from recon.initialise import default_count
 from recon.quality import PRESETS, Quality
+from recon.reconstruction import Method
 from recon.volume import Grid
 from recon.warm_up import warm_up
-
-Method = Literal["r2", "fbp"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class ReconOptions:
         source: the scan.
         target: where results go.
         selection: which part of the scan, and its correction.
-        method: "r2" or "fbp".
+        method: of recon.reconstruct.
         steps: of the fit; None takes the reconstructor's own number.
         seconds: at most, for the fit; for a followed scan, after its end.
         budget: s for everything from line integrals to volume; chooses all settings of the fit.

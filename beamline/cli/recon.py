@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 
@@ -17,11 +17,12 @@ from beamline.deliver import Target
 from beamline.errors import QualityError, ScanStopped
 from beamline.events import Event, fan_out
 from beamline.follow import follow as follow_scan
-from beamline.offline import Method, ReconOptions, run
+from beamline.offline import ReconOptions, run
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock
 from recon.fbp import Filter
 from recon.quality import PRESETS, Quality, parse_budget
+from recon.reconstruction import Method
 
 
 def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
@@ -46,7 +47,7 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @click.option(
     "-m",
     "--method",
-    type=click.Choice(["r2", "fbp"]),
+    type=click.Choice(get_args(Method)),
     default="r2",
     show_default=True,
     help="r2: Gaussians fitted to the views; fbp: filtered back-projection.",
