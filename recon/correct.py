@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Mask = NDArray[np.bool_]
-Image = NDArray[np.float32]
+from recon.masks import NEIGHBOURS, Image, Mask, fill, plan_fill
 
-_NEIGHBOURS = np.array([(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)])
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 
 
@@ -79,34 +77,6 @@ class Projections:
     masked: Mask
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
-
-
-_Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Mask]]
-
-
-def _plan_fill(mask: Mask) -> _Fill:
-    """Rings of masked pixels from the outside in; each takes the mean of the neighbours known before it."""
-    rows, cols = mask.shape
-    known = ~mask
-    r, c = np.nonzero(mask)
-    plan: _Fill = []
-    while r.size:
-        nr, nc = r[:, None] + _NEIGHBOURS[:, 0], c[:, None] + _NEIGHBOURS[:, 1]
-        inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
-        nr, nc = np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)
-        valid = inside & known[nr, nc]
-        ready = valid.any(axis=1)
-        if not ready.any():
-            raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
-        plan.append((r[ready], c[ready], nr[ready], nc[ready], valid[ready]))
-        known[r[ready], c[ready]] = True
-        r, c = r[~ready], c[~ready]
-    return plan
-
-
-def _fill(image: Image, plan: _Fill) -> None:
-    for r, c, nr, nc, valid in plan:
-        image[r, c] = np.where(valid, image[nr, nc], 0).sum(axis=1) / valid.sum(axis=1)
 
 
 def dead_pixels(references: References, hot_threshold: float = CorrectionSettings.hot_threshold) -> Mask:
@@ -194,7 +164,7 @@ def _air(transmission: NDArray[np.float32], left: int, right: int) -> NDArray[np
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
     """Of the neighbours of each (r, c): the median, and the third brightest (at the image edge the brightest)."""
     rows, cols = image.shape
-    nr, nc = r[:, None] + _NEIGHBOURS[:, 0], c[:, None] + _NEIGHBOURS[:, 1]
+    nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
     inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
     values = np.where(inside, image[np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)], np.float32(np.nan))
     values.sort(axis=1)  # NaN, the places outside, come last
@@ -288,7 +258,7 @@ def _transmission(
             for position, flat in sorted(references.flats, key=lambda group: group[0])
         ]
     data = np.empty(counts.shape, np.float32)
-    fill = _plan_fill(dead)
+    plan = plan_fill(dead)
     replaced = 0
     for v, view in enumerate(data):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -297,11 +267,11 @@ def _transmission(
         bad = ~np.isfinite(view) & ~dead
         n = int(bad.sum())
         if n == 0:
-            _fill(view, fill)
+            fill(view, plan)
             continue
         if n > view.size / 2:
             raise ValueError(f"view {v}: {n} of {view.size} pixels are not finite; leave this view out")
-        _fill(view, _plan_fill(bad | dead))
+        fill(view, plan_fill(bad | dead))
         replaced += n
     return data, replaced
 

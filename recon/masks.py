@@ -1,0 +1,82 @@
+"""Pixels that tell nothing: filled from their neighbours so that none spreads, and given no weight in a fit."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+Image = NDArray[np.float32]
+NEIGHBOURS = np.array([(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)])
+Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Mask]]
+
+
+def plan_fill(mask: Mask) -> Fill:
+    """Rings of masked pixels from the outside in; each takes the mean of the neighbours known before it.
+
+    Raises:
+        ValueError: where all pixels [row, col] are masked.
+    """
+    rows, cols = mask.shape
+    known = ~mask
+    r, c = np.nonzero(mask)
+    plan: Fill = []
+    while r.size:
+        nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
+        inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
+        nr, nc = np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)
+        valid = inside & known[nr, nc]
+        ready = valid.any(axis=1)
+        if not ready.any():
+            raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
+        plan.append((r[ready], c[ready], nr[ready], nc[ready], valid[ready]))
+        known[r[ready], c[ready]] = True
+        r, c = r[~ready], c[~ready]
+    return plan
+
+
+def fill(image: Image, plan: Fill) -> None:
+    """Fill the pixels that `plan` was made for, in place."""
+    for r, c, nr, nc, valid in plan:
+        image[r, c] = np.where(valid, image[nr, nc], 0).sum(axis=1) / valid.sum(axis=1)
+
+
+def masked(
+    projections: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Projections without a value that is not finite, and the weights that go with them.
+
+    Pixels that are not finite, or have no weight, take the mean of their neighbours in the same view, so that direct
+    methods and starting volumes have something to work with; a fit sees by their weight of 0 that nothing was measured.
+
+    Args:
+        projections: [view, row, col]; not changed.
+        weight: of each ray, 0 or more, [view, row, col]; None: one for all.
+
+    Returns:
+        Projections (the given ones where there is nothing to fill) and weights; None where every ray weighs one.
+
+    Raises:
+        ValueError: for weights that are negative, not finite or of another shape, or a view without a single value.
+    """
+    if weight is not None:
+        if weight.shape != projections.shape:
+            raise ValueError(f"weights have shape {weight.shape}, the projections {projections.shape}")
+        if not (np.isfinite(weight).all() and weight.min(initial=0) >= 0):
+            raise ValueError("weights must be finite and 0 or more")
+    bad = ~np.isfinite(projections)
+    if weight is not None:
+        bad |= weight == 0
+    marred = np.flatnonzero(bad.any(axis=(1, 2)))
+    if marred.size == 0:
+        return projections, weight
+    blind = np.flatnonzero(bad.all(axis=(1, 2)))
+    if blind.size:
+        raise ValueError(
+            f"{blind.size} of {len(bad)} views have no value that is finite and weighs something "
+            f"({blind[:8].tolist()} ...); leave these views out"
+        )
+    filled = np.array(projections, np.float32)
+    for view in marred:
+        fill(filled[view], plan_fill(bad[view]))
+    return filled, np.where(bad, 0, 1 if weight is None else weight).astype(np.float32)
