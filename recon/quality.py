@@ -66,7 +66,7 @@ class Preset:
 PRESETS: dict[Quality, Preset] = {
     "preview": Preset(250, 0.5),
     "standard": Preset(2000, 1.0),
-    "best": Preset(8000, 2.0),
+    "best": Preset(4000, 2.0),
 }
 
 
