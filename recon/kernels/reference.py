@@ -4,9 +4,10 @@
     ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))       (parallel beam: exact; cone: affine)
 
 With the covariance taken to the detector by the Jacobian of the projection at the centre, a third row along the ray,
-and split as [[Σ₂, v], [vᵀ, f]], the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)): the Schur complement, never
-negative, with no difference of large determinants. The exact ray of a cone needs no projection: with H = S⁻¹Rᵀ, δ from
-the source to the centre and D along the ray of a pixel,
+and split as [[Σ₂, v], [vᵀ, f]], the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)): the Schur complement, the square
+of the last pivot of Σ' = L Lᵀ. L comes from J R S itself by orthogonal steps (QR): a needle of aspect 10⁴ would leave
+nothing of the difference even in float64. The exact ray of a cone needs no projection: with H = S⁻¹Rᵀ, δ from the
+source to the centre and D along the ray of a pixel,
 
     ∫ σ dt = Σ_i ρ_i sqrt(2π) |D| / |H D| exp(-1/2 |Hδ x HD|² / |HD|²)
 
@@ -125,18 +126,18 @@ def _affine(
 ) -> Tensor:
     centre, jacobian = to_detector(in_view, geometry)
     turn = jacobian @ in_view.new_tensor(geometry.axes(view))
-    covariance = turn @ covariances(scales, quaternions) @ turn.transpose(1, 2)
-    flat, across, along = covariance[:, :2, :2], covariance[:, :2, 2:], covariance[:, 2:, 2:]
-    inverse = torch.linalg.inv(flat)
+    shaped = turn @ rotation_matrices(quaternions) * scales[:, None, :]
+    lower = torch.linalg.qr(shaped.transpose(1, 2)).R.transpose(1, 2)  # L, up to signs of its columns
     if length > 0:
         factor = torch.full_like(densities, length)
     else:
-        factor = torch.sqrt(2 * math.pi * (along - across.transpose(1, 2) @ inverse @ across).reshape(-1))
+        factor = math.sqrt(2 * math.pi) * lower[:, 2, 2].abs()
     u, v = pixels(geometry, view, in_view)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
     offset = grid[None] - centre[:, None, None, :]
-    exponent = torch.einsum("nrci,nij,nrcj->nrc", offset, inverse, offset)
-    return torch.einsum("n,nrc->rc", densities * factor, torch.exp(-0.5 * exponent))
+    first = offset[..., 0] / lower[:, 0, 0, None, None]
+    second = (offset[..., 1] - lower[:, 1, 0, None, None] * first) / lower[:, 1, 1, None, None]
+    return torch.einsum("n,nrc->rc", densities * factor, torch.exp(-0.5 * (first * first + second * second)))
 
 
 def _along_rays(
@@ -169,6 +170,6 @@ def voxelize(
     z, y, x = axes
     grid = torch.stack(torch.broadcast_tensors(x[None, None, :], y[None, :, None], z[:, None, None]), -1)
     offset = grid[None] - means[:, None, None, None, :]
-    inverse = torch.linalg.inv(covariances(scales, quaternions))
-    exponent = torch.einsum("nzyxi,nij,nzyxj->nzyx", offset, inverse, offset)
-    return torch.einsum("n,nzyx->zyx", densities, torch.exp(-0.5 * exponent))
+    whiten = rotation_matrices(quaternions).transpose(1, 2) / scales[:, :, None]  # S⁻¹Rᵀ
+    white = torch.einsum("nij,nzyxj->nzyxi", whiten, offset)
+    return torch.einsum("n,nzyx->zyx", densities, torch.exp(-0.5 * (white * white).sum(-1)))
