@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from recon.kernels.losses_cpu import gaussian_window
+from recon.kernels.losses_cpu import ABSOLUTE, L1, L2, DataTerm, gaussian_window
 
 
 def ssim(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2) -> Tensor:
@@ -33,16 +33,28 @@ def ssim_map(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.0
     return luminance * structure
 
 
-def projection_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
-    """mean w (|x - y| + ssim_weight (1 - SSIM))   (Zha et al. 2024, with weights w [row, col] >= 0; None: all 1).
+def data_term(image: Tensor, target: Tensor, term: DataTerm) -> Tensor:
+    """What each pixel costs [row, col]: see `DataTerm`."""
+    difference = image - target
+    if term.kind == L1:
+        return difference.abs()
+    through = torch.ones_like(target) if term.kind == L2 else torch.exp(-term.depth * target)
+    return through * difference**2 / (2 * term.delta)
 
-    Pixels of no weight are left out: SSIM's windows take them for zeros in both images, as they do what lies outside.
+
+def projection_loss(
+    image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None, term: DataTerm = ABSOLUTE
+) -> Tensor:
+    """mean w (D(image, target) + ssim_weight (1 - SSIM)), weights w [row, col] >= 0; None: all 1.
+
+    Zha et al. 2024 take D = |image - target|. Pixels of no weight are left out: SSIM's windows take them for zeros in
+    both images, as they do what lies outside.
     """
     if weights is None:
-        return (image - target).abs().mean() + ssim_weight * (1 - ssim(image, target))
+        return data_term(image, target, term).mean() + ssim_weight * (1 - ssim(image, target))
     seen = weights > 0
     x, y = (torch.where(seen, a, torch.zeros_like(a)) for a in (image, target))
-    return (weights * ((x - y).abs() + ssim_weight * (1 - ssim_map(x, y)))).mean()
+    return (weights * (data_term(x, y, term) + ssim_weight * (1 - ssim_map(x, y)))).mean()
 
 
 def total_variation(volume: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from recon.kernels.losses_cpu import ProjectionLoss, total_variation
-from recon.losses import projection_loss, ssim
+from recon.kernels.losses_cpu import L2, POISSON, DataTerm, ProjectionLoss, total_variation
+from recon.losses import data_term, projection_loss, ssim
 from recon.losses import total_variation as twin_total_variation
 
 
@@ -56,6 +56,36 @@ def test_weighted_loss_and_gradient_equal_the_twin(rng: np.random.Generator, sha
     other, marred = np.empty_like(image), [np.where(weights > 0, a, np.float32(1e6)) for a in (image, target)]
     assert loss(marred[0], marred[1], loss.target_maps(marred[1], weights), other, weights) == value
     np.testing.assert_array_equal(other, gradient)
+
+
+@pytest.mark.parametrize("term", [DataTerm(L2, 0.05, 1.0), DataTerm(POISSON, 0.02, 3.0)])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_squares_and_the_poisson_likelihood_equal_the_twin(
+    rng: np.random.Generator, term: DataTerm, weighted: bool
+) -> None:
+    image, target = _images(rng)
+    weights = (rng.random(image.shape) * (rng.random(image.shape) > 0.3)).astype(np.float32) if weighted else None
+    loss, gradient = ProjectionLoss(image.shape, 0.25, term=term), np.empty_like(image)
+    value = loss(image, target, loss.target_maps(target, weights), gradient, weights)
+    x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
+    w = None if weights is None else torch.from_numpy(weights.astype(np.float64))
+    expected = projection_loss(x, torch.from_numpy(target.astype(np.float64)), 0.25, w, term)
+    expected.backward()
+    assert value == pytest.approx(expected.item(), rel=1e-5)
+    assert x.grad is not None
+    np.testing.assert_allclose(gradient, x.grad.numpy(), atol=2e-5 * float(x.grad.abs().max()))
+
+
+def test_the_poisson_term_is_the_likelihood_of_counts_near_its_minimum() -> None:
+    # -log L of N counts where I0 e^-x are expected is I0 (e^-x + e^-y x) with y = -log(N / I0); delta = 1 takes I0 away.
+    y, step, depth = np.array([[0.3, 1.1, 2.5]]), 1e-3, 1.7
+    x = y + step
+
+    def likelihood(at: np.ndarray) -> np.ndarray:
+        return (np.exp(-depth * at) + np.exp(-depth * y) * depth * at) / depth**2
+
+    term = data_term(torch.from_numpy(x), torch.from_numpy(y), DataTerm(POISSON, 1.0, depth)).numpy()
+    np.testing.assert_allclose(term, likelihood(x) - likelihood(y), rtol=2e-3)
 
 
 def test_weights_of_one_change_nothing_and_of_none_leave_nothing(rng: np.random.Generator) -> None:
