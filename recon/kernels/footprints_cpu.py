@@ -12,11 +12,17 @@ and a parallel beam is the same with ax = ay = 0, g = 1 / pitch. With a = S Rᵀ
 
 μ is the central ray's integral sqrt(2π / r̂ᵀΣ⁻¹r̂), equal to the Schur complement's sqrt(2π (f - vᵀΣ₂⁻¹v)) but free of
 any subtraction (3DGS's projection, Zwicker et al. 2001, with the factor of Zha et al. 2024). Backward, with the
-moments M of the image gradient under a footprint (see `project_cpu`):
+moments M of the image gradient under a footprint, in its own directions τ and v (see `project_cpu`):
 
-    ∂W = M₀,   ∂m = W K M₁,   ∂Σ₂ = 1/2 W K M₂ K         with W = ρμ, K = Σ₂⁻¹
+    ∂W = M₀,   ∂m = W (k M_τ, l M_v - k r M_τ),   ∂T = W (Σ g G yyᵀ + M₀ hhᵀ / h·h)      W = ρμ
+    y = τ A + δv B,   A = (b x h) / (g s₁ s₂ s₃ h·h),   B = l b
 
-and for a cone through g, ax and ay to the centre. ax and ay are not clamped, as 3DGS does to keep far off-screen
+y is the offset in the Gaussian's own axes, in standard deviations: y·y = δᵀKδ, A·A = k, B·B = l, A·B = 0. T's diagonal
+is the gradient on log scales; off it, (s_k / s_j - s_j / s_k) T_jk turns axis j towards k. The gradient on rotations is
+that turn alone: what else flows to a matrix, and leaves the rotations, cancels in the quaternion, and of a needle it is
+aspect² times as large. Gradients on Σ₂ = K⁻¹, as 3DGS has them, lose aspect² as well.
+
+A cone adds what flows to the centre through g, ax and ay. These are not clamped, as 3DGS does to keep far off-screen
 Gaussians small: the clamp breaks det Σ₂ and the gradient, and moves mass where a cone is wide. A Gaussian at or behind
 the source plane has no footprint.
 
@@ -68,6 +74,28 @@ class Camera(NamedTuple):
     col: float
     row: float
     straight: bool
+
+
+@njit(inline="always", fastmath=True)
+def _turned(x, y, z, r):  # type: ignore[no-untyped-def]
+    """Rᵀ times a vector."""
+    return x * r[0] + y * r[3] + z * r[6], x * r[1] + y * r[4] + z * r[7], x * r[2] + y * r[5] + z * r[8]
+
+
+@njit(inline="always", fastmath=True)
+def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations):  # type: ignore[no-untyped-def]
+    """Add what follows from T, the gradient on a deformation along the Gaussian's own axes, see above."""
+    d_log_scales[i, 0] += t00
+    d_log_scales[i, 1] += t11
+    d_log_scales[i, 2] += t22
+    s0, s1, s2, r = scales[i, 0], scales[i, 1], scales[i, 2], rotations[i]
+    i0, i1, i2 = _f(1) / s0, _f(1) / s1, _f(1) / s2
+    x, y, z = t01 * (s1 * i0 - s0 * i1), t02 * (s2 * i0 - s0 * i2), t12 * (s2 * i1 - s1 * i2)
+    x, y, z = _f(0.5) * x, _f(0.5) * y, _f(0.5) * z
+    for j in range(0, 9, 3):
+        d_rotations[i, j] -= r[j + 1] * x + r[j + 2] * y
+        d_rotations[i, j + 1] += r[j] * x - r[j + 2] * z
+        d_rotations[i, j + 2] += r[j] * y + r[j + 1] * z
 
 
 # What is fixed when a kernel is compiled (here: straight) folds into its loop; an argument of a threaded loop does not.
@@ -163,6 +191,10 @@ def _backward(straight: bool) -> Any:
         d_centres: F32,
     ) -> None:
         f, source, plain = _f(focal), _f(sod), length > 0
+        # The view's axes are left-handed in this project; others would turn A around.
+        turned = axes[0, 0] * (axes[1, 1] * axes[2, 2] - axes[1, 2] * axes[2, 1])
+        turned -= axes[0, 1] * (axes[1, 0] * axes[2, 2] - axes[1, 2] * axes[2, 0])
+        turned += axes[0, 2] * (axes[1, 0] * axes[2, 1] - axes[1, 1] * axes[2, 0])
         for i in prange(densities.shape[0]):
             u0, u1, u2 = axes[0, 0], axes[0, 1], axes[0, 2]
             v0, v1, v2 = axes[1, 0], axes[1, 1], axes[1, 2]
@@ -173,11 +205,11 @@ def _backward(straight: bool) -> Any:
             if table[i, HU] < 0:
                 d_centres[i, 0] = d_centres[i, 1] = _f(0)
                 continue
-            m0, mx, my = moments[i, 0], moments[i, 1], moments[i, 2]
-            mxx, mxy, myy = moments[i, 3], moments[i, 4], moments[i, 5]
-            ka, shear, w = table[i, K], table[i, SHEAR], table[i, W]
-            kb, kc = -ka * shear, table[i, KV] + ka * shear * shear
-            gu, gv = w * (ka * mx + kb * my), w * (kb * mx + kc * my)
+            k, shear, kv, w = table[i, K], table[i, SHEAR], table[i, KV], table[i, W]
+            m0, mt, mv = moments[i, 0], moments[i, 1], moments[i, 2]
+            mtt, mtv, mvv = moments[i, 3], moments[i, 4], moments[i, 5]
+            gu = w * k * mt
+            gv = w * kv * mv - shear * gu
             d_centres[i, 0], d_centres[i, 1] = gu, gv
             ax, ay, g, rr, depth = _f(0), _f(0), f, _f(1), _f(1)
             if not straight and sod > 0:
@@ -185,40 +217,42 @@ def _backward(straight: bool) -> Any:
                 depth = source + (d0 * x + d1 * y + d2 * z)
                 ax, ay = (u0 * x + u1 * y + u2 * z) / depth, (v0 * x + v1 * y + v2 * z) / depth
                 g, rr = f / depth, _f(1) + ax * ax + ay * ay
-            # P = K M₂, then ∂Σ₂ = 1/2 W P K; g² takes it from 1/px² to 1/mm².
-            p00, p01 = ka * mxx + kb * mxy, ka * mxy + kb * myy
-            p10, p11 = kb * mxx + kc * mxy, kb * mxy + kc * myy
-            twice = w * g * g
-            guu, guv, gvv = twice * (p00 * ka + p01 * kb), twice * (p00 * kb + p01 * kc), twice * (p10 * kb + p11 * kc)
-
-            hh = _f(0)
-            for k in range(3):
-                r0, r1, r2 = rotations[i, k], rotations[i, 3 + k], rotations[i, 6 + k]
-                pu, pv, pd = u0 * r0 + u1 * r1 + u2 * r2, v0 * r0 + v1 * r1 + v2 * r2, d0 * r0 + d1 * r1 + d2 * r2
-                h = (ax * pu + ay * pv + pd) / scales[i, k]
-                hh += h * h
+            r, s0, s1, s2 = rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
+            pu0, pu1, pu2 = _turned(u0, u1, u2, r)
+            pv0, pv1, pv2 = _turned(v0, v1, v2, r)
+            pd0, pd1, pd2 = _turned(d0, d1, d2, r)
+            b0, b1, b2 = s0 * (pv0 - ay * pd0), s1 * (pv1 - ay * pd1), s2 * (pv2 - ay * pd2)
+            i0, i1, i2 = _f(1) / s0, _f(1) / s1, _f(1) / s2
+            h0, h1 = (ax * pu0 + ay * pv0 + pd0) * i0, (ax * pu1 + ay * pv1 + pd1) * i1
+            h2 = (ax * pu2 + ay * pv2 + pd2) * i2
+            hh = h0 * h0 + h1 * h1 + h2 * h2
+            size, level = turned / (g * (s0 * s1 * s2) * hh), kv * g
+            a0, a1, a2 = size * (b1 * h2 - b2 * h1), size * (b2 * h0 - b0 * h2), size * (b0 * h1 - b1 * h0)
+            b0, b1, b2 = level * b0, level * b1, level * b2
             d_densities[i] += m0 * (_f(length) if plain else _ROOT_TWO_PI * np.sqrt(rr / hh))
-            pull = _f(0) if plain else -w * m0 / hh  # ∂L/∂h = -W M₀ h / |h|²
-            gax = gay = grow = _f(0)
-            for k in range(3):
-                r0, r1, r2, s = rotations[i, k], rotations[i, 3 + k], rotations[i, 6 + k], scales[i, k]
-                pu, pv, pd = u0 * r0 + u1 * r1 + u2 * r2, v0 * r0 + v1 * r1 + v2 * r2, d0 * r0 + d1 * r1 + d2 * r2
-                a, b = s * (pu - ax * pd), s * (pv - ay * pd)
-                h = (ax * pu + ay * pv + pd) / s
-                ga, gb, gh = guu * a + guv * b, guv * a + gvv * b, pull * h
-                d_log_scales[i, k] += ga * a + gb * b - gh * h
-                grow += ga * a + gb * b
-                ga, gb, gh = ga * s, gb * s, gh / s
-                gax, gay = gax + gh * pu - ga * pd, gay + gh * pv - gb * pd
-                gpu, gpv, gpd = ga + gh * ax, gb + gh * ay, gh - ga * ax - gb * ay
-                d_rotations[i, k] += u0 * gpu + v0 * gpv + d0 * gpd
-                d_rotations[i, 3 + k] += u1 * gpu + v1 * gpv + d1 * gpd
-                d_rotations[i, 6 + k] += u2 * gpu + v2 * gpv + d2 * gpd
+            pull = _f(0) if plain else m0 / hh
+            # T / W = (τ A + δv B)(τ A + δv B)ᵀ + M₀ hhᵀ / h·h, as A cᵀ + B eᵀ + ...
+            c0, c1, c2 = mtt * a0 + mtv * b0, mtt * a1 + mtv * b1, mtt * a2 + mtv * b2
+            e0, e1, e2 = mtv * a0 + mvv * b0, mtv * a1 + mvv * b1, mtv * a2 + mvv * b2
+            add_shape(
+                i, scales, rotations,
+                w * (a0 * c0 + b0 * e0 + pull * h0 * h0), w * (a0 * c1 + b0 * e1 + pull * h0 * h1),
+                w * (a0 * c2 + b0 * e2 + pull * h0 * h2), w * (a1 * c1 + b1 * e1 + pull * h1 * h1),
+                w * (a1 * c2 + b1 * e2 + pull * h1 * h2), w * (a2 * c2 + b2 * e2 + pull * h2 * h2),
+                d_log_scales, d_rotations,
+            )  # fmt: skip
             tu, tv, td = f * gu, f * gv, _f(0)
             if not straight and sod > 0:
-                if not plain:  # μ grows with |ray|
-                    gax, gay = gax + w * m0 * ax / rr, gay + w * m0 * ay / rr
-                tu, tv = (tu + gax) / depth, (tv + gay) / depth
+                # ∂a = g W k Σ g G τ y and ∂b alike; a and b lose ax and ay times SRᵀd, h gains them times S⁻¹Rᵀ(u, v).
+                pd0, pd1, pd2 = s0 * pd0, s1 * pd1, s2 * pd2
+                far_t, far_v = c0 * pd0 + c1 * pd1 + c2 * pd2, e0 * pd0 + e1 * pd1 + e2 * pd2
+                gax = -g * k * far_t
+                gay = -g * (kv * far_v - k * shear * far_t)
+                if not plain:  # μ grows with |ray|, and falls as h grows
+                    gax += m0 * ax / rr - pull * (h0 * pu0 * i0 + h1 * pu1 * i1 + h2 * pu2 * i2)
+                    gay += m0 * ay / rr - pull * (h0 * pv0 * i0 + h1 * pv1 * i1 + h2 * pv2 * i2)
+                grow = w * (k * mtt + kv * mvv)
+                tu, tv = (tu + w * gax) / depth, (tv + w * gay) / depth
                 td = -(tu * ax + tv * ay + grow / depth)
             d_means[i, 0] += u0 * tu + v0 * tv + d0 * td
             d_means[i, 1] += u1 * tu + v1 * tv + d1 * td
