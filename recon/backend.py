@@ -14,9 +14,9 @@ import numpy as np
 from recon.geometry import Geometry
 from recon.kernels import losses_cpu
 from recon.kernels.activation import F32
-from recon.kernels.adam_cpu import adam
-from recon.kernels.project_cpu import render
-from recon.splat import Active, Gradients, grid_layout, view_backward, view_table
+from recon.kernels.adam_cpu import adam_all, add_lengths
+from recon.kernels.losses_cpu import ABSOLUTE, DataTerm
+from recon.splat import Active, Gradients, RayModel, RenderedView, Room, grid_layout, render_view
 from recon.volume import Grid
 
 Array = TypeVar("Array")
@@ -43,8 +43,11 @@ class Box(Protocol[Array]):
 class Pass(Protocol[Array]):
     """Physical parameters of a model, and the gradients that views and boxes of voxels have added so far."""
 
-    def view(self, geometry: Geometry, view: int, faint: float, cut: float) -> View[Array]:
-        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ."""
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> View[Array]:
+        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ.
+
+        A view must have gone back before the next one is rendered: they share memory.
+        """
 
     def box(self, grid: Grid, faint: float, cut: float) -> Box[Array]:
         """Voxelise on a grid; `faint` is a density."""
@@ -54,13 +57,15 @@ class Pass(Protocol[Array]):
 
 
 class ProjectionLoss(Protocol[Array]):
-    """mean |x - y| + λ (1 - SSIM(x, y))."""
+    """mean w (D(x, y) + λ (1 - SSIM(x, y))), see `losses_cpu.ProjectionLoss`."""
 
-    def target_maps(self, target: Array) -> Array:
-        """What is computed once a target [row, col]: blurred y and y² [2, row, col]."""
+    def target_maps(self, target: Array, weights: Array | None = None) -> Array:
+        """What is computed once for a target [row, col]."""
 
-    def __call__(self, image: Array, target: Array, target_maps: Array) -> tuple[SupportsFloat, Array]:
-        """The loss and its gradient [row, col]."""
+    def __call__(
+        self, image: Array, target: Array, target_maps: Array, weights: Array | None = None
+    ) -> tuple[SupportsFloat, Array]:
+        """The loss and its gradient [row, col], which the next call overwrites."""
 
 
 class Backend(Protocol[Array]):
@@ -75,11 +80,19 @@ class Backend(Protocol[Array]):
     def begin(self, means: Array, log_scales: Array, quaternions: Array, raw: Array, unit: float) -> Pass[Array]:
         """A pass over raw parameters; densities are unit * softplus(raw)."""
 
-    def projection_loss(self, shape: tuple[int, int], ssim_weight: float) -> ProjectionLoss[Array]:
+    def projection_loss(
+        self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
+    ) -> ProjectionLoss[Array]:
         """The loss on images of one shape."""
+
+    def misfit(self, image: Array, target: Array, weights: Array | None) -> SupportsFloat:
+        """||w (image - target)|| / ||w target||; 0 for a target of zeros."""
 
     def total_variation(self, volume: Array, weight: float) -> tuple[SupportsFloat, Array]:
         """weight * mean |difference of neighbours| of [z, y, x], and its gradient."""
+
+    def add_lengths(self, vectors: Array, factor: float, sums: Array) -> None:
+        """sums [n] += factor |vectors [n, 2]|."""
 
     def adam(
         self,
@@ -89,8 +102,9 @@ class Backend(Protocol[Array]):
         second: Sequence[Array],
         rates: Sequence[float],
         step: int,
+        bounds: Sequence[tuple[float, float] | None],
     ) -> None:
-        """Update the four parameter arrays and their moments in place; `step` counts from 1."""
+        """Update the four parameter arrays and their moments in place and keep them within bounds; steps from 1."""
 
 
 def backend_for(device: str) -> Backend[Any]:
@@ -103,6 +117,8 @@ def backend_for(device: str) -> Backend[Any]:
     """
     if device == "cpu":
         return Cpu()
+    if not device.startswith("cuda"):
+        raise ValueError(f"a fit computes on 'cpu' or on a CUDA device ('cuda', 'cuda:1'), not on {device!r}")
     from recon.kernels.gpu.engine import Gpu  # triton is loaded only where a GPU is asked for
 
     return Gpu(device)
@@ -111,6 +127,9 @@ def backend_for(device: str) -> Backend[Any]:
 class Cpu:
     """The numba kernels on numpy arrays."""
 
+    def __init__(self) -> None:
+        self._room: tuple[tuple[int, tuple[int, int]], Room] | None = None
+
     def array(self, values: F32) -> F32:
         return np.array(values, np.float32)
 
@@ -118,14 +137,29 @@ class Cpu:
         return array.copy()
 
     def begin(self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> CpuPass:
-        return CpuPass(means, log_scales, quaternions, raw, unit)
+        return CpuPass(self, means, log_scales, quaternions, raw, unit)
 
-    def projection_loss(self, shape: tuple[int, int], ssim_weight: float) -> CpuLoss:
-        return CpuLoss(shape, ssim_weight)
+    def room(self, n: int, detector_shape: tuple[int, int]) -> Room:
+        """Memory for a view of n Gaussians; the last one again where it fits."""
+        if self._room is None or self._room[0] != (n, detector_shape):
+            self._room = ((n, detector_shape), Room.of(n, detector_shape))
+        return self._room[1]
+
+    def projection_loss(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE) -> CpuLoss:
+        return CpuLoss(shape, ssim_weight, term)
+
+    def misfit(self, image: F32, target: F32, weights: F32 | None) -> float:
+        off = image - target if weights is None else weights * (image - target)
+        seen = target if weights is None else weights * target
+        power = float(np.vdot(seen, seen))
+        return (float(np.vdot(off, off)) / power) ** 0.5 if power > 0 else 0.0
 
     def total_variation(self, volume: F32, weight: float) -> tuple[float, F32]:
         gradient = np.empty_like(volume)
         return losses_cpu.total_variation(volume, gradient, weight), gradient
+
+    def add_lengths(self, vectors: F32, factor: float, sums: F32) -> None:
+        add_lengths(vectors, factor, sums)
 
     def adam(
         self,
@@ -135,22 +169,24 @@ class Cpu:
         second: Sequence[F32],
         rates: Sequence[float],
         step: int,
+        bounds: Sequence[tuple[float, float] | None],
     ) -> None:
-        for *arrays, rate in zip(parameters, gradients, first, second, rates, strict=True):
-            p, g, m, v = (a.reshape(a.shape[0], -1) for a in arrays)
-            adam(p, g, m, v, rate, step)
+        adam_all(parameters, gradients, first, second, rates, step, bounds)
 
 
 class CpuPass:
     """A pass by the numba kernels."""
 
-    def __init__(self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> None:
-        self._raw, self._unit = (quaternions, raw), unit
+    def __init__(
+        self, backend: Cpu, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float
+    ) -> None:  # fmt: skip
+        self._backend, self._raw, self._unit = backend, (quaternions, raw), unit
         self.active = Active.of(means, log_scales, quaternions, raw, unit)
         self.into = Gradients.zeros(raw.shape[0])
 
-    def view(self, geometry: Geometry, view: int, faint: float, cut: float) -> CpuView:
-        return CpuView(self, geometry, view, faint, cut)
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> CpuView:
+        room = self._backend.room(len(self.active.densities), geometry.detector_shape)
+        return CpuView(render_view(self.active, geometry, view, faint, cut, model, room=room), self.into)
 
     def box(self, grid: Grid, faint: float, cut: float) -> CpuBox:
         return CpuBox(self, grid, faint, cut)
@@ -162,15 +198,12 @@ class CpuPass:
 class CpuView:
     """A view by the numba kernels."""
 
-    def __init__(self, run: CpuPass, geometry: Geometry, view: int, faint: float, cut: float) -> None:
-        self._run, self._geometry, self._view = run, geometry, view
-        self._table = view_table(run.active, geometry, view, faint, cut)
-        self.image: F32 = np.empty(geometry.detector_shape, np.float32)
-        render(self._table, self.image)
+    def __init__(self, seen: RenderedView, into: Gradients) -> None:
+        self._seen, self._into, self.image = seen, into, seen.image
 
     def backward(self, gradient: F32) -> F32:
-        centres = np.empty((self._table.shape[0], 2), np.float32)
-        view_backward(self._run.active, self._geometry, self._view, self._table, gradient, self._run.into, centres)
+        centres = np.empty((len(self._into.densities), 2), np.float32)
+        self._seen.backward(gradient, self._into, centres)
         return centres
 
 
@@ -191,12 +224,14 @@ class CpuBox:
 class CpuLoss:
     """The fused loss by the numba kernels."""
 
-    def __init__(self, shape: tuple[int, int], ssim_weight: float) -> None:
-        self._loss = losses_cpu.ProjectionLoss(shape, ssim_weight)
+    def __init__(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm) -> None:
+        self._loss = losses_cpu.ProjectionLoss(shape, ssim_weight, term=term)
+        self._slope = np.empty(shape, np.float32)
 
-    def target_maps(self, target: F32) -> F32:
-        return self._loss.target_maps(target)
+    def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
+        return self._loss.target_maps(target, weights)
 
-    def __call__(self, image: F32, target: F32, target_maps: F32) -> tuple[float, F32]:
-        gradient = np.empty_like(image)
-        return self._loss(image, target, target_maps, gradient), gradient
+    def __call__(
+        self, image: F32, target: F32, target_maps: F32, weights: F32 | None = None
+    ) -> tuple[float, F32]:  # fmt: skip
+        return self._loss(image, target, target_maps, self._slope, weights), self._slope

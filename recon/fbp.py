@@ -109,7 +109,7 @@ def filter_projections(
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
-def _back_project(filtered, cosines, sines, axis_col, x, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _back_project(filtered, cosines, sines, axis_cols, x, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """out[z, y, x] = Σ_view filtered[view, u(x, y), z] by linear interpolation; x and y in pixels."""
     views, cols, nz = filtered.shape
     nx, ny = x.size, y.size
@@ -122,7 +122,7 @@ def _back_project(filtered, cosines, sines, axis_col, x, y, out):  # type: ignor
         acc = np.zeros((block, nz), np.float32)
         for v in range(views):
             c = cosines[v]
-            offset = y[j] * sines[v] + axis_col
+            offset = y[j] * sines[v] + axis_cols[v]
             for i in range(i0, i1):
                 t = x[i] * c + offset
                 if t < -0.5 or t > cols - 0.5:
@@ -156,6 +156,14 @@ def _rows_at(projections: NDArray[np.float32], rows: NDArray[np.float64]) -> NDA
     return low_part + projections[:, upper] * np.where(inside, weight, 0).astype(np.float32)[:, None]
 
 
+def _slab(projections: NDArray[np.float32], geometry: Geometry, rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    """All views at the detector rows that show the same heights, each where it was shifted to."""
+    if not geometry.shifts[:, 1].any():
+        return _rows_at(projections, rows)
+    moved = zip(projections, geometry.shifts[:, 1], strict=True)
+    return np.concatenate([_rows_at(view[None], rows + shift) for view, shift in moved])
+
+
 def fbp(
     projections: NDArray[np.float32], geometry: Geometry, grid: Grid | None = None, filter: Filter = "ram-lak"
 ) -> NDArray[np.float32]:
@@ -174,27 +182,33 @@ def fbp(
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
 
     Raises:
-        ValueError: where the shape does not belong to the geometry, values are not finite, or the filter is unknown.
+        ValueError: where the shape does not belong to the geometry, values are not finite, the filter is unknown, or
+            the geometry is a cone, rolled or tilted.
     """
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:
         raise ValueError(
             f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
         )
+    if geometry.is_cone:
+        raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
+    if not geometry.is_straight:
+        raise ValueError("FBP takes straight views only; these are rolled or tilted: rotate the images first")
     grid = Grid.matching(geometry) if grid is None else grid
     pitch = geometry.pixel_pitch
     z, y, x = (axis / pitch for axis in grid.coordinates())
-    rows = z + (geometry.detector_shape[0] - 1) / 2
+    rows = z + geometry.axis_row
+    axis_cols = geometry.axis_col + geometry.shifts[:, 0]
     weights = angular_weights(geometry.angles).astype(np.float32)
     out = np.empty(grid.shape, np.float32)
     views, cols = geometry.n_views, geometry.detector_shape[1]
     slab = int(np.clip(_SLAB_BYTES // (4 * views * cols), 8, 64))
     for start in range(0, rows.size, slab):
         part = slice(start, start + slab)
-        filtered = filter_projections(_rows_at(projections, rows[part]), pitch, filter)
+        filtered = filter_projections(_slab(projections, geometry, rows[part]), pitch, filter)
         filtered *= weights[:, None, None]
         if not np.isfinite(filtered).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         columns = np.ascontiguousarray(filtered.transpose(0, 2, 1))
-        _back_project(columns, np.cos(geometry.angles), np.sin(geometry.angles), geometry.axis_col, x, y, out[part])
+        _back_project(columns, np.cos(geometry.angles), np.sin(geometry.angles), axis_cols, x, y, out[part])
     return out

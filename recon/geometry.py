@@ -170,6 +170,10 @@ class Geometry:
             None, self.roll[0], self.tilt[0],
         )  # fmt: skip
 
+    def straightened(self) -> Geometry:
+        """The same views without roll and tilt."""
+        return replace(self, roll=_frozen(np.zeros(self.n_views)), tilt=_frozen(np.zeros(self.n_views)))
+
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,16 @@ from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
 from recon.fbp import angular_weights, fbp
+from recon.fdk import covers_the_circle, fdk
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.splat import project
+from recon.iterative import solve
+from recon.operators import Projector
+from recon.solvers import OsSirtTv
+from recon.splat import RayModel, project
 from recon.volume import Grid, Volume
+
+Start = Literal["fbp", "tv"]
 
 # Voxels below this fraction of the density unit hold no matter worth a Gaussian (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
@@ -21,6 +28,8 @@ MATTER = 0.05
 # Standard deviation of a new Gaussian in distances to its neighbours. Zha et al. take 1; narrower ones start sharper
 # and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3; 0.55 loses on the walnut).
 _SPREAD = 0.8
+
+_SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum more of them only begin to follow the noise
 
 
 def density_unit(volume: Volume) -> float:
@@ -36,13 +45,22 @@ def default_count(grid: Grid) -> int:
 
 
 def place(
-    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, count: int | None, rng: np.random.Generator
+    projections: NDArray[np.float32],
+    geometry: Geometry,
+    grid: Grid,
+    count: int | None,
+    rng: np.random.Generator,
+    *,
+    start: Start = "fbp",
+    rays: RayModel | None = None,
 ) -> Gaussians:
-    """The starting point of a fit: Gaussians drawn from an FBP of the data [view, row, col], scaled to the data.
+    """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
 
     Args:
         grid: a box that holds all that the views see (`Grid.of_field`): matter outside could not be explained.
         count: how many; None derives it from the grid.
+        start: which volume, see `first_volume`.
+        rays: what a Gaussian gives a ray in the fit to come.
 
     Raises:
         ValueError: for a count below 1, and where the data hold no matter or are no line integrals.
@@ -50,13 +68,29 @@ def place(
     wanted = default_count(grid) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
+    volume = first_volume(projections, geometry, grid, start)
+    cols, axis = geometry.detector_shape[1], geometry.axis_col
+    radius = max(axis + 0.5, cols - axis - 0.5) * geometry.sample_pitch
+    placed = sample_gaussians(volume, wanted, rng, field_radius=radius)
+    return scale_to_data(placed, projections, geometry, rays=rays)
+
+
+def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp") -> Volume:
+    """A quick volume to draw Gaussians from, 1/mm.
+
+    "fbp": FBP or FDK; a cone's short scan, for which there is no FDK here, gets a few sweeps of OS-SIRT with TV
+    instead. "tv": these sweeps, always: slower, and without streaks where views are few. Rolled and tilted views count
+    as straight ones here: the fit knows better.
+    """
+    straight = geometry.straightened()
+    if start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles)):
+        sweeps = OsSirtTv(iterations=_SWEEPS, momentum=True)
+        return solve(sweeps, Projector(straight, grid), projections)
+    if geometry.is_cone:
+        return Volume(fdk(projections, straight, grid, "hann"), grid)
     # Views over a part of the half circle give an FBP that is weaker by that part; the unit must not be.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
-    volume = Volume(fbp(projections, geometry, grid, "hann") * whole, grid)
-    cols, axis = geometry.detector_shape[1], geometry.axis_col
-    radius = max(axis + 0.5, cols - axis - 0.5) * geometry.pixel_pitch
-    placed = sample_gaussians(volume, wanted, rng, field_radius=radius)
-    return scale_to_data(placed, projections, geometry)
+    return Volume(fbp(projections, straight, grid, "hann") * whole, grid)
 
 
 def sample_gaussians(
@@ -114,7 +148,11 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def scale_to_data(
-    gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, views: int = 12
+    gaussians: Gaussians,
+    projections: NDArray[np.float32],
+    geometry: Geometry,
+    views: int = 12,
+    rays: RayModel | None = None,
 ) -> Gaussians:
     """The same Gaussians with all densities times k, k = <Aρ, P> / <Aρ, Aρ> over a few views.
 
@@ -122,7 +160,7 @@ def scale_to_data(
     and makes the start independent of units and of the number of Gaussians.
     """
     chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))
-    rendered = project(gaussians, geometry, chosen.tolist()).numpy()
+    rendered = project(gaussians, geometry, chosen.tolist(), model=rays).numpy()
     measured = np.asarray(projections[chosen], np.float64)
     power = float((rendered.astype(np.float64) ** 2).sum())
     factor = float((rendered * measured).sum()) / power if power > 0 else 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, get_args
@@ -14,14 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from recon import fit
+from recon import iterative
 from recon.fbp import Filter, fbp
+from recon.fdk import fdk
+from recon.fit import FitSettings, Progress
+from recon.gaussian_fit import FitRequest, run_fit
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.initialise import place
+from recon.initialise import Start
+from recon.masks import masked
+from recon.operators import Projector
+from recon.solvers import FistaTv, OsSirtTv
 from recon.volume import Grid, Volume
 
-Method = Literal["r2", "fbp"]
+Method = Literal["r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"]
 DEFAULT_STEPS = 2000
 
 
@@ -32,18 +38,20 @@ class Reconstruction:
     Attributes:
         volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
         seconds: wall time of the reconstruction.
-        history: the fit's own curve, empty for a direct method.
+        history: the fit's or the iterations' own curve, empty for a direct method.
         method: how.
         gaussians: the model behind an "r2" volume.
         settings: every parameter that was used.
+        checkpoint: the state of an "r2" fit, which `resume` takes up again; see `checkpoint.arrays_of`.
     """
 
     volume: Volume
     seconds: float
-    history: tuple[fit.Progress, ...]
+    history: tuple[Progress, ...]
     method: Method
     gaussians: Gaussians | None
     settings: Mapping[str, Any]
+    checkpoint: Mapping[str, NDArray[Any]] | None = None
 
 
 def reconstruct(
@@ -57,88 +65,116 @@ def reconstruct(
     seed: int = 0,
     *,
     filter: Filter = "hann",
-    settings: fit.FitSettings | None = None,
+    settings: FitSettings | None = None,
     seconds: float | None = None,
-    on_progress: Callable[[fit.Progress], None] | None = None,
+    start: Start = "fbp",
+    held_out: Sequence[int] = (),
+    early_stop: bool = False,
+    resume: Mapping[str, NDArray[Any]] | None = None,
+    device: str = "cpu",
+    iterations: int | None = None,
+    tv_weight: float | None = None,
+    weights: NDArray[np.float32] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
     now: Callable[[], float] = time.perf_counter,
 ) -> Reconstruction:
     """Line integrals to a volume.
 
     Args:
-        projections: [view, row, col], -log of the transmission, finite; any real type (a CPU tensor too).
+        projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
+            finite are filled from their neighbours and weigh nothing.
         geometry: of these views.
         grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
             small box holds what the whole volume holds there.
-        method: "r2" (R²-Gaussian fit) or "fbp".
-        steps: of the fit, one view each; 0 gives the starting point; None takes 2000, or as many as fit into `seconds`.
+        method: "r2" (R²-Gaussian fit), "fbp" (FDK for a cone), or a classical iterative one, see `iterative.solve`.
+        steps: of the fit; 0 gives the starting point; None takes 2000, or as many as fit into `seconds`.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         densify: the fit may clone, split and prune.
         seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.
         filter: of "fbp" ("ram-lak", "shepp-logan" or "hann"). The smooth one is best for few or noisy views.
         settings: of the fit, in full; overrides `densify`.
         seconds: a time budget for the fit; the rates decay along it.
-        on_progress: called about ten times a second.
+        start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
+        held_out: views that the fit does not see; their residual is in the history.
+        early_stop: end the fit when that residual has not fallen for a while, and return the model that had it lowest.
+        resume: the checkpoint of a fit with the same data and settings, to be taken up where it was left.
+        device: "cpu", or a CUDA device for the fit.
+        iterations, tv_weight: of a classical method; None: its defaults. The weight is in density units.
+        weights: of each ray [view, row, col], 0 or more; for "r2" and the iterative methods.
+        on_progress: called about ten times a second, or after each iteration.
         should_stop: asked between steps; a stopped fit returns what it has.
         now: a clock in s.
 
     Raises:
-        ValueError: for shapes that disagree, values that are not finite, views from one side only, numbers out of
-            range, or data without matter.
+        ValueError: for shapes that disagree, views from one side only, numbers out of range, options of another
+            method, or data without matter.
     """
-    _check(method, filter, geometry, steps, seconds)
+    options = {
+        "method": (method, get_args(Method)),
+        "filter": (filter, get_args(Filter)),
+        "start": (start, get_args(Start)),
+    }
+    _check(options, geometry, steps, seconds)
+    fits = {"steps": steps, "seconds": seconds, "resume": resume}
+    if method != "r2" and any(value is not None for value in fits.values()):
+        raise ValueError(f"{', '.join(fits)} are of the r2 fit; {method} has none")
+    if method in ("r2", "fbp") and (iterations is not None or tv_weight is not None):
+        raise ValueError(f"iterations and tv_weight are of the classical iterative methods; {method} has none")
     data = _line_integrals(projections, geometry)
     begin = now()
     target = grid or Grid.matching(geometry)
+    if method == "r2":
+        if steps is None and seconds is None:
+            steps = DEFAULT_STEPS
+        chosen = settings or FitSettings()
+        if settings is None and not densify:
+            chosen = replace(chosen, policy=None)
+        request = FitRequest(
+            chosen, steps, seconds, gaussians, seed, start, tuple(held_out), early_stop, resume, device
+        )
+        fitted = run_fit(data, weights, geometry, target, request, on_progress, should_stop, now)
+        return Reconstruction(
+            fitted.volume, now() - begin, fitted.history, method, fitted.gaussians, MappingProxyType(fitted.settings),
+            fitted.checkpoint,
+        )  # fmt: skip
     if method == "fbp":
-        volume = Volume(fbp(data, geometry, target, filter), target)
+        filled = masked(data, weights)[0]
+        volume = Volume((fdk if geometry.is_cone else fbp)(filled, geometry, target, filter), target)
         return Reconstruction(volume, now() - begin, (), method, None, MappingProxyType({"filter": filter}))
+    how = iterative.default_settings(method)
+    if tv_weight is not None:
+        if not isinstance(how, FistaTv | OsSirtTv):
+            raise ValueError(f"tv_weight is of fista-tv and os-sirt-tv; {method} has none")
+        how = replace(how, tv_weight=tv_weight)
+    if iterations is not None:
+        how = replace(how, iterations=iterations)
+    history: list[Progress] = []
 
-    chosen = settings or fit.FitSettings()
-    if settings is None and not densify:
-        chosen = replace(chosen, policy=None)
-    field = Grid.of_field(geometry, max(geometry.pixel_pitch, target.voxel_size))
-    start = (
-        gaussians
-        if isinstance(gaussians, Gaussians)
-        else place(data, geometry, field, gaussians, np.random.default_rng(seed))
-    )
-    state = fit.init(start, seed, fit.growth(chosen))
-    problem = fit.make_problem(data, geometry, field, start.density_unit, chosen)
-    if steps is None and seconds is None:
-        steps = DEFAULT_STEPS
-    planned = steps or 0  # 0 in a history: no number of steps was planned
-    history: list[fit.Progress] = []
-    fit_begin = said = now()
-    while steps is None or state.step < steps:
-        spent = now() - fit_begin
-        if seconds is not None and spent >= seconds and state.step > 0:
-            break
-        fraction = max(state.step / planned if planned else 0.0, spent / seconds if seconds else 0.0)
-        fit.step(state, problem, chosen, min(1.0, fraction))
-        if now() - said > 0.1 or state.step == 1:
-            said = now()
-            history.append(_progress(state, planned, said - begin, geometry.n_views))
-            if on_progress is not None:
-                on_progress(history[-1])
-        if should_stop is not None and should_stop():
-            break
-    history.append(_progress(state, planned, now() - begin, geometry.n_views))
-    if on_progress is not None:
-        on_progress(history[-1])
-    volume = fit.volume_of(state, target, chosen)
-    used = {**asdict(chosen), "steps": state.step, "seed": seed, "gaussians_at_start": start.n, "gaussians": state.n}
-    return Reconstruction(
-        volume, now() - begin, tuple(history), method, fit.gaussians_of(state), MappingProxyType(used)
-    )
+    def told(iteration: int, residual: float) -> None:
+        history.append(
+            Progress(iteration, how.iterations, now() - begin, residual, residual, 0, geometry.n_views)
+        )  # fmt: skip
+        if on_progress is not None:
+            on_progress(history[-1])
+
+    filled, known = masked(data, weights)
+    volume = iterative.solve(
+        how, Projector(geometry, target), filled, weight=known, on_iteration=told, should_stop=should_stop, seed=seed
+    )  # fmt: skip
+    used = {**asdict(how), "seed": seed}
+    return Reconstruction(volume, now() - begin, tuple(history), method, None, MappingProxyType(used))
 
 
-def _check(method: str, filter: str, geometry: Geometry, steps: int | None, seconds: float | None) -> None:
-    for name, value, legal in (("method", method, get_args(Method)), ("filter", filter, get_args(Filter))):
+def _check(
+    options: Mapping[str, tuple[str, Sequence[str]]], geometry: Geometry, steps: int | None, seconds: float | None
+) -> None:
+    for name, (value, legal) in options.items():
         if value not in legal:
-            raise ValueError(f"{name} must be one of {legal}, got {value!r}")
-    # Views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
-    if np.abs(np.sin(geometry.angles - geometry.angles[0])).max() < 1e-6:
+            raise ValueError(f"{name} must be one of {tuple(legal)}, got {value!r}")
+    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
+    turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone else 1)
+    if np.abs(np.sin(turn)).max() < 1e-6:
         raise ValueError(
             f"{geometry.n_views} views from one side ({np.rad2deg(geometry.angles[0]):g} degrees): one view does not "
             "determine a volume; give at least two, at different angles"
@@ -156,12 +192,5 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     expected = (geometry.n_views, *geometry.detector_shape)
     if given.shape != expected:
         raise ValueError(f"projections have shape {given.shape}, the geometry says {expected} [view, row, col]")
-    with np.errstate(over="ignore"):  # what float32 cannot hold is told as not finite
-        data = np.ascontiguousarray(given, np.float32)
-    if not np.isfinite(data).all():
-        raise ValueError(f"{int((~np.isfinite(data)).sum())} of {data.size} projection values are not finite")
-    return data
-
-
-def _progress(state: fit.FitState, planned: int, seconds: float, n_views: int) -> fit.Progress:
-    return fit.Progress(state.step, planned, seconds, state.loss, state.residual, state.n, n_views)
+    with np.errstate(over="ignore"):  # what float32 cannot hold counts as not finite
+        return np.ascontiguousarray(given, np.float32)

@@ -21,6 +21,7 @@ from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import place
 from recon.kernels.activation import F32
+from recon.problem import Problem, extend
 from recon.volume import Grid, Volume
 
 _NEWEST = 0.2  # this share of the views counts as the newest
@@ -65,7 +66,7 @@ class StreamingFit:
         self._now, self._start = now, now()
         self._data: list[F32] = []
         self._angles: list[float] = []
-        self._problem: fit.Problem | None = None
+        self._problem: Problem | None = None
         self._state: fit.FitState | None = None
         self._round_views, self._round_step, self._placed = 0, 0, 0
 
@@ -101,7 +102,7 @@ class StreamingFit:
         if self._problem is None:
             self._data.extend(images)
         else:
-            self._problem = fit.extend(self._problem, images, theta)
+            self._problem = extend(self._problem, images, theta)
 
     def move_axis(self, axis_col: float) -> None:
         """Say that the rotation axis lies elsewhere. The model stays: a fraction of a pixel is soon learnt again.
@@ -195,7 +196,7 @@ class StreamingFit:
                 return
         elif self._problem is not None and max(float(image.max()) for image in self._problem.images) > _BLIND:
             # The sample came, or the shutter opened, after the first views: their scale is that of noise.
-            self._data = [image * self._problem.scale for image in self._problem.images]
+            self._data = list(self._problem.projections)
             self._place_first()
         assert self._state is not None
         # Room is for what later views show: early ones span a narrow angle and would fill it with their streaks.
@@ -207,9 +208,9 @@ class StreamingFit:
     def _place_first(self) -> None:
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        field = Grid.of_field(self._template, max(geometry.pixel_pitch, self._grid.voxel_size))
+        field = Grid.of_field(self._template, max(geometry.sample_pitch, self._grid.voxel_size))
         placed = place(data, geometry, field, self._count, self._rng)
-        self._problem = fit.make_problem(data, geometry, field, placed.density_unit, self._settings)
+        self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
         self._state = fit.init(placed, self._rng)
         self._placed = placed.n
         self._data = []  # the problem holds them from now on

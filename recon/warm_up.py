@@ -22,7 +22,7 @@ def warm_up() -> None:
     grid = Grid.matching(views)
     settings = fit.FitSettings(policy=DensityPolicy(start=0, every=1, threshold=0.0))
     placed = place(data, views, grid, 50, np.random.default_rng(0))
-    problem = fit.make_problem(data, views, grid, placed.density_unit, settings)
+    problem = fit.problem_of(data, views, grid, placed.density_unit, settings)
     state = fit.init(placed, 0, fit.growth(settings))
     fit.run(state, problem, settings, 3)
     fit.volume_of(state, grid, settings)

@@ -148,7 +148,7 @@ def test_a_whole_step_and_its_parts() -> None:
     noise = np.random.default_rng(2).normal(1, 0.05, (4, SIDE, SIDE)).astype(np.float32)
     data = project(g, views).numpy() * noise
     settings = fit.FitSettings(policy=None)
-    problem = fit.make_problem(data, views, Grid.matching(views), g.density_unit, settings)
+    problem = fit.problem_of(data, views, Grid.matching(views), g.density_unit, settings)
     state = fit.init(g, 0)
     p, unit, n = state.parameters, 1 / problem.half_field, state.n
     step = _times(lambda: fit.step(state, problem, settings, 0.3, view=2))

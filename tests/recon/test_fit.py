@@ -25,7 +25,7 @@ PLAIN = fit.FitSettings(policy=None, tv_weight=0.0)
 
 
 def _problem(truth: Gaussians, settings: fit.FitSettings) -> fit.Problem:
-    return fit.make_problem(project(truth, VIEWS).numpy(), VIEWS, GRID, truth.density_unit, settings)
+    return fit.problem_of(project(truth, VIEWS).numpy(), VIEWS, GRID, truth.density_unit, settings)
 
 
 def _disturbed(truth: Gaussians, rng: np.random.Generator) -> Gaussians:
@@ -199,7 +199,7 @@ def test_the_unit_of_length_does_not_matter(random_gaussians: Make, rng: np.rand
             for g in (truth, start)
         ]
         data = project(scaled[0], views).numpy()
-        problem = fit.make_problem(data, views, Grid.matching(views), 0.7 / factor, settings)
+        problem = fit.problem_of(data, views, Grid.matching(views), 0.7 / factor, settings)
         return fit.run(fit.init(scaled[1], 0), problem, settings, 10).loss
 
     assert loss(length) == pytest.approx(loss(1.0), rel=1e-3)
@@ -208,10 +208,45 @@ def test_the_unit_of_length_does_not_matter(random_gaussians: Make, rng: np.rand
 def test_bad_data_are_refused(random_gaussians: Make) -> None:
     data = project(random_gaussians(3), VIEWS).numpy()
     with pytest.raises(ValueError, match="shape"):
-        fit.make_problem(data[1:], VIEWS, GRID, 1.0, PLAIN)
-    data[2, 3, 4] = np.nan
-    with pytest.raises(ValueError, match="1 of"):
-        fit.make_problem(data, VIEWS, GRID, 1.0, PLAIN)
+        fit.problem_of(data[1:], VIEWS, GRID, 1.0, PLAIN)
+    data[2] = np.nan
+    with pytest.raises(ValueError, match="no value that is finite"):
+        fit.problem_of(data, VIEWS, GRID, 1.0, PLAIN)
+
+
+def test_values_that_are_not_finite_pull_at_nothing(random_gaussians: Make) -> None:
+    # What stands in a pixel of no weight must not change a bit of the fit.
+    g = random_gaussians(20, extent=6.0)
+    data = project(g, VIEWS).numpy()
+    marred, other = data.copy(), data.copy()
+    marred[:, 3:6, 4:8], other[:, 3:6, 4:8] = np.nan, np.inf
+    start = replace(g, means=g.means + 0.1)
+    runs = [
+        fit.run(fit.init(start, 0), fit.problem_of(d, VIEWS, GRID, 1.0, PLAIN), PLAIN, 5) for d in (marred, other)
+    ]  # fmt: skip
+    for name in fit.NAMES:
+        assert np.isfinite(runs[0].parameters[name]).all()
+        np.testing.assert_array_equal(runs[0].parameters[name], runs[1].parameters[name])
+
+
+def test_a_step_on_all_views_takes_the_mean_gradient(random_gaussians: Make) -> None:
+    # Adam's first moment after one step is a tenth of the gradient; the mean over views is that of the single ones.
+    g = random_gaussians(12, extent=6.0)
+    data = project(replace(g, means=g.means + 0.2), VIEWS).numpy()
+    alone = replace(PLAIN, tv_weight=0.0, policy=None)
+    problem = fit.problem_of(data, VIEWS, GRID, 1.0, alone)
+    singles = [fit.step(fit.init(g, 0), problem, alone, 0.0, view=v).first for v in range(VIEWS.n_views)]
+    together = fit.step(fit.init(g, 0), problem, replace(alone, views_per_step=VIEWS.n_views), 0.0)
+    for name in fit.NAMES:
+        expected = np.mean([first[name] for first in singles], axis=0)
+        np.testing.assert_allclose(together.first[name], expected, atol=1e-5 * np.abs(expected).max())
+    assert together.seen == VIEWS.n_views
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for bad in ({"views_per_step": 0}, {"coarse": 0}, {"tv_weight": -1.0}, {"ssim_weight": float("nan")}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            fit.FitSettings(**bad)
 
 
 def test_a_model_without_gaussians_or_with_bad_ones_is_refused(random_gaussians: Make) -> None:
@@ -237,7 +272,7 @@ def test_views_of_nothing_leave_a_model_to_go_on_with(random_gaussians: Make) ->
     policy = DensityPolicy(start=0, stop=2, every=10, prune_below=1e3)
     settings = fit.FitSettings(policy=policy)
     empty = np.zeros((VIEWS.n_views, *VIEWS.detector_shape), np.float32)
-    state = fit.run(fit.init(g, 0), fit.make_problem(empty, VIEWS, GRID, 1.0, settings), settings, 25)
+    state = fit.run(fit.init(g, 0), fit.problem_of(empty, VIEWS, GRID, 1.0, settings), settings, 25)
     assert state.n == 10 and state.step == 25
     assert all(np.isfinite(values).all() for values in state.parameters.values())
 

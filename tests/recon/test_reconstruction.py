@@ -9,7 +9,12 @@ import pytest
 import torch
 
 import recon
+import recon.initialise
+import recon.reconstruction
+from recon import fit
 from recon.metrics import psnr
+from recon.operators import Projector
+from recon.splat import RayModel, project, voxelize
 from simulators.phantom import Detector, Phantom
 from simulators.solids import Cylinder, Ellipsoid
 
@@ -126,8 +131,8 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
     [
         ({"method": "magic"}, "method must be one of"),
         ({"projections": np.zeros((3, 20, 40))}, "geometry says"),
-        ({"projections": np.full((24, 20, 40), np.nan)}, "not finite"),
-        ({"projections": np.full((24, 20, 40), 1e300)}, "not finite"),
+        ({"projections": np.full((24, 20, 40), np.nan)}, "no value that is finite"),
+        ({"projections": np.full((24, 20, 40), 1e300)}, "no value that is finite"),
         ({"projections": np.ones((24, 20, 40), complex)}, "real numbers"),
         ({"projections": np.zeros((24, 20, 40))}, "no matter"),
         ({"filter": "magic"}, "filter must be one of"),
@@ -135,6 +140,16 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
         ({"seconds": -1.0}, "seconds must be"),
         ({"seconds": float("nan")}, "seconds must be"),
         ({"gaussians": 0}, "at least one Gaussian"),
+        ({"start": "magic"}, "start must be one of"),
+        ({"held_out": (24,)}, "views 0 to 23"),
+        ({"held_out": tuple(range(24))}, "none is left"),
+        ({"early_stop": True}, "there are none"),
+        ({"iterations": 3}, "r2 has none"),
+        ({"method": "sirt", "steps": 3}, "sirt has none"),
+        ({"method": "sirt", "tv_weight": 0.1}, "sirt has none"),
+        ({"method": "fbp", "iterations": 3}, "fbp has none"),
+        ({"resume": {}}, "no checkpoint"),
+        ({"device": "abacus"}, "not on 'abacus'"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
     ],
 )
@@ -142,6 +157,95 @@ def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], mess
     arguments = {"projections": noisy, "geometry": VIEWS} | change
     with pytest.raises(ValueError, match=message):
         recon.reconstruct(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("method", "iterations", "margin"),
+    [("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0), ("fista-tv", 60, 3.0),
+     ("os-sirt-tv", 20, 3.0)],
+)  # fmt: skip
+def test_classical_methods_by_the_same_call_beat_fbp(
+    phantom: Phantom, noisy: np.ndarray, method: recon.reconstruction.Method, iterations: int, margin: float
+) -> None:
+    truth = phantom.attenuation(GRID)
+    baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, method="fbp").volume.data)
+    seen: list[int] = []
+    result = recon.reconstruct(
+        noisy, VIEWS, method=method, iterations=iterations, on_progress=lambda p: seen.append(p.step)
+    )
+    assert psnr(truth, result.volume.data) > baseline + margin
+    assert seen == list(range(1, iterations + 1)) and result.history[-1].residual < 0.2
+    assert result.gaussians is None and result.settings["iterations"] == iterations
+
+
+def test_views_held_out_are_measured_and_not_fitted(noisy: np.ndarray) -> None:
+    spoilt = noisy.copy()
+    spoilt[5] *= 3
+    kept, other = (
+        recon.reconstruct(data, VIEWS, steps=60, gaussians=800, held_out=(5, 17)) for data in (noisy, spoilt)
+    )  # fmt: skip
+    np.testing.assert_array_equal(kept.volume.data, other.volume.data)
+    assert kept.history[-1].n_views == 22
+    assert other.history[-1].held_out > 3 * kept.history[-1].held_out > 0
+
+
+def test_a_fit_may_end_where_views_held_out_stop_getting_better(noisy: np.ndarray) -> None:
+    loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)
+    options = {"gaussians": 3000, "held_out": tuple(range(0, 24, 4)), "settings": fit.FitSettings(pace=15.0)}
+    early = recon.reconstruct(loud, VIEWS, steps=3000, early_stop=True, **options)  # type: ignore[arg-type]
+    assert early.history[-1].step < 3000
+    lowest = min(p.held_out for p in early.history if np.isfinite(p.held_out))
+    # What comes back is the model that was best, not the one that stopped.
+    again = recon.reconstruct(
+        loud, VIEWS, steps=0, gaussians=early.gaussians, held_out=tuple(range(0, 24, 4))
+    )  # fmt: skip
+    assert again.history[-1].held_out == pytest.approx(lowest, rel=1e-4)
+
+
+def test_a_fit_can_be_left_and_taken_up_again(noisy: np.ndarray) -> None:
+    whole = recon.reconstruct(noisy, VIEWS, steps=120, gaussians=600)
+    asked: list[int] = []
+    part = recon.reconstruct(
+        noisy, VIEWS, steps=120, gaussians=600, should_stop=lambda: asked.append(0) or len(asked) >= 50
+    )
+    assert part.history[-1].step == 50 and part.checkpoint is not None
+    rest = recon.reconstruct(noisy, VIEWS, steps=120, resume=part.checkpoint)
+    np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [fit.FitSettings(loss="l2"), fit.FitSettings(loss="poisson"), fit.FitSettings(coarse=2, coarse_until=0.5),
+     fit.FitSettings(views_per_step=3)],
+)  # fmt: skip
+def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, settings: fit.FitSettings) -> None:
+    truth = phantom.attenuation(GRID)
+    baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, method="fbp").volume.data)
+    result = recon.reconstruct(noisy, VIEWS, steps=300, gaussians=2500, settings=settings)
+    assert psnr(truth, result.volume.data) > baseline + 1
+
+
+@pytest.mark.parametrize("start", ["fbp", "tv"])
+def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.initialise.Start) -> None:
+    # Data of the voxel projector: nothing of the fit's own formulas.
+    truth = phantom.attenuation(GRID)
+    around = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    cone = recon.Geometry.cone(around, SHAPE, 2 * PITCH, 12.0, 24.0, axis_col=18.3)
+    data = Projector(cone, GRID).forward(truth)
+    baseline = psnr(truth, recon.reconstruct(data, cone, GRID, "fbp").volume.data)
+    settings = fit.FitSettings(rays=RayModel(exact_above=0.01))
+    result = recon.reconstruct(data, cone, GRID, steps=500, gaussians=2500, settings=settings, start=start)
+    assert psnr(truth, result.volume.data) > baseline + 1
+
+
+def test_tilted_views_are_fitted_as_they_are(phantom: Phantom, noisy: np.ndarray) -> None:
+    start = recon.reconstruct(noisy, VIEWS, steps=200, gaussians=2000).gaussians
+    assert start is not None
+    tilted = recon.Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=18.3, tilt=0.15, roll=0.03)
+    data = project(start, tilted).numpy()
+    told, untold = (recon.reconstruct(data, g, GRID, steps=300, gaussians=2000) for g in (tilted, VIEWS))
+    truth = voxelize(start, GRID).numpy()
+    assert psnr(truth, told.volume.data) > psnr(truth, untold.volume.data) + 3
 
 
 def test_one_view_is_refused(noisy: np.ndarray) -> None:

@@ -377,7 +377,7 @@ def test_a_step_of_a_fit_is_the_same_on_both_backends(random_gaussians: Make) ->
     # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.
     settings = fit.FitSettings(policy=None, truncation=Truncation(9.0, 1e-12))
     data = np.random.default_rng(5).random((2, *SHAPE)).astype(np.float32)
-    problem = fit.make_problem(data, geometry, grid, UNIT, settings)
+    problem = fit.problem_of(data, geometry, grid, UNIT, settings)
     state = fit.init(g, 11)
     box = Grid((6, 6, 6), grid.voxel_size, (0.2, -0.4, 0.1))
     ours, theirs = (_step(backend, state, problem, settings, box) for backend in (Cpu(), backend_for("cuda")))

@@ -77,7 +77,7 @@ def test_squares_and_the_poisson_likelihood_equal_the_twin(
 
 
 def test_the_poisson_term_is_the_likelihood_of_counts_near_its_minimum() -> None:
-    # -log L of N counts where I0 e^-x are expected is I0 (e^-x + e^-y x) with y = -log(N / I0); delta = 1 takes I0 away.
+    # -log L of N counts where I0 e^-x are expected is I0 (e^-x + e^-y x), y = -log(N / I0); delta = 1 takes I0 away.
     y, step, depth = np.array([[0.3, 1.1, 2.5]]), 1e-3, 1.7
     x = y + step
 

@@ -1,0 +1,176 @@
+"""A whole R²-Gaussian fit: placing, steps against a count or a clock, held-out views, and what it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import fit
+from recon.backend import Backend, backend_for
+from recon.checkpoint import arrays_of, state_from
+from recon.fit import FitSettings, FitState, Progress
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.initialise import Start, place
+from recon.kernels.activation import F32
+from recon.masks import masked
+from recon.problem import Problem, coarser
+from recon.volume import Grid, Volume
+
+_LOOK = 50  # steps between two looks at the views held out
+_PATIENCE = 0.2  # of the steps planned, and at least six looks, may pass without a better one
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What is asked of a fit; the words are those of `reconstruct`."""
+
+    settings: FitSettings
+    steps: int | None
+    seconds: float | None
+    gaussians: int | Gaussians | None
+    seed: int
+    start: Start
+    held_out: tuple[int, ...]
+    early_stop: bool
+    resume: Mapping[str, NDArray[Any]] | None
+    device: str
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit leaves; the words are those of `Reconstruction`."""
+
+    volume: Volume
+    history: tuple[Progress, ...]
+    gaussians: Gaussians
+    settings: dict[str, Any]
+    checkpoint: Mapping[str, NDArray[Any]]
+
+
+@dataclass(eq=False)
+class _Watch:
+    """The residual of views held out, and the model that had it lowest."""
+
+    problem: Problem | None
+    settings: FitSettings
+    value: float = float("nan")
+    best: float = float("inf")
+    best_step: int = 0
+    kept: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def look(self, state: FitState, keep: bool) -> None:
+        if self.problem is None:
+            return
+        self.value = fit.misfit_of(state, self.problem, self.settings)
+        if self.value < self.best:
+            self.best, self.best_step = self.value, state.step
+            if keep:
+                self.kept = arrays_of(state, self.problem.backend)
+
+
+def run_fit(
+    data: F32,
+    weights: F32 | None,
+    geometry: Geometry,
+    grid: Grid,
+    request: FitRequest,
+    on_progress: Callable[[Progress], None] | None,
+    should_stop: Callable[[], bool] | None,
+    now: Callable[[], float],
+) -> Fitted:
+    """Fit line integrals [view, row, col]; see `reconstruct`.
+
+    Raises:
+        ValueError: as `reconstruct`.
+    """
+    begin, settings = now(), request.settings
+    backend = backend_for(request.device)
+    used, kept_back = _split(geometry.n_views, request.held_out, request.early_stop)
+    data, weights = masked(data, weights)
+    seen, known = geometry.select(used), None if weights is None else weights[used]
+    field_grid = Grid.of_field(geometry, max(geometry.sample_pitch, grid.voxel_size))
+    state, n_start, unit = _first_state(data[used], seen, field_grid, request, backend)
+    problem = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
+    rough = problem
+    if settings.coarse > 1:
+        rough = coarser(problem, settings.coarse, settings.loss, settings.ssim_weight)
+    unseen = None
+    if kept_back.size:
+        others = None if weights is None else weights[kept_back]
+        unseen = fit.problem_of(
+            data[kept_back], geometry.select(kept_back), field_grid, unit, settings, backend, others
+        )  # fmt: skip
+    watch = _Watch(unseen, settings)
+
+    planned, history = request.steps or 0, []  # 0 in a history: no number of steps was planned
+    steps, seconds = request.steps, request.seconds
+
+    def tell(at: float) -> None:
+        history.append(
+            Progress(
+                state.step, planned, at - begin, float(state.loss), float(state.residual), state.n, seen.n_views,
+                watch.value,
+            )
+        )  # fmt: skip
+        if on_progress is not None:
+            on_progress(history[-1])
+
+    fit_begin = said = now()
+    done = 0
+    while steps is None or state.step < steps:
+        spent = now() - fit_begin
+        if seconds is not None and spent >= seconds and done > 0:
+            break
+        fraction = min(1.0, max(state.step / planned if planned else 0.0, spent / seconds if seconds else 0.0))
+        fit.step(state, rough if fraction < settings.coarse_until else problem, settings, fraction)
+        done += 1
+        if state.step % _LOOK == 0:
+            watch.look(state, request.early_stop)
+        if now() - said > 0.1 or done == 1:
+            said = now()
+            tell(said)
+        if should_stop is not None and should_stop():
+            break
+        if request.early_stop and state.step - watch.best_step > max(6 * _LOOK, _PATIENCE * planned):
+            break
+    watch.look(state, request.early_stop)
+    tell(now())
+    last = state
+    if watch.kept:
+        state = state_from(watch.kept, backend)
+    volume = fit.volume_of(state, grid, settings, backend)
+    record = {
+        **asdict(settings), "steps": state.step, "seed": request.seed, "start": request.start,
+        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": request.held_out, "device": request.device,
+    }  # fmt: skip
+    return Fitted(volume, tuple(history), fit.gaussians_of(state, backend), record, arrays_of(last, backend))
+
+
+def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    kept_back = np.unique(np.asarray(held_out, np.intp))
+    if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
+        raise ValueError(f"held_out must name views 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
+    if kept_back.size >= n_views:
+        raise ValueError(f"all {n_views} views are held out: none is left for the fit")
+    if early_stop and not kept_back.size:
+        raise ValueError("early_stop looks at views held out, and there are none")
+    return np.setdiff1d(np.arange(n_views), kept_back), kept_back
+
+
+def _first_state(
+    data: F32, geometry: Geometry, field_grid: Grid, request: FitRequest, backend: Backend[Any]
+) -> tuple[FitState, int, float]:
+    """The state to go on from, how many Gaussians it began with, and their density unit."""
+    if request.resume is not None:
+        state = state_from(request.resume, backend)
+        return state, state.n, state.unit
+    start = request.gaussians
+    if not isinstance(start, Gaussians):
+        rng = np.random.default_rng(request.seed)
+        start = place(data, geometry, field_grid, start, rng, start=request.start, rays=request.settings.rays)
+    return fit.init(start, request.seed, fit.growth(request.settings), backend), start.n, start.density_unit

@@ -1,0 +1,141 @@
+"""Problem: the data of a fit on the device that fits them, in units in which published rates and weights hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.backend import Backend, ProjectionLoss
+from recon.binning import bin_views
+from recon.geometry import Geometry
+from recon.kernels.activation import F32
+from recon.kernels.losses_cpu import L1, L2, POISSON, DataTerm
+from recon.masks import masked
+from recon.volume import Grid
+
+Loss = Literal["l1", "l2", "poisson"]
+_KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The data of a fit: images in half fields times density units, geometry and grid in mm.
+
+    Attributes:
+        images: one [row, col] each view, projections / (half_field * unit).
+        target_maps: each view blurred for SSIM.
+        weights: of each view's pixels [row, col]; None where all weigh one.
+        geometry: of the views.
+        grid: the box that Gaussians live in; it should hold all that the views see, whatever volume is wanted later.
+        half_field: mm.
+        unit: 1/mm.
+        loss: the projection loss.
+        backend: the device's operations, and the owner of all these arrays.
+    """
+
+    images: tuple[Any, ...]
+    target_maps: tuple[Any, ...]
+    weights: tuple[Any | None, ...]
+    geometry: Geometry
+    grid: Grid
+    half_field: float
+    unit: float
+    loss: ProjectionLoss[Any]
+    backend: Backend[Any]
+
+    @property
+    def scale(self) -> np.float32:
+        """Line integrals over what `images` hold."""
+        return np.float32(self.half_field * self.unit)
+
+    @property
+    def projections(self) -> F32:
+        """The line integrals [view, row, col], back on the host."""
+        return np.stack([self.backend.numpy(image) * self.scale for image in self.images])
+
+
+def make_problem(
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid,
+    unit: float,
+    backend: Backend[Any],
+    *,
+    weights: F32 | None = None,
+    loss: Loss = "l1",
+    ssim_weight: float = 0.25,
+) -> Problem:
+    """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
+
+    Values that are not finite get no weight, see `masks.masked`. The squared losses are made of the size of the
+    absolute one at the data's noise (see `noise_level`), so that the weights of SSIM and total variation keep their
+    meaning.
+
+    Args:
+        weights: of each ray [view, row, col], 0 or more; None: one for all.
+
+    Raises:
+        ValueError: where shapes disagree, a view has no finite value, or the loss is unknown.
+    """
+    expected = (geometry.n_views, *geometry.detector_shape)
+    if projections.shape != expected:
+        raise ValueError(f"projections have shape {projections.shape}, the geometry says {expected}")
+    if loss not in _KINDS:
+        raise ValueError(f"loss must be one of {get_args(Loss)}, got {loss!r}")
+    half_field = max(n * edge for n, edge in zip(grid.shape, grid.spacing, strict=True)) / 2
+    scale = half_field * unit
+    filled, known = masked(projections, weights)
+    delta = max(noise_level(filled) / scale, 1e-4)
+    projection_loss = backend.projection_loss(
+        geometry.detector_shape, ssim_weight, DataTerm(_KINDS[loss], delta, scale)
+    )
+    empty = Problem((), (), (), geometry, grid, half_field, unit, projection_loss, backend)
+    return replace(_with_views(empty, filled, known), geometry=geometry)
+
+
+def extend(problem: Problem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None) -> Problem:
+    """The problem with more views [view, row, col]; those it has are not copied."""
+    geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
+    return replace(_with_views(problem, *masked(projections, weights)), geometry=geometry)
+
+
+def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Problem:
+    """The same problem on joined pixels: a first look at the large scales for a fraction of the time."""
+    weights = None
+    if any(w is not None for w in problem.weights):
+        ones = np.ones(problem.geometry.detector_shape, np.float32)
+        weights = np.stack([ones if w is None else problem.backend.numpy(w) for w in problem.weights])
+        weights = bin_views(weights, factor)
+    return make_problem(
+        bin_views(problem.projections, factor), problem.geometry.binned(factor), problem.grid, problem.unit,
+        problem.backend, weights=weights, loss=loss, ssim_weight=ssim_weight,
+    )  # fmt: skip
+
+
+def noise_level(projections: F32) -> float:
+    """Standard deviation of the noise of a pixel, from second differences along the rows, which smooth matter leaves
+    small: their median absolute value over 0.6745 √6. 0 for fewer than three columns."""
+    cols = projections.shape[-1]
+    if cols < 3:
+        return 0.0
+    some = projections[:: max(1, len(projections) // 8)]
+    bends = some[..., 2:] - 2 * some[..., 1:-1] + some[..., :-2]
+    return float(np.median(np.abs(bends))) / (0.6745 * 6**0.5)
+
+
+def _with_views(problem: Problem, projections: F32, weights: F32 | None) -> Problem:
+    backend, loss = problem.backend, problem.loss
+    images = tuple(backend.array(np.ascontiguousarray(view, np.float32) / problem.scale) for view in projections)
+    known: tuple[Any | None, ...] = (None,) * len(images)
+    if weights is not None:
+        known = tuple(None if bool((w == 1).all()) else backend.array(w) for w in weights)
+    maps = tuple(loss.target_maps(image, w) for image, w in zip(images, known, strict=True))
+    return replace(
+        problem,
+        images=problem.images + images,
+        target_maps=problem.target_maps + maps,
+        weights=problem.weights + known,
+    )
