@@ -82,6 +82,8 @@ def run_fit(
     on_progress: Callable[[Progress], None] | None,
     should_stop: Callable[[], bool] | None,
     now: Callable[[], float],
+    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None,
+    checkpoint_every: float = 60.0,
 ) -> Fitted:
     """Fit line integrals [view, row, col]; see `reconstruct`.
 
@@ -105,7 +107,7 @@ def run_fit(
         unseen = fit.problem_of(
             data[kept_back], geometry.select(kept_back), field_grid, unit, settings, backend, others
         )  # fmt: skip
-    watch = _Watch(unseen, settings)
+    watch = _Watch(unseen, settings, best_step=state.step)  # a fit taken up again is given its patience anew
 
     planned, history = request.steps or 0, []  # 0 in a history: no number of steps was planned
     steps, seconds = request.steps, request.seconds
@@ -120,7 +122,7 @@ def run_fit(
         if on_progress is not None:
             on_progress(history[-1])
 
-    fit_begin = said = now()
+    fit_begin = said = handed = now()
     done = 0
     while steps is None or state.step < steps:
         spent = now() - fit_begin
@@ -134,6 +136,9 @@ def run_fit(
         if now() - said > 0.1 or done == 1:
             said = now()
             tell(said)
+        if on_checkpoint is not None and now() - handed >= checkpoint_every:
+            on_checkpoint(arrays_of(state, backend))
+            handed = now()  # what keeping it takes must not crowd out the fit
         if should_stop is not None and should_stop():
             break
         if request.early_stop and state.step - watch.best_step > max(6 * _LOOK, _PATIENCE * planned):

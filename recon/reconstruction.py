@@ -77,6 +77,8 @@ def reconstruct(
     weights: NDArray[np.float32] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None,
+    checkpoint_every: float = 60.0,
     now: Callable[[], float] = time.perf_counter,
 ) -> Reconstruction:
     """Line integrals to a volume.
@@ -104,6 +106,7 @@ def reconstruct(
         weights: of each ray [view, row, col], 0 or more; for "r2" and the iterative methods.
         on_progress: called about ten times a second, or after each iteration.
         should_stop: asked between steps; a stopped fit returns what it has.
+        on_checkpoint: given the checkpoint of an "r2" fit every `checkpoint_every` s.
         now: a clock in s.
 
     Raises:
@@ -133,7 +136,9 @@ def reconstruct(
         request = FitRequest(
             chosen, steps, seconds, gaussians, seed, start, tuple(held_out), early_stop, resume, device
         )
-        fitted = run_fit(data, weights, geometry, target, request, on_progress, should_stop, now)
+        fitted = run_fit(
+            data, weights, geometry, target, request, on_progress, should_stop, now, on_checkpoint, checkpoint_every
+        )
         return Reconstruction(
             fitted.volume, now() - begin, fitted.history, method, fitted.gaussians, MappingProxyType(fitted.settings),
             fitted.checkpoint,

@@ -213,6 +213,27 @@ def test_a_fit_can_be_left_and_taken_up_again(noisy: np.ndarray) -> None:
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
+def test_checkpoints_are_handed_out_as_the_fit_goes_on(noisy: np.ndarray) -> None:
+    kept: list[dict[str, np.ndarray]] = []
+    ticks = iter(range(100_000))
+    options = {"steps": 60, "gaussians": 600}
+    whole = recon.reconstruct(
+        noisy, VIEWS, **options, now=lambda: float(next(ticks)), checkpoint_every=50.0,
+        on_checkpoint=lambda arrays: kept.append(dict(arrays)),
+    )  # fmt: skip
+    steps = [int(arrays["counts"][1]) for arrays in kept]
+    assert len(steps) > 2 and steps == sorted(set(steps)) and steps[-1] < 60
+    rest = recon.reconstruct(noisy, VIEWS, **options, resume=kept[1])
+    np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
+
+
+def test_early_stopping_gives_a_fit_taken_up_again_its_patience_anew(noisy: np.ndarray) -> None:
+    options = {"gaussians": 300, "held_out": (3, 15), "early_stop": True}
+    first = recon.reconstruct(noisy, VIEWS, steps=400, **options)
+    rest = recon.reconstruct(noisy, VIEWS, steps=600, resume=first.checkpoint, **options)
+    assert rest.history[-1].step >= min(600, first.history[-1].step + 200)
+
+
 @pytest.mark.parametrize(
     "settings",
     [fit.FitSettings(loss="l2"), fit.FitSettings(loss="poisson"), fit.FitSettings(coarse=2, coarse_until=0.5),
