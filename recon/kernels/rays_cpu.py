@@ -46,8 +46,8 @@ _f = np.float32
 _BAND = 8  # rows a task: each owns its pixels, so nothing is shared
 # Columns of the terms: α, η, W |f / D₀|, the truncation c² and the box that it fills.
 AU, AV, ETA, WEIGHT, CUT, ROW0, ROW1, COL0, COL1 = range(9)
-# Columns of the sums, with a = g V, b = ∂ ln V / ∂N, q = ∂ ln V / ∂Q, l = 1 + α·δ.
-A, BU, BV, BUU, BUV, BVV, L, LU, LV, N = range(10)
+# Columns of the sums, with a = g V, b = ∂ ln V / ∂N, q = ∂ ln V / ∂Q, l = 1 + α·δ; b goes with τ = δu - r δv and δv.
+A, BT, BV, BTT, BTV, BVV, L, LU, LV, N = range(10)
 
 
 @njit(inline="always", fastmath=True)
@@ -185,7 +185,7 @@ def _sums(table: F32, terms: F64, focal: float, col: float, row: float, gradient
             dv, du0 = _f(r) - table[i, V], _f(first) - u
             up, over0 = _f(r - row) * per, _f(first - col) * per
             tall, up2, along = kv * dv * dv, _f(1) + up * up, _f(1) + av * dv
-            s = sb = sbu = sbuu = sl = slu = sn = _f(0)
+            s = sb = sbt = sbtt = sl = slu = sn = _f(0)
             for j in range(line.shape[0]):
                 du, over = du0 + _f(j), over0 + _f(j) * per
                 across = du - shear * dv
@@ -197,16 +197,16 @@ def _sums(table: F32, terms: F64, focal: float, col: float, row: float, gradient
                 ab, al = eta * aq - _f(0.5) * inverse * a, lift * aq
                 s += a
                 sb += ab
-                sbu += ab * du
-                sbuu += ab * du * du
+                sbt += ab * across
+                sbtt += ab * across * across
                 sl += al
                 slu += al * du
                 sn += aq * n
             sums[i, A] += s
-            sums[i, BU] += sbu
+            sums[i, BT] += sbt
             sums[i, BV] += sb * dv
-            sums[i, BUU] += sbuu
-            sums[i, BUV] += sbu * dv
+            sums[i, BTT] += sbtt
+            sums[i, BTV] += sbt * dv
             sums[i, BVV] += sb * dv * dv
             sums[i, L] += sl
             sums[i, LU] += slu
@@ -222,15 +222,15 @@ def _as_moments(table: F32, terms: F64, sums: F32, moments: F32) -> None:
             moments[i, m] = _f(0)
         if table[i, HU] < 0:
             continue
-        per_w = 1.0 / table[i, W]
-        shear, svv = float(table[i, SHEAR]), 1.0 / table[i, KV]
-        suv, suu = shear * svv, 1.0 / table[i, K] + shear * shear * svv
-        au, av = terms[i, AU], terms[i, AV]
-        moments[i, 0] = per_w * sums[i, A]
-        moments[i, 1] = -2 * per_w * (sums[i, BU] + sums[i, L] * (suu * au + suv * av))
-        moments[i, 2] = -2 * per_w * (sums[i, BV] + sums[i, L] * (suv * au + svv * av))
-        moments[i, 3], moments[i, 4] = -2 * per_w * sums[i, BUU], -2 * per_w * sums[i, BUV]
-        moments[i, 5] = -2 * per_w * sums[i, BVV]
+        per_w = -2.0 / table[i, W]
+        moments[i, 0] = -0.5 * per_w * sums[i, A]
+        # Σ₂α along τ and v, without Σ₂'s large parts that would cancel in τ.
+        along_t = terms[i, AU] / table[i, K]
+        along_v = (table[i, SHEAR] * terms[i, AU] + terms[i, AV]) / table[i, KV]
+        moments[i, 1] = per_w * (sums[i, BT] + sums[i, L] * along_t)
+        moments[i, 2] = per_w * (sums[i, BV] + sums[i, L] * along_v)
+        moments[i, 3], moments[i, 4] = per_w * sums[i, BTT], per_w * sums[i, BTV]
+        moments[i, 5] = per_w * sums[i, BVV]
 
 
 @njit(**OPTIONS)

@@ -128,10 +128,7 @@ def _affine(
     turn = jacobian @ in_view.new_tensor(geometry.axes(view))
     shaped = turn @ rotation_matrices(quaternions) * scales[:, None, :]
     lower = torch.linalg.qr(shaped.transpose(1, 2)).R.transpose(1, 2)  # L, up to signs of its columns
-    if length > 0:
-        factor = torch.full_like(densities, length)
-    else:
-        factor = math.sqrt(2 * math.pi) * lower[:, 2, 2].abs()
+    factor = torch.full_like(densities, length) if length > 0 else math.sqrt(2 * math.pi) * lower[:, 2, 2].abs()
     u, v = pixels(geometry, view, in_view)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
     offset = grid[None] - centre[:, None, None, :]

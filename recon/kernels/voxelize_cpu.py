@@ -7,10 +7,14 @@ With the rows a, b, c (x, y, z) of R S in voxels, the exponent is a sum of squar
 
 At one δz this is a footprint in (x, y) whose centre has moved by δz (a·c, b·c) / Σzz, as `project_cpu` draws it.
 
-The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G δ, N₂ = Σ g G δδᵀ, put together from each slice's moments; with
-H = S⁻¹ Rᵀ per voxel the exponent is -1/2 |H δ|², and
+The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G ε and N₂ = Σ g G εεᵀ with ε = (τ, δy', δz): δz from the
+Gaussian's centre, the others in the slice from its own, as they come. In the Gaussian's axes and standard deviations
 
-    ∂ρ = N₀,   ∂p = ρ Hᵀ H N₁,   ∂H = -ρ H N₂
+    y = τ A + δy' B + δz C,   A = H e_x,   B = (c x A) sqrt(l) / |c x A|,   C = c / Σzz,   H = S⁻¹ Rᵀ per voxel
+
+and with T = ρ Σ g G yyᵀ (see `footprints_cpu`)
+
+    ∂ρ = N₀,   ∂p = ρ R S⁻¹ Σ g G y,   ∂ log scales and ∂R from T
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from numpy.typing import NDArray
 
 from recon.kernels import lanes
 from recon.kernels.activation import F32, OPTIONS
-from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W
+from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W, add_shape
 from recon.kernels.project_cpu import add_footprint, gather_footprint, padded, padded_shape
 
 _f = np.float32
@@ -162,42 +166,47 @@ def _gather(
     d_rotations: F32,
     d_densities: F32,
 ) -> None:
-    ex, ey, ez = _f(spacing[2]), _f(spacing[1]), _f(spacing[0])
+    ex, ez = _f(spacing[2]), _f(spacing[0])
     for task in prange(pieces.shape[0]):
         piece, found = pieces[task, :1], pieces[task, 1:]
         for j in range(task * _SHARE, min(hits.shape[0], (task + 1) * _SHARE)):
             i = hits[j]
-            n0 = nx1 = ny1 = nz1 = xx = xy = xz = yy = yz = zz = _f(0)
+            n0 = nt = nv = nz = tt = tv = vv = tz = vz = zz = _f(0)
             for z in range(slices[j, 0], slices[j, 1]):
                 dz = _cut(table, j, z, _f(1), piece)
                 gather_footprint(piece, 0, ny, nx, gradient[z], found)
                 weight = piece[0, W]
-                # From the slice's own centre to the Gaussian's.
-                sx, sy = table[j, _DRIFT_X] * dz, table[j, _DRIFT_Y] * dz
-                m0, mx, my = weight * found[0, 0], weight * found[0, 1], weight * found[0, 2]
-                xx += weight * found[0, 3] + sx * (_f(2) * mx + sx * m0)
-                xy += weight * found[0, 4] + sx * my + sy * (mx + sx * m0)
-                yy += weight * found[0, 5] + sy * (_f(2) * my + sy * m0)
-                mx, my = mx + sx * m0, my + sy * m0
-                n0, nx1, ny1, nz1 = n0 + m0, nx1 + mx, ny1 + my, nz1 + dz * m0
-                xz, yz, zz = xz + dz * mx, yz + dz * my, zz + dz * dz * m0
-            density, r, sc = densities[i], rotations[i], scales[i]
+                m0, mt, mv = weight * found[0, 0], weight * found[0, 1], weight * found[0, 2]
+                n0, nt, nv, nz = n0 + m0, nt + mt, nv + mv, nz + dz * m0
+                tt, tv, vv = tt + weight * found[0, 3], tv + weight * found[0, 4], vv + weight * found[0, 5]
+                tz, vz, zz = tz + dz * mt, vz + dz * mv, zz + dz * dz * m0
+            density, r, s0, s1, s2 = densities[i], rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
             d_densities[i] += n0
-            for k in range(3):
-                inverse = _f(1) / sc[k]
-                h0, h1, h2 = ex * r[k] * inverse, ey * r[3 + k] * inverse, ez * r[6 + k] * inverse
-                if means_too:
-                    pull = density * (h0 * nx1 + h1 * ny1 + h2 * nz1) * inverse
-                    d_means[i, 0] += pull * r[k]
-                    d_means[i, 1] += pull * r[3 + k]
-                    d_means[i, 2] += pull * r[6 + k]
-                g0 = -density * (h0 * xx + h1 * xy + h2 * xz)
-                g1 = -density * (h0 * xy + h1 * yy + h2 * yz)
-                g2 = -density * (h0 * xz + h1 * yz + h2 * zz)
-                d_log_scales[i, k] -= g0 * h0 + g1 * h1 + g2 * h2
-                d_rotations[i, k] += g0 * inverse * ex
-                d_rotations[i, 3 + k] += g1 * inverse * ey
-                d_rotations[i, 6 + k] += g2 * inverse * ez
+            a0, a1, a2 = ex * r[0] / s0, ex * r[1] / s1, ex * r[2] / s2
+            c0, c1, c2 = r[6] * s0 / ez, r[7] * s1 / ez, r[8] * s2 / ez
+            # B has the length sqrt(l), whatever the digits of its factors.
+            b0, b1, b2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
+            size = np.sqrt(table[j, KV] / max(b0 * b0 + b1 * b1 + b2 * b2, _f(1 / _FARTHEST)))
+            b0, b1, b2 = size * b0, size * b1, size * b2
+            c0, c1, c2 = table[j, _KZ] * c0, table[j, _KZ] * c1, table[j, _KZ] * c2
+            if means_too:
+                y0 = density * (nt * a0 + nv * b0 + nz * c0) / s0
+                y1 = density * (nt * a1 + nv * b1 + nz * c1) / s1
+                y2 = density * (nt * a2 + nv * b2 + nz * c2) / s2
+                d_means[i, 0] += r[0] * y0 + r[1] * y1 + r[2] * y2
+                d_means[i, 1] += r[3] * y0 + r[4] * y1 + r[5] * y2
+                d_means[i, 2] += r[6] * y0 + r[7] * y1 + r[8] * y2
+            # T / ρ = (τ A + δv B + δz C)(...)ᵀ, as A fᵀ + B gᵀ + C hᵀ.
+            f0, f1, f2 = tt * a0 + tv * b0 + tz * c0, tt * a1 + tv * b1 + tz * c1, tt * a2 + tv * b2 + tz * c2
+            g0, g1, g2 = tv * a0 + vv * b0 + vz * c0, tv * a1 + vv * b1 + vz * c1, tv * a2 + vv * b2 + vz * c2
+            h0, h1, h2 = tz * a0 + vz * b0 + zz * c0, tz * a1 + vz * b1 + zz * c1, tz * a2 + vz * b2 + zz * c2
+            add_shape(
+                i, scales, rotations,
+                density * (a0 * f0 + b0 * g0 + c0 * h0), density * (a0 * f1 + b0 * g1 + c0 * h1),
+                density * (a0 * f2 + b0 * g2 + c0 * h2), density * (a1 * f1 + b1 * g1 + c1 * h1),
+                density * (a1 * f2 + b1 * g2 + c1 * h2), density * (a2 * f2 + b2 * g2 + c2 * h2),
+                d_log_scales, d_rotations,
+            )  # fmt: skip
 
 
 class Layout:

@@ -64,11 +64,12 @@ def table_of(active: Active, geometry: Geometry, view: int, *, faint: float = 1e
 
 
 def on_pixels(table: F64) -> tuple[F64, F64, F64]:
-    """G [n, row, col] of each footprint and the offsets (δu, δv) [n, row, col] from its centre, in float64."""
+    """G [n, row, col] of each footprint and the offsets (τ, δv) [n, row, col] from its centre, in float64."""
     t = table.astype(np.float64)[:, :, None, None]
     rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    du, dv = cols[None] - t[:, U], rows[None] - t[:, V]
-    return np.exp(-0.5 * (t[:, K] * (du - t[:, SHEAR] * dv) ** 2 + t[:, KV] * dv**2)), du, dv
+    dv = rows[None] - t[:, V]
+    dt = cols[None] - t[:, U] - t[:, SHEAR] * dv
+    return np.exp(-0.5 * (t[:, K] * dt**2 + t[:, KV] * dv**2)), dt, dv
 
 
 def leaves(parameters: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -91,14 +92,14 @@ def test_footprints_and_gradients_equal_the_twins(name: str, length: float, rng:
     doubles = leaves(parameters)
     for view in range(2):
         table = table_of(active, geometry, view, length=length)
-        shapes, du, dv = on_pixels(table)
+        shapes, dt, dv = on_pixels(table)
         image = np.einsum("n,nrc->rc", table[:, W], shapes)
         expected = twin_image(doubles, geometry, view, length)
         np.testing.assert_allclose(image, expected.detach().numpy(), atol=3e-6 * float(expected.detach().max()))
 
         (expected * torch.from_numpy(weights[view])).sum().backward()
         g = weights[view][None] * shapes
-        powers = np.stack((g, g * du, g * dv, g * du * du, g * du * dv, g * dv * dv), -1)
+        powers = np.stack((g, g * dt, g * dv, g * dt * dt, g * dt * dv, g * dv * dv), -1)
         moments = powers.sum((1, 2)).astype(np.float32)
         footprints_backward(
             table, moments, active.means, active.scales, active.rotations, active.densities, camera(geometry, view),
@@ -116,9 +117,9 @@ def test_the_gradient_on_centres_is_that_of_moving_the_picture(name: str, rng: n
     geometry, parameters = GEOMETRIES[name], raw(rng, 1, 3.0)
     active, weights = active_of(parameters), rng.normal(size=SHAPE)
     table = table_of(active, geometry, 0)
-    g, du, dv = on_pixels(table)
+    g, dt, dv = on_pixels(table)
     g *= weights
-    powers = np.stack((g, g * du, g * dv, g * du * du, g * du * dv, g * dv * dv), -1)
+    powers = np.stack((g, g * dt, g * dv, g * dt * dt, g * dt * dv, g * dv * dv), -1)
     centres = np.empty((1, 2), np.float32)
     into = Gradients.zeros(1)
     footprints_backward(

@@ -73,8 +73,10 @@ def test_image_and_moments_equal_dense_sums(rng: np.random.Generator, shape: tup
     expected = np.einsum("n,nrc->rc", table[:, W].astype(np.float64), value)
     np.testing.assert_allclose(_image(table, shape), expected, atol=1e-5 * max(1, expected.max()))
     g = rng.normal(size=shape).astype(np.float32)
-    sums = np.stack([(g * value * x).sum((1, 2)) for x in (1, across, down, across**2, across * down, down**2)], 1)
-    scale = np.stack([(value * np.abs(x)).sum((1, 2)) for x in (1, across, down, across**2, across * down, down**2)], 1)
+    aside = across - table[:, SHEAR, None, None].astype(np.float64) * down
+    powers = (1, aside, down, aside**2, aside * down, down**2)
+    sums = np.stack([(g * value * x).sum((1, 2)) for x in powers], 1)
+    scale = np.stack([(value * np.abs(x)).sum((1, 2)) for x in powers], 1)
     assert (np.abs(moments(table, g) - sums) < 1e-5 * scale + 1e-4 * np.abs(table[:, [HU]] + table[:, [HV]]) ** 2).all()
 
 
@@ -140,6 +142,24 @@ def test_past_the_gate_the_recurrence_would_lose_what_the_pixels_keep() -> None:
     start = _dense(needle, (80, 80))[0][0][8]
     assert (start.astype(np.float32) == 0).sum() > 40
     assert _image(needle, (80, 80))[40, 40] == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize(("n", "alike", "bound"), [(20_000, True, 6e-6), (20_000, False, 2e-6), (300_000, False, 3e-6)])
+def test_a_pile_of_footprints_is_summed_without_drift(
+    rng: np.random.Generator, n: int, alike: bool, bound: float
+) -> None:
+    # Of a sum of equal numbers one by one every step rounds alike: 5e-3 are lost of a million, 9e-5 of these.
+    places = np.full((n, 2), 8.0) if alike else rng.uniform(7.6, 8.4, (n, 2))
+    weights = np.full(n, 0.7) if alike else rng.uniform(0.1, 1, n)
+    table = _table(places, *(np.ones(n) for _ in range(2)), np.zeros(n), weights, 3.5)
+    t, pixel = table.astype(np.float64), np.arange(16)
+    along = [np.exp(-0.5 * (pixel[None] - t[:, [place]]) ** 2) for place in (U, V)]
+    expected = (along[1] * t[:, [W]]).T @ along[0]
+    inside = expected > 0.05 * expected.max()
+    assert (np.abs(_image(table, (16, 16)) / expected - 1))[inside].max() < bound
+    if alike:
+        one_by_one = np.cumsum(np.full(n, weights[0], np.float32), dtype=np.float32)[-1]
+        assert abs(float(one_by_one) / (n * 0.7) - 1) > 5 * bound
 
 
 def test_a_workspace_serves_again_and_changes_nothing(rng: np.random.Generator) -> None:
