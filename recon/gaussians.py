@@ -104,12 +104,12 @@ class Gaussians:
         )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """The parameters as plain arrays, for a checkpoint; `from_arrays` reads them back."""
+        """The parameters as plain arrays on the host, for a checkpoint; `from_arrays` reads them back."""
         return {
-            "means": self.means.detach().numpy(),
-            "log_scales": self.log_scales.detach().numpy(),
-            "quaternions": self.quaternions.detach().numpy(),
-            "raw_densities": self.raw_densities.detach().numpy(),
+            "means": self.means.detach().cpu().numpy(),
+            "log_scales": self.log_scales.detach().cpu().numpy(),
+            "quaternions": self.quaternions.detach().cpu().numpy(),
+            "raw_densities": self.raw_densities.detach().cpu().numpy(),
             "density_unit": np.asarray(self.density_unit),
         }
 

@@ -1,6 +1,7 @@
 """project and voxelize: Gaussians to line integrals and to voxels, differentiable, by the kernel that fits the data.
 
-Float32 tensors go to the threaded CPU kernels; float64 tensors (or `kernel="reference"`) to the readable twin.
+Float32 tensors go to the threaded CPU kernels, on a CUDA device to the GPU's; float64 tensors (or
+`kernel="reference"`) to the readable twin, which runs on the CPU.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from recon.kernels.rays_cpu import Rays
 from recon.kernels.voxelize_cpu import Layout
 from recon.volume import Grid
 
-Kernel = Literal["auto", "cpu", "reference"]
+Kernel = Literal["auto", "cpu", "gpu", "reference"]
 
 
 @dataclass(frozen=True)
@@ -224,17 +225,14 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, geometry: Geometry, truncation: Truncation, model: RayModel,
+        unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel,
     ) -> Tensor:  # fmt: skip
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
-        faint = truncation.faint * unit * geometry.sample_pitch * geometry.detector_shape[1]
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         shared, views = Room.of(len(active.densities), geometry.detector_shape), []
         for view, image in enumerate(images):  # each keeps its own table until it goes back
             room = replace(shared, table=footprint_table(len(active.densities)))
-            views.append(
-                render_view(active, geometry, view, faint, truncation.sigmas, model, image=image, room=room)
-            )  # fmt: skip
+            views.append(render_view(active, geometry, view, faint, cut, model, image=image, room=room))
         ctx.state = (_array(quaternions), _array(raw), unit, views)
         return torch.from_numpy(images)
 
@@ -245,17 +243,17 @@ class _Project(torch.autograd.Function):
         centres = np.empty((len(raw), 2), np.float32)
         for view, image in zip(views, gradient.contiguous().numpy(), strict=True):
             view.backward(image, into, centres)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None)
 
 
 class _Voxelize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, grid: Grid, truncation: Truncation,
+        unit: float, grid: Grid, faint: float, cut: float,
     ) -> Tensor:  # fmt: skip
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
-        layout = grid_layout(active, grid, truncation.faint * unit, truncation.sigmas)
+        layout = grid_layout(active, grid, faint, cut)
         ctx.state = (_array(quaternions), _array(raw), layout, unit)
         return torch.from_numpy(np.ascontiguousarray(layout.fill()))
 
@@ -264,7 +262,7 @@ class _Voxelize(torch.autograd.Function):
         quaternions, raw, layout, unit = ctx.state
         into = Gradients.zeros(len(raw))
         layout.backward(gradient.contiguous().numpy(), into.means, into.log_scales, into.rotations, into.densities)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None)
 
 
 def _array(tensor: Tensor) -> F32:
@@ -291,11 +289,15 @@ def project(
 
     A cone's are those of the affine footprint, or of the true ray where `model` says so. Differentiable in all four
     parameter tensors. The reference kernel truncates nothing.
+
+    Raises:
+        ValueError: the kernel does not take tensors of this type or on this device.
+        ImportError: CUDA tensors, and triton is not installed.
     """
     rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
-    g = gaussians
-    if _use_reference(g, kernel):
+    g, which = gaussians, _kernel(gaussians, kernel)
+    if which == "reference":
         parameters = (g.means, g.scales, g.quaternions, g.densities)
         length = rays.length(chosen)
         images = []
@@ -305,27 +307,42 @@ def project(
                 exact = reference.affine_error(*parameters[:3], chosen, view) > rays.exact_above
             images.append(reference.project_view(*parameters, chosen, view, exact=exact, length=length))
         return torch.stack(images)
-    cut = truncation or Truncation()
-    return _Project.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, chosen, cut, rays)
+    cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
+    if which == "gpu":
+        from recon.kernels.gpu import autograd  # triton is loaded only where a GPU is asked for
+
+        return autograd.project(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+    return _Project.apply(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
 
 
 def voxelize(
     gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, kernel: Kernel = "auto"
 ) -> Tensor:
-    """Density [z, y, x] (1/mm) of the Gaussians at the grid's voxel centres; any box, any voxel size."""
-    g = gaussians
-    if _use_reference(g, kernel):
+    """Density [z, y, x] (1/mm) of the Gaussians at the grid's voxel centres: any box and voxel size. Raises as above."""
+    g, which = gaussians, _kernel(gaussians, kernel)
+    if which == "reference":
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
         return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x))
-    cut = truncation or Truncation()
-    return _Voxelize.apply(g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, grid, cut)
+    cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
+    faint = cut.faint * g.density_unit
+    if which == "gpu":
+        from recon.kernels.gpu import autograd
+
+        return autograd.voxelize(*raw, g.density_unit, grid, faint, cut.sigmas)
+    return _Voxelize.apply(*raw, g.density_unit, grid, faint, cut.sigmas)
 
 
-def _use_reference(gaussians: Gaussians, kernel: Kernel) -> bool:
-    if kernel == "reference":
-        return True
-    if gaussians.means.dtype != torch.float32:
-        if kernel == "cpu":
-            raise ValueError(f"the cpu kernel works in float32, the Gaussians are {gaussians.means.dtype}")
-        return True
-    return False
+def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
+    """The line integral below which nothing is drawn."""
+    return truncation.faint * gaussians.density_unit * geometry.sample_pitch * geometry.detector_shape[1]
+
+
+def _kernel(gaussians: Gaussians, kernel: Kernel) -> Kernel:
+    dtype, device = gaussians.means.dtype, gaussians.means.device.type
+    suited: Kernel = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
+    chosen = suited if kernel == "auto" else kernel
+    if chosen != "reference" and dtype != torch.float32:
+        raise ValueError(f"the {chosen} kernel works in float32, the Gaussians are {dtype}")
+    if chosen != "gpu" and device != "cpu":
+        raise ValueError(f"the {chosen} kernel runs on the cpu, the Gaussians are {dtype} on {device}: move them")
+    return chosen

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from recon.geometry import Geometry
+from recon.kernels.gpu import require
 from recon.kernels.gpu.engine import GpuPass
+from recon.splat import RayModel
 from recon.volume import Grid
 
 
@@ -16,10 +18,10 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, geometry: Geometry, faint: float, cut: float, length: float,
+        unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel,
     ) -> Tensor:  # fmt: skip
         run = _pass(means, log_scales, quaternions, raw, unit)
-        views = [run.view(geometry, view, faint, cut, length) for view in range(geometry.n_views)]
+        views = [run.view(geometry, view, faint, cut, model) for view in range(geometry.n_views)]
         ctx.state = (run, views)
         return torch.stack([view.image for view in views])
 
@@ -52,16 +54,17 @@ class _Voxelize(torch.autograd.Function):
 
 
 def _pass(means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> GpuPass:
+    require(means.device)
     p, s, q, r = (t.detach().contiguous() for t in (means, log_scales, quaternions, raw))
     return GpuPass(p, s, q, r, unit)
 
 
 def project(
     means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-    unit: float, geometry: Geometry, faint: float, cut: float, length: float = 0.0,
+    unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel,
 ) -> Tensor:  # fmt: skip
     """Line integrals [view, row, col]; `faint` in units of the image, `cut` in σ; differentiable in the tensors."""
-    return _Project.apply(means, log_scales, quaternions, raw, unit, geometry, faint, cut, length)
+    return _Project.apply(means, log_scales, quaternions, raw, unit, geometry, faint, cut, model)
 
 
 def voxelize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,12 +11,23 @@ from torch import Tensor
 
 from recon.geometry import Geometry
 from recon.kernels.activation import F32
+from recon.kernels.footprints_cpu import INEXACT
 from recon.kernels.gpu import losses, require
-from recon.kernels.gpu.footprints import footprints, footprints_backward
+from recon.kernels.gpu.footprints import HU, footprints, footprints_backward
 from recon.kernels.gpu.images import moments, render
 from recon.kernels.gpu.parameters import activate, activation_backward, adam
+from recon.kernels.gpu.rays import Rays
 from recon.kernels.gpu.voxels import fill, fill_backward, place
+from recon.kernels.losses_cpu import ABSOLUTE, DataTerm
+from recon.splat import RayModel
 from recon.volume import Grid
+
+Parameters = tuple[Tensor, Tensor, Tensor, Tensor]  # means, scales (or their logarithms), rotations, densities
+
+
+def _zeros(like: Parameters) -> Parameters:
+    means, scales, rotations, densities = (torch.zeros_like(array) for array in like)
+    return means, scales, rotations, densities
 
 
 class GpuPass:
@@ -25,13 +37,11 @@ class GpuPass:
         self._raw, self._unit = (quaternions, raw), unit
         scales, rotations, densities = activate(log_scales, quaternions, raw, unit)
         self.active = (means, scales, rotations, densities)
-        self.into = (
-            torch.zeros_like(means), torch.zeros_like(scales), torch.zeros_like(rotations), torch.zeros_like(densities)
-        )  # fmt: skip
+        self.into = _zeros(self.active)
 
-    def view(self, geometry: Geometry, view: int, faint: float, cut: float, length: float = 0.0) -> GpuView:
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> GpuView:
         """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ."""
-        return GpuView(self, geometry, view, faint, cut, length)
+        return GpuView(self, geometry, view, faint, cut, model)
 
     def box(self, grid: Grid, faint: float, cut: float) -> GpuBox:
         """Voxelise on a grid; `faint` is a density."""
@@ -51,10 +61,18 @@ class GpuPass:
 class GpuView:
     """One rendered view: its image [row, col], and the way back."""
 
-    def __init__(self, run: GpuPass, geometry: Geometry, view: int, faint: float, cut: float, length: float) -> None:
-        self._run, self._geometry, self._view, self._length = run, geometry, view, length
-        self.footprints = footprints(*run.active, geometry, view, faint, cut, length)
+    def __init__(self, run: GpuPass, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> None:
+        self._run, self._geometry, self._view, self._length = run, geometry, view, model.length(geometry)
+        self.footprints = footprints(*run.active, geometry, view, faint, cut, self._length, model.exact_above)
         self.image = render(self.footprints, geometry.detector_shape)
+        self._rays: tuple[Tensor, Rays] | None = None
+        if geometry.is_cone and model.exact_above < math.inf:  # their number is known only once the device tells it
+            exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
+            if exact.numel() > 0:
+                means, scales, rotations, densities = (array[exact] for array in run.active)
+                rays = Rays(means, scales, rotations, densities, geometry, view, faint, cut)
+                rays.add_to(self.image)
+                self._rays = (exact, rays)
 
     def backward(self, gradient: Tensor) -> Tensor:
         """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
@@ -63,6 +81,13 @@ class GpuView:
         footprints_backward(
             found, moments(found, gradient), *run.active, self._geometry, self._view, *run.into, centres, self._length
         )
+        if self._rays is not None:
+            exact, rays = self._rays
+            some, moved = _zeros(rays.parameters), centres.new_empty((exact.numel(), 2))
+            rays.backward(gradient, *some, moved)
+            centres[exact] = moved
+            for total, part in zip(run.into, some, strict=True):
+                total[exact] += part  # each is there once: no order of adding, the same bits
         return centres
 
 
@@ -97,13 +122,27 @@ class Gpu:
         """A pass over raw parameters; densities are unit * softplus(raw)."""
         return GpuPass(means, log_scales, quaternions, raw, unit)
 
-    def projection_loss(self, shape: tuple[int, int], ssim_weight: float) -> losses.ProjectionLoss:
+    def projection_loss(
+        self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
+    ) -> losses.ProjectionLoss:
         """The loss on images of one shape."""
-        return losses.ProjectionLoss(shape, ssim_weight, self.device)
+        return losses.ProjectionLoss(shape, ssim_weight, self.device, term)
+
+    def misfit(self, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+        """||w (image - target)|| / ||w target|| (float64, no dimensions, on the device); 0 for a target of zeros."""
+        off, seen = image - target, target
+        if weights is not None:
+            off, seen = weights * off, weights * seen
+        squares, power = (off * off).sum(dtype=torch.float64), (seen * seen).sum(dtype=torch.float64)
+        return torch.where(power > 0, torch.sqrt(squares / power), 0.0)
 
     def total_variation(self, volume: Tensor, weight: float) -> tuple[Tensor, Tensor]:
         """weight * mean |difference of neighbours| of [z, y, x], and its gradient."""
         return losses.total_variation(volume, weight)
+
+    def add_lengths(self, vectors: Tensor, factor: float, sums: Tensor) -> None:
+        """sums [n] += factor |vectors [n, 2]|."""
+        sums.add_(torch.linalg.vector_norm(vectors, dim=1), alpha=factor)
 
     def adam(
         self,
@@ -113,6 +152,7 @@ class Gpu:
         second: Sequence[Tensor],
         rates: Sequence[float],
         step: int,
+        bounds: Sequence[tuple[float, float] | None],
     ) -> None:
-        """Update the four parameter arrays and their moments in place; `step` counts from 1."""
-        adam(parameters, gradients, first, second, rates, step)
+        """Update the four parameter arrays and their moments in place and keep them within bounds; steps from 1."""
+        adam(parameters, gradients, first, second, rates, step, bounds)

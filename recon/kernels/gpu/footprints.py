@@ -20,10 +20,12 @@ import triton.language as tl
 from torch import Tensor
 
 from recon.geometry import Geometry
+from recon.kernels.footprints_cpu import HIDDEN, INEXACT, NEAREST
 
 _BLOCK = 128
 _ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
 _HUGE = tl.constexpr(3.0e38)
+_HIDDEN, _INEXACT = tl.constexpr(HIDDEN), tl.constexpr(INEXACT)
 # Columns of the footprint table, as in footprints_cpu.
 U, V, K, SHEAR, KV, W, HU, HV = (tl.constexpr(column) for column in range(8))
 
@@ -42,7 +44,7 @@ class Footprints:
 
 
 @triton.jit
-def _ray(  # type: ignore[no-untyped-def]
+def along_ray(  # type: ignore[no-untyped-def]
     means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr
 ):
     """Where a Gaussian lies in the view and how the view sees it: (across, up, per, a, b, depth, norm)."""
@@ -66,18 +68,19 @@ def _ray(  # type: ignore[no-untyped-def]
 @triton.jit(do_not_specialize=["n"])
 def _footprints(  # type: ignore[no-untyped-def]
     means, scales, rotations, densities, table, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz, col0, row0,
-    focal, sod, near, faint, cut, fixed, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    focal, sod, near, faint, cut, fixed, worst, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     i = tl.minimum(i, n - 1)  # lanes past the end compute the last one again and store nothing
-    across, up, per, a, b, depth, norm = _ray(
+    across, up, per, a, b, depth, norm = along_ray(
         means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE
     )  # fmt: skip
     jux, juy, juz = per * (ux - a * dx), per * (uy - a * dy), per * (uz - a * dz)
     jvx, jvy, jvz = per * (vx - b * dx), per * (vy - b * dy), per * (vz - b * dz)
     nx, ny, nz = (a * ux + b * vx + dx) / norm, (a * uy + b * vy + dy) / norm, (a * uz + b * vz + dz) / norm
     uu, uv, vv, hh, product = across * 0.0, across * 0.0, across * 0.0, across * 0.0, per * per * norm
+    along_u, along_v = across * 0.0, across * 0.0
     for k in tl.static_range(3):
         s = tl.load(scales + 3 * i + k)
         r0, r1 = tl.load(rotations + 9 * i + k), tl.load(rotations + 9 * i + 3 + k)
@@ -85,6 +88,9 @@ def _footprints(  # type: ignore[no-untyped-def]
         p, q = s * (jux * r0 + juy * r1 + juz * r2), s * (jvx * r0 + jvy * r1 + jvz * r2)
         h = (nx * r0 + ny * r1 + nz * r2) / s
         uu, uv, vv, hh, product = uu + p * p, uv + p * q, vv + q * q, hh + h * h, product * s
+        if CONE:
+            along_u += h / s * (ux * r0 + uy * r1 + uz * r2)
+            along_v += h / s * (vx * r0 + vy * r1 + vz * r2)
     length = tl.sqrt(hh)
     inverse = 1.0 / (product * length)  # 1 / sqrt(det Σ₂)
     weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI / length)
@@ -95,6 +101,16 @@ def _footprints(  # type: ignore[no-untyped-def]
     reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, weight, 1.0) / faint), 0.0)))
     hu, hv = reach * tl.sqrt(uu), reach * tl.sqrt(vv)
     hit = seen & (u + hu >= 0.0) & (u - hu <= cols - 1.0) & (v + hv >= 0.0) & (v - hv <= rows - 1.0)
+    if CONE:
+        # ε² of `footprints_cpu`: with α and β in px of the rotation axis' scale, Σ₂ / f² and η.
+        au, av, bu, bv = along_u / (hh * norm), along_v / (hh * norm), a / (norm * norm), b / (norm * norm)
+        eta = 1.0 / (depth * depth * norm * norm * hh)
+        error = uu * (0.5 * bu * bu + au * bu + 1.5 * au * au)
+        error += uv * (bu * bv + au * bv + av * bu + 3.0 * au * av)
+        error += vv * (0.5 * bv * bv + av * bv + 1.5 * av * av)
+        inexact = seen & (error / (focal * focal) + 6.0 * eta * eta > worst)
+        hu, hv = tl.where(inexact, _INEXACT, hu), tl.where(inexact, _INEXACT, hv)
+        hit = hit & (hu >= 0.0)
     f = table + 8 * i
     tl.store(f + U, u, live)
     tl.store(f + V, v, live)
@@ -102,8 +118,8 @@ def _footprints(  # type: ignore[no-untyped-def]
     tl.store(f + SHEAR, tl.where(seen, uv / vv, 0.0), live)
     tl.store(f + KV, tl.where(seen, kv, 0.0), live)
     tl.store(f + W, tl.where(seen, weight, 0.0), live)
-    tl.store(f + HU, tl.where(seen, hu, -1.0), live)
-    tl.store(f + HV, tl.where(seen, hv, -1.0), live)
+    tl.store(f + HU, tl.where(seen, hu, _HIDDEN), live)
+    tl.store(f + HV, tl.where(seen, hv, _HIDDEN), live)
     # Clipped as floats: a box far outside is no int32.
     row_low, row_high = tl.maximum(tl.ceil(v - hv), 0.0), tl.minimum(tl.floor(v + hv) + 1.0, rows * 1.0)
     col_low, col_high = tl.maximum(tl.ceil(u - hu), 0.0), tl.minimum(tl.floor(u + hu) + 1.0, cols * 1.0)
@@ -124,7 +140,7 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
     live = i < n
     f, m = table + 8 * i, moments + 6 * i
     seen = live & (tl.load(f + HU, live, -1.0) >= 0.0)
-    across, _, per, a, b, depth, norm = _ray(
+    across, _, per, a, b, depth, norm = along_ray(
         means, i, seen, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE
     )  # fmt: skip
     m0, me, mv = tl.load(m, seen, 0.0), tl.load(m + 1, seen, 0.0), tl.load(m + 2, seen, 0.0)
@@ -203,28 +219,30 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
     tl.store(at + 2, tl.load(at + 2, seen, 0.0) + gz, seen)
 
 
-def _beam(geometry: Geometry, view: int) -> tuple[list[float], float, float]:
+def beam_of(geometry: Geometry, view: int) -> tuple[list[float], float, float]:
     """The view's axes (nine numbers), the detector's distance in pixels (pixels a mm, if parallel), source distance."""
     focal = (geometry.sdd if geometry.is_cone else 1.0) / geometry.pixel_pitch
     return geometry.axes(view).ravel().tolist(), focal, geometry.sod if geometry.is_cone else 0.0
 
 
 def footprints(
-    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
-    geometry: Geometry, view: int, faint: float, cut: float, length: float = 0.0,
+    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, geometry: Geometry, view: int,
+    faint: float, cut: float, length: float = 0.0, exact_above: float = math.inf,
 ) -> Footprints:  # fmt: skip
     """Footprints of Gaussians, ending below `faint` (units of the image) and at the latest after `cut` σ.
 
-    A `length` (mm) other than 0 stands in for μ: the uncorrected factor.
+    A `length` (mm) other than 0 stands in for μ: the uncorrected factor. Half widths are INEXACT, and boxes empty,
+    where a cone's ε is above `exact_above` (see `footprints_cpu`).
     """
     n = densities.shape[0]
     found = Footprints(means.new_empty((n, 8)), torch.empty((n, 4), dtype=torch.int32, device=means.device))
     rows, cols = geometry.detector_shape
-    axes, focal, sod = _beam(geometry, view)
+    axes, focal, sod = beam_of(geometry, view)
     if n > 0:
         _footprints[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, densities, found.table, found.boxes, n, rows, cols, *axes, *geometry.origin(view),
-            focal, sod, 0.01 * sod, faint, cut, length, CONE=geometry.is_cone, BLOCK=_BLOCK,
+            focal, sod, NEAREST * sod, faint, cut, length, min(exact_above * exact_above, _HUGE.value),
+            CONE=geometry.is_cone, BLOCK=_BLOCK,
         )  # fmt: skip
     return found
 
@@ -237,7 +255,7 @@ def footprints_backward(
 ) -> None:  # fmt: skip
     """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
     n = densities.shape[0]
-    axes, focal, sod = _beam(geometry, view)
+    axes, focal, sod = beam_of(geometry, view)
     if n > 0:
         _footprints_backward[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, densities, found.table, moments, d_means, d_log_scales, d_rotations, d_densities,

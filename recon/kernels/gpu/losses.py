@@ -1,4 +1,4 @@
-"""L1 with D-SSIM and total variation, with their gradients, in a few passes over the pixels (Triton)."""
+"""Data terms with D-SSIM, and total variation, with their gradients, in a few passes over the pixels (Triton)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.kernels.losses_cpu import RADIUS, gaussian_window
+from recon.kernels.losses_cpu import ABSOLUTE, L1, L2, RADIUS, DataTerm, gaussian_window
 
 _BLOCK = 256
 _R = tl.constexpr(RADIUS)
+_L1, _L2 = tl.constexpr(L1), tl.constexpr(L2)
 
 
 @triton.jit
@@ -32,15 +33,20 @@ def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: 
 
 
 @triton.jit
-def _products_across(image, target, out, window, cols, pixels, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """x, x² and xy blurred along the rows, out [3, row, col]."""
+def _products_across(  # type: ignore[no-untyped-def]
+    image, target, weights, out, window, cols, pixels, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr
+):
+    """x, x² and xy blurred along the rows, out [3, row, col]; a pixel of no weight is 0."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
     col = i % cols
     bx, bxx, bxy = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     for tap in tl.static_range(-_R, _R + 1):
         ok = live & (col + tap >= 0) & (col + tap < cols)
-        x, y = tl.load(image + i + tap, ok, 0.0), tl.load(target + i + tap, ok, 0.0)
+        y = tl.load(target + i + tap, ok, 0.0)
+        if WEIGHTED:
+            ok = ok & (tl.load(weights + i + tap, ok, 0.0) > 0.0)
+        x = tl.load(image + i + tap, ok, 0.0)
         weighted = tl.load(window + (tap + _R)) * x
         bx, bxx, bxy = bx + weighted, bxx + weighted * x, bxy + weighted * y
     tl.store(out + i, bx, live)
@@ -49,8 +55,11 @@ def _products_across(image, target, out, window, cols, pixels, BLOCK: tl.constex
 
 
 @triton.jit
-def _ssim_terms(half, target_maps, partials, sums, window, rows, cols, pixels, c1, c2, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Finish the blur down the columns; the SSIM map's sum a block, and its derivatives by the blurred x, x², xy."""
+def _ssim_terms(  # type: ignore[no-untyped-def]
+    half, target_maps, weights, partials, sums, window, rows, cols, pixels, c1, c2, WEIGHTED: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Finish the blur down the columns; the sum of w (1 - SSIM) a block; w SSIM's slopes by the blurred x, x², xy."""
     block = tl.program_id(0)
     i = block * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -66,18 +75,25 @@ def _ssim_terms(half, target_maps, partials, sums, window, rows, cols, pixels, c
     vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
     top1, top2 = 2.0 * mx * my + c1, 2.0 * vxy + c2
     low1, low2 = 1.0 / (mx * mx + my * my + c1), 1.0 / (vx + vy + c2)
-    value = top1 * top2 * low1 * low2
-    d_vx, d_vxy = -value * low2, 2.0 * top1 * low1 * low2
-    d_mx = 2.0 * my * top2 * low1 * low2 - 2.0 * mx * value * low1
+    low, weight = low1 * low2, 1.0
+    if WEIGHTED:
+        weight = tl.load(weights + i, live, 0.0)
+        low = low * weight
+    value = top1 * top2 * low
+    d_vx, d_vxy = -value * low2, 2.0 * top1 * low
+    d_mx = 2.0 * my * top2 * low - 2.0 * mx * value * low1
     tl.store(partials + i, d_mx - 2.0 * mx * d_vx - my * d_vxy, live)
     tl.store(partials + pixels + i, d_vx, live)
     tl.store(partials + 2 * pixels + i, d_vxy, live)
-    tl.store(sums + block, tl.sum(tl.where(live, value, 0.0)))
+    tl.store(sums + block, tl.sum(tl.where(live, weight - value, 0.0)))
 
 
 @triton.jit
-def _combine(image, target, half, gradient, sums, window, rows, cols, pixels, l1, ssim, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Finish the derivatives' blur and join them with L1's; the sum of |x - y| a block."""
+def _combine(  # type: ignore[no-untyped-def]
+    image, target, half, weights, gradient, sums, window, rows, cols, pixels, soft, depth, share, ssim,
+    KIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Finish the derivatives' blur and join them with the data term's; the sum of w times that term a block."""
     block = tl.program_id(0)
     i = block * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -91,28 +107,41 @@ def _combine(image, target, half, gradient, sums, window, rows, cols, pixels, l1
         pxy += weight * tl.load(at + 2 * pixels, ok, 0.0)
     x, y = tl.load(image + i, live, 0.0), tl.load(target + i, live, 0.0)
     off = x - y
-    sign = tl.where(off > 0.0, 1.0, tl.where(off < 0.0, -1.0, 0.0))
-    tl.store(gradient + i, l1 * sign - ssim * (px + 2.0 * x * pxx + y * pxy), live)
-    tl.store(sums + block, tl.sum(tl.abs(off)))
+    if KIND == _L1:
+        pull = tl.where(off > 0.0, 1.0, tl.where(off < 0.0, -1.0, 0.0))
+        cost = tl.abs(off)
+    else:
+        pull = off * soft
+        if KIND != _L2:
+            pull = pull * tl.exp(-depth * y)
+        cost = 0.5 * off * pull
+    slope = px + 2.0 * x * pxx + y * pxy
+    if WEIGHTED:
+        weight = tl.load(weights + i, live, 0.0)
+        pull, cost, slope = pull * weight, cost * weight, tl.where(weight > 0.0, slope, 0.0)
+    tl.store(gradient + i, share * pull - ssim * slope, live)
+    tl.store(sums + block, tl.sum(cost))
 
 
 class ProjectionLoss:
-    """mean |x - y| + λ (1 - SSIM(x, y)) and its gradient; the target's blurred maps are computed once a view."""
+    """mean w (D(x, y) + λ (1 - SSIM(x, y))) and its gradient, see `losses_cpu.ProjectionLoss`."""
 
     def __init__(
-        self, shape: tuple[int, int], ssim_weight: float, device: torch.device,
+        self, shape: tuple[int, int], ssim_weight: float, device: torch.device, term: DataTerm = ABSOLUTE,
         c1: float = 0.01**2, c2: float = 0.03**2,
     ) -> None:  # fmt: skip
         self.shape, self.pixels, self.ssim_weight, self.c1, self.c2 = shape, shape[0] * shape[1], ssim_weight, c1, c2
+        self.term = term
         self.window = torch.from_numpy(gaussian_window()).to(device)
         self._blocks = triton.cdiv(self.pixels, _BLOCK)
         self._half = torch.empty((3, *shape), device=device)
         self._partials = torch.empty((3, *shape), device=device)
         self._sums = torch.empty((2, self._blocks), device=device)
 
-    def target_maps(self, target: Tensor) -> Tensor:
-        """Blurred y and y² [2, row, col] of a target image."""
-        maps = torch.stack((target, target * target))
+    def target_maps(self, target: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Blurred m y and m y² [2, row, col] of a target image, m where the weight is above 0."""
+        seen = target if weights is None else target * (weights > 0)
+        maps = torch.stack((seen, seen * seen))
         return self._blurred(self._blurred(maps, across=True), across=False)
 
     def _blurred(self, maps: Tensor, *, across: bool) -> Tensor:
@@ -122,23 +151,33 @@ class ProjectionLoss:
         )
         return out
 
-    def __call__(self, image: Tensor, target: Tensor, target_maps: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss (float64, no dimensions, on the device: reading it waits for the device) and its gradient."""
+    def __call__(
+        self, image: Tensor, target: Tensor, target_maps: Tensor, weights: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The loss (float64, no dimensions, on the device: reading it waits for the device) and its gradient.
+
+        `target_maps` are those of the same weights. Image and target must be finite also where the weight is 0.
+        """
         (rows, cols), pixels, grid = self.shape, self.pixels, (self._blocks,)
         gradient = torch.empty_like(image)
-        weight = self.ssim_weight / pixels
-        ssim, l1 = self._sums
-        _products_across[grid](image, target, self._half, self.window, cols, pixels, BLOCK=_BLOCK)
+        unlike, data = self._sums
+        weighted = weights is not None
+        w = image if weights is None else weights  # without weights it is not read
+        _products_across[grid](
+            image, target, w, self._half, self.window, cols, pixels, WEIGHTED=weighted, BLOCK=_BLOCK
+        )  # fmt: skip
         _ssim_terms[grid](
-            self._half, target_maps, self._partials, ssim, self.window, rows, cols, pixels, self.c1, self.c2,
-            BLOCK=_BLOCK,
+            self._half, target_maps, w, self._partials, unlike, self.window, rows, cols, pixels, self.c1, self.c2,
+            WEIGHTED=weighted, BLOCK=_BLOCK,
         )  # fmt: skip
         _blur[(self._blocks, 3)](self._partials, self._half, self.window, rows, cols, pixels, ACROSS=True, BLOCK=_BLOCK)
         _combine[grid](
-            image, target, self._half, gradient, l1, self.window, rows, cols, pixels, 1 / pixels, weight, BLOCK=_BLOCK
-        )
+            image, target, self._half, w, gradient, data, self.window, rows, cols, pixels, 1 / self.term.delta,
+            self.term.depth, 1 / pixels, self.ssim_weight / pixels, KIND=self.term.kind, WEIGHTED=weighted,
+            BLOCK=_BLOCK,
+        )  # fmt: skip
         sums = self._sums.sum(1, dtype=torch.float64)
-        return sums[1] / pixels + (self.ssim_weight - weight * sums[0]), gradient
+        return (sums[1] + self.ssim_weight * sums[0]) / pixels, gradient
 
 
 @triton.jit

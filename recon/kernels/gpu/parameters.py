@@ -12,6 +12,7 @@ from torch import Tensor
 from recon.kernels.adam_cpu import BETA1, BETA2
 
 _BLOCK = 128
+_WIDEST = torch.finfo(torch.float32).max
 _SHORTEST = tl.constexpr(1e-12)  # a quaternion shorter than this acts as the identity
 
 
@@ -108,7 +109,9 @@ def activation_backward(
 
 
 @triton.jit
-def _adam_one(parameter, gradient, first, second, rate, scale2, eps, b1, b2, size, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _adam_one(  # type: ignore[no-untyped-def]
+    parameter, gradient, first, second, rate, low, high, scale2, eps, b1, b2, size, BLOCK: tl.constexpr
+):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = i < size
     g = tl.load(gradient + i, live, 0.0)
@@ -116,24 +119,26 @@ def _adam_one(parameter, gradient, first, second, rate, scale2, eps, b1, b2, siz
     v = b2 * tl.load(second + i, live, 0.0) + (1.0 - b2) * g * g
     tl.store(first + i, m, live)
     tl.store(second + i, v, live)
-    tl.store(parameter + i, tl.load(parameter + i, live, 0.0) - rate * m / (tl.sqrt(v * scale2) + eps), live)
+    value = tl.load(parameter + i, live, 0.0) - rate * m / (tl.sqrt(v * scale2) + eps)
+    tl.store(parameter + i, tl.minimum(tl.maximum(value, low), high), live)
 
 
 @triton.jit
 def _adam(  # type: ignore[no-untyped-def]
-    p0, g0, m0, v0, rate0, size0, p1, g1, m1, v1, rate1, size1, p2, g2, m2, v2, rate2, size2, p3, g3, m3, v3, rate3,
-    size3, scale2, eps, b1, b2, BLOCK: tl.constexpr,
+    p0, g0, m0, v0, rate0, low0, high0, size0, p1, g1, m1, v1, rate1, low1, high1, size1,
+    p2, g2, m2, v2, rate2, low2, high2, size2, p3, g3, m3, v3, rate3, low3, high3, size3,
+    scale2, eps, b1, b2, BLOCK: tl.constexpr,
 ):  # fmt: skip
     # One launch for all four arrays: the second axis of the grid says which.
     which = tl.program_id(1)
     if which == 0:
-        _adam_one(p0, g0, m0, v0, rate0, scale2, eps, b1, b2, size0, BLOCK)
+        _adam_one(p0, g0, m0, v0, rate0, low0, high0, scale2, eps, b1, b2, size0, BLOCK)
     elif which == 1:
-        _adam_one(p1, g1, m1, v1, rate1, scale2, eps, b1, b2, size1, BLOCK)
+        _adam_one(p1, g1, m1, v1, rate1, low1, high1, scale2, eps, b1, b2, size1, BLOCK)
     elif which == 2:
-        _adam_one(p2, g2, m2, v2, rate2, scale2, eps, b1, b2, size2, BLOCK)
+        _adam_one(p2, g2, m2, v2, rate2, low2, high2, scale2, eps, b1, b2, size2, BLOCK)
     else:
-        _adam_one(p3, g3, m3, v3, rate3, scale2, eps, b1, b2, size3, BLOCK)
+        _adam_one(p3, g3, m3, v3, rate3, low3, high3, scale2, eps, b1, b2, size3, BLOCK)
 
 
 def adam(
@@ -143,13 +148,18 @@ def adam(
     second: Sequence[Tensor],
     rates: Sequence[float],
     step: int,
+    bounds: Sequence[tuple[float, float] | None],
     eps: float = 1e-15,
 ) -> None:
-    """Update four arrays and their moments in place (Kingma & Ba 2015, algorithm 1); `step` counts from 1."""
+    """Update four arrays and their moments in place (Kingma & Ba 2015, algorithm 1) and keep them within bounds.
+
+    `step` counts from 1.
+    """
     scale1, scale2 = 1 / (1 - BETA1**step), 1 / (1 - BETA2**step)
     arguments: list[Tensor | float | int] = []
-    for p, g, m, v, rate in zip(parameters, gradients, first, second, rates, strict=True):
-        arguments += [p, g, m, v, rate * scale1, p.numel()]
+    for p, g, m, v, rate, within in zip(parameters, gradients, first, second, rates, bounds, strict=True):
+        low, high = (-_WIDEST, _WIDEST) if within is None else within
+        arguments += [p, g, m, v, rate * scale1, low, high, p.numel()]
     largest = max(p.numel() for p in parameters)
     if largest > 0:
         block = 4 * _BLOCK

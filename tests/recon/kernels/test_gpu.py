@@ -12,12 +12,15 @@ from torch import Tensor
 
 from recon import fit
 from recon.backend import Backend, Cpu, backend_for
+from recon.checkpoint import arrays_of, state_from
+from recon.density_control import DensityPolicy
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.kernels import footprints_cpu, reference
+from recon.kernels.losses_cpu import L1, L2, POISSON, DataTerm
 from recon.losses import projection_loss
 from recon.losses import total_variation as twin_total_variation
-from recon.splat import Active, Truncation, view_table
+from recon.splat import Active, RayModel, Truncation, project, view_table, voxelize
 from recon.volume import Grid
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
@@ -33,6 +36,7 @@ parameters = importlib.import_module("recon.kernels.gpu.parameters")
 tiles = importlib.import_module("recon.kernels.gpu.tiles")
 
 WHOLE = (1e-12, 9.0)  # faint, cut: no cut-off worth the name
+AFFINE, EXACT = RayModel(), RayModel(exact_above=0.0)
 UNIT = 0.7
 SHAPE = (19, 26)  # no multiple of a tile
 
@@ -76,7 +80,7 @@ def test_images_and_gradients_equal_the_twins(make: object, random_gaussians: Ma
     geometry = make()  # type: ignore[operator]
     g = random_gaussians(18, 9.0)
     raw, twin = raw_of(g, device), in_double(g)
-    found = autograd.project(*raw, UNIT, geometry, *WHOLE)
+    found = autograd.project(*raw, UNIT, geometry, *WHOLE, AFFINE)
     expected = torch.stack([twin_view(twin, geometry, view) for view in range(geometry.n_views)])
     peak = float(expected.detach().max())
     assert float((found.detach().cpu() - expected.detach()).abs().max()) < 3e-6 * peak
@@ -86,14 +90,50 @@ def test_images_and_gradients_equal_the_twins(make: object, random_gaussians: Ma
     assert_gradients(raw, twin)
 
 
+def test_exact_rays_and_gradients_equal_the_twins(random_gaussians: Make, device: torch.device) -> None:
+    geometry, g = cone(), random_gaussians(18, 9.0)
+    twin = in_double(g)
+    errors = reference.affine_error(twin.means, twin.scales, twin.quaternions, geometry, 0)
+    for worst in (0.0, float(errors.median())):
+        raw, twin = raw_of(g, device), in_double(g)
+        found = autograd.project(*raw, UNIT, geometry, *WHOLE, RayModel(exact_above=worst))[0]
+        physical = (twin.means, twin.scales, twin.quaternions, twin.densities)
+        expected = reference.project_view(*physical, geometry, 0, exact=errors > worst)
+        assert float((found.detach().cpu() - expected.detach()).abs().max()) < 5e-6 * float(expected.detach().max())
+        weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
+        (found * weights.float().to(device)).sum().backward()
+        (expected * weights).sum().backward()
+        assert_gradients(raw, twin)
+
+
+@pytest.mark.parametrize("cut", [1.5, 3.0])
+def test_exact_rays_end_where_the_cpus_end(cut: float, random_gaussians: Make, device: torch.device) -> None:
+    # To the pixel; and forward and backward agree on where.
+    g, geometry = random_gaussians(12, 9.0), cone()
+    raw, ours = raw_of(g, device), as_leaves(g)
+    found = autograd.project(*raw, g.density_unit, geometry, 1e-4, cut, EXACT)[0]
+    faint = 1e-4 / (g.density_unit * geometry.sample_pitch * SHAPE[1])
+    expected = project(ours, geometry, truncation=Truncation(cut, faint), model=EXACT)[0]
+    np.testing.assert_allclose(found.detach().cpu(), expected.detach(), atol=1e-5 * float(expected.detach().max()))
+    y = torch.from_numpy(np.random.default_rng(4).normal(size=SHAPE).astype(np.float32))
+    (found * y.to(device)).sum().backward()
+    (expected * y).sum().backward()
+    assert_gradients(raw, ours, 1e-4)
+    assert raw[3].grad is not None
+    back = raw[3].grad.cpu().double() / (g.density_unit * torch.sigmoid(g.raw_densities.double()))
+    left, right = float((found.detach().cpu() * y).double().sum()), float((g.densities.double() * back).sum())
+    assert left == pytest.approx(right, rel=2e-5)
+
+
 @pytest.mark.parametrize("make", [parallel, cone])
 def test_the_uncorrected_factor_equals_the_twins(make: object, random_gaussians: Make, device: torch.device) -> None:
     geometry = make()  # type: ignore[operator]
     g = random_gaussians(10, 9.0)
     raw, twin = raw_of(g, device), in_double(g)
-    found = autograd.project(*raw, UNIT, geometry, *WHOLE, 5.5)[0]
+    plain = RayModel(rectified=False)
+    found = autograd.project(*raw, UNIT, geometry, *WHOLE, plain)[0]
     physical = (twin.means, twin.scales, twin.quaternions, twin.densities)
-    expected = reference.project_view(*physical, geometry, 0, length=5.5)
+    expected = reference.project_view(*physical, geometry, 0, length=plain.length(geometry))
     assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
     (found * found).sum().backward()
     (expected * expected).sum().backward()
@@ -106,7 +146,7 @@ def test_footprints_equal_the_cpus(random_gaussians: Make, device: torch.device)
     active = Active.of(*(arrays[k] for k in ("means", "log_scales", "quaternions", "raw_densities")), UNIT)
     expected = view_table(active, geometry, 0, 1e-3, 3.5)
     raw = [t.detach() for t in raw_of(g, device)]
-    found = engine.GpuPass(*raw, UNIT).view(geometry, 0, 1e-3, 3.5).footprints
+    found = engine.GpuPass(*raw, UNIT).view(geometry, 0, 1e-3, 3.5, AFFINE).footprints
     table = found.table.cpu().numpy()
     hidden = expected[:, footprints_cpu.HU] < 0
     assert hidden.any() or not (table[:, footprints_cpu.HU] < 0).any()
@@ -124,7 +164,7 @@ def test_a_cut_off_ends_at_the_box_whatever_the_tiles(device: torch.device) -> N
     # One Gaussian over several tiles and image borders: exactly the pixels of its box are lit.
     g = Gaussians.from_physical([[2.3, 0.0, -3.1]], [1.4], [1.0])
     geometry = Geometry.parallel([0.0], (17, 20), axis_col=14.0)
-    view = engine.GpuPass(*(t.detach() for t in raw_of(g, device)), 1.0).view(geometry, 0, 1e-9, 2.5)
+    view = engine.GpuPass(*(t.detach() for t in raw_of(g, device)), 1.0).view(geometry, 0, 1e-9, 2.5, AFFINE)
     image = view.image.cpu().numpy()
     rows, cols = np.abs(np.arange(17) - (8 - 3.1)) <= 2.5 * 1.4, np.abs(np.arange(20) - 16.3) <= 2.5 * 1.4
     np.testing.assert_array_equal(image > 0, rows[:, None] & cols[None, :])
@@ -140,7 +180,7 @@ def test_the_backward_pass_is_the_adjoint_where_footprints_are_cut(
     g = random_gaussians(25, 14.0)
     raw = raw_of(g, device)
     y = torch.from_numpy(rng.normal(size=(2, *SHAPE)).astype(np.float32)).to(device)
-    image = autograd.project(*raw, UNIT, parallel(), 1e-3, 2.0)
+    image = autograd.project(*raw, UNIT, parallel(), 1e-3, 2.0, AFFINE)
     (image * y).sum().backward()
     assert raw[3].grad is not None
     back = raw[3].grad.cpu().double() / (UNIT * torch.sigmoid(g.raw_densities.double()))
@@ -179,7 +219,7 @@ def test_none_one_and_those_that_cover_everything(n: int, device: torch.device) 
     g = Gaussians.from_physical(np.full((n, 3), 0.2), np.full((n, 3), 40.0), np.ones(n), density_unit=1.0)
     raw, twin = raw_of(g, device), in_double(g)
     geometry, grid = Geometry.parallel([1.0], (9, 17)), Grid((3, 9, 9))
-    image = autograd.project(*raw, 1.0, geometry, *WHOLE)
+    image = autograd.project(*raw, 1.0, geometry, *WHOLE, AFFINE)
     volume = autograd.voxelize(*raw, 1.0, grid, *WHOLE)
     image.sum().backward()
     volume.sum().backward()
@@ -201,7 +241,7 @@ def test_none_one_and_those_that_cover_everything(n: int, device: torch.device) 
 def test_what_misses_the_image_or_is_too_faint_has_no_gradient(device: torch.device) -> None:
     g = Gaussians.from_physical([[0.0, 0, 0], [500.0, 0, 0], [0, 0, 1e30]], [1.0, 1.0, 1.0], [1e-9, 1.0, 1.0])
     raw = raw_of(g, device)
-    image = autograd.project(*raw, 1.0, Geometry.parallel([0.0], (5, 6)), 1e-6, 3.5)
+    image = autograd.project(*raw, 1.0, Geometry.parallel([0.0], (5, 6)), 1e-6, 3.5, AFFINE)
     assert not image.any()
     image.sum().backward()
     assert all(tensor.grad is not None and not tensor.grad.any() for tensor in raw)
@@ -213,7 +253,7 @@ def test_a_needle_keeps_its_digits(aspect: float, device: torch.device) -> None:
     g = Gaussians.from_physical([[0.1, 0.2, -0.3]], [[0.03 * aspect, 0.03, 0.03]], [1.0], [[0.9, 0.1, 0.35, 0.2]])
     geometry = Geometry.parallel([0.3], (24, 24), 0.05)
     raw, twin = raw_of(g, device), in_double(g)
-    found = autograd.project(*raw, g.density_unit, geometry, *WHOLE)
+    found = autograd.project(*raw, g.density_unit, geometry, *WHOLE, AFFINE)
     expected = twin_view(twin, geometry, 0)
     assert float((found[0].cpu() - expected).detach().abs().max()) < 1e-5 * float(expected.detach().max())
     found.sum().backward()
@@ -235,13 +275,14 @@ def test_extreme_gaussians_stay_finite(device: torch.device) -> None:
         torch.tensor([0.5, 3.0, 0.0, -80.0, 0.5]),
     )
     with np.errstate(all="ignore"):  # the interpreter is numpy, which warns of an infinity that a GPU just makes
-        for call, where in (
-            (autograd.project, parallel()),
-            (autograd.project, cone()),
+        for call, where, *model in (
+            (autograd.project, parallel(), AFFINE),
+            (autograd.project, cone(), AFFINE),
+            (autograd.project, cone(), EXACT),
             (autograd.voxelize, Grid((4, 5, 6))),
         ):
             raw = raw_of(g, device)
-            out = call(*raw, 1.0, where, 1e-5, 3.5)
+            out = call(*raw, 1.0, where, 1e-5, 3.5, *model)
             out.sum().backward()
             assert torch.isfinite(out).all() and float(out.detach().min()) >= 0
             assert all(tensor.grad is not None and torch.isfinite(tensor.grad).all() for tensor in raw)
@@ -271,7 +312,7 @@ def test_a_long_list_is_shared_out_and_sums_to_the_same(device: torch.device) ->
     g = Gaussians.from_physical(rng.uniform(-3, 3, (90, 3)), rng.uniform(0.8, 2, (90, 3)), rng.uniform(0.2, 1, 90))
     geometry, grid = Geometry.parallel([0.5], (7, 8)), Grid((4, 5, 6))
     run = engine.GpuPass(*(t.detach() for t in raw_of(g, device)), g.density_unit)
-    view, box = run.view(geometry, 0, *WHOLE), run.box(grid, *WHOLE)
+    view, box = run.view(geometry, 0, *WHOLE, AFFINE), run.box(grid, *WHOLE)
     boxes = view.footprints.boxes
     assert tiles.tile_lists(boxes, (7, 8), 8).shares > 1
     assert tiles.tile_lists(torch.zeros_like(boxes), (7, 8), 8).shares == 1
@@ -310,33 +351,62 @@ def test_activations_and_gradients_equal_torch(rng: np.random.Generator, device:
     np.testing.assert_allclose(d_r.cpu(), r.grad, rtol=1e-4, atol=1e-12)
 
 
-def test_adam_equals_the_cpus(rng: np.random.Generator, device: torch.device) -> None:
+def test_adam_and_its_bounds_equal_the_cpus(rng: np.random.Generator, device: torch.device) -> None:
     shapes, rates = ((700, 3), (5, 3), (5, 4), (1,)), (0.01, 0.02, 0.003, 0.1)
+    bounds = (None, (-0.5, 0.4), None, (0.1, 2.0))
     ours, theirs = Cpu(), engine.Gpu("cuda")
     start = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
     sets = [[[b.array(p) for p in start], *([b.array(0 * p) for p in start] for _ in range(2))] for b in (ours, theirs)]
     for step in range(1, 4):
         slopes = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
         for backend, (p, first, second) in zip((ours, theirs), sets, strict=True):
-            backend.adam(p, [backend.array(slope) for slope in slopes], first, second, rates, step)
+            backend.adam(p, [backend.array(slope) for slope in slopes], first, second, rates, step, bounds)
+    held = theirs.numpy(sets[1][0][1])
+    assert held.min() == np.float32(-0.5) and held.max() == np.float32(0.4)
     for mine, others in zip(*sets, strict=True):
         for a, b in zip(mine, others, strict=True):
             np.testing.assert_allclose(theirs.numpy(b), a, atol=2e-6)
 
 
-def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator, device: torch.device) -> None:
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("term", [DataTerm(L1, 1.0, 1.0), DataTerm(L2, 0.3, 1.0), DataTerm(POISSON, 0.2, 1.7)])
+def test_projection_loss_and_gradient_equal_the_twin(
+    weighted: bool, term: DataTerm, rng: np.random.Generator, device: torch.device
+) -> None:
     target = rng.random((19, 33)).astype(np.float32)
     image = (target + 0.2 * rng.normal(size=target.shape)).astype(np.float32)
     image[3, 4] = target[3, 4]
-    loss = engine.Gpu("cuda").projection_loss(target.shape, 0.25)
-    x, y = torch.from_numpy(image).to(device), torch.from_numpy(target).to(device)
-    value, gradient = loss(x, y, loss.target_maps(y))
-    twin = torch.from_numpy(image.astype(np.float64)).requires_grad_()
-    expected = projection_loss(twin, torch.from_numpy(target.astype(np.float64)), 0.25)
+    weights = np.maximum(rng.uniform(-0.5, 2.0, target.shape), 0).astype(np.float32) if weighted else None
+    backend = engine.Gpu("cuda")
+    loss = backend.projection_loss(target.shape, 0.25, term)
+    x, y = backend.array(image), backend.array(target)
+    w = None if weights is None else backend.array(weights)
+    value, gradient = loss(x, y, loss.target_maps(y, w), w)
+    twin, *others = (None if a is None else torch.from_numpy(a.astype(np.float64)) for a in (image, target, weights))
+    assert twin is not None
+    twin.requires_grad_()
+    expected = projection_loss(twin, others[0], 0.25, others[1], term)
     expected.backward()
     assert float(value) == pytest.approx(expected.item(), rel=1e-5)
     assert twin.grad is not None
     np.testing.assert_allclose(gradient.cpu(), twin.grad, atol=2e-5 * float(twin.grad.abs().max()))
+    if weights is not None:
+        assert not gradient.cpu().numpy()[weights == 0].any()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_misfit_and_lengths_equal_the_cpus(weighted: bool, rng: np.random.Generator) -> None:
+    image, target, w = rng.random((3, 12, 17)).astype(np.float32)
+    vectors, factor = rng.normal(size=(31, 2)).astype(np.float32), 2.5
+    found = []
+    for backend in (Cpu(), backend_for("cuda")):
+        weights, sums = backend.array(w) if weighted else None, backend.array(np.arange(31, dtype=np.float32))
+        here = [backend.array(a) for a in (image, target, 0 * target)]
+        assert float(backend.misfit(here[0], here[2], weights)) == 0
+        backend.add_lengths(backend.array(vectors), factor, sums)
+        found.append((float(backend.misfit(here[0], here[1], weights)), backend.numpy(sums)))
+    assert found[1][0] == pytest.approx(found[0][0], rel=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(5, 6, 11), (1, 4, 4), (1, 1, 3), (1, 1, 1)])
@@ -356,34 +426,54 @@ def test_total_variation_and_gradient_equal_the_twin(
     np.testing.assert_allclose(gradient.cpu(), x.grad, atol=1e-7)
 
 
-def _step(backend: Backend, state: fit.FitState, problem: fit.Problem, settings: fit.FitSettings, box: Grid) -> tuple:
-    """A fit's step in the backend's operations: loss, image and gradients of view 0 and one box of voxels."""
-    cut, unit, half = settings.truncation, 1 / problem.half_field, problem.half_field
-    run = backend.begin(*(backend.array(state.parameters[name]) for name in fit.NAMES), unit)
-    loss = backend.projection_loss(problem.geometry.detector_shape, settings.ssim_weight)
-    target = backend.array(problem.images[0])
-    view = run.view(problem.geometry, 0, cut.faint, cut.sigmas)
-    value, slope = loss(view.image, target, loss.target_maps(target))
-    centres = view.backward(slope)
-    part = run.box(box, cut.faint / half, cut.sigmas)
-    rough, slope = backend.total_variation(part.density * half, settings.tv_weight)
-    part.backward(slope * half, means_too=settings.tv_moves)
-    return float(value) + float(rough), *(backend.numpy(a) for a in (view.image, centres, *run.gradients()))
+def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: fit.FitSettings) -> tuple[fit.FitState, list]:
+    """Five steps with rounds of density control on data and weights that are always the same."""
+    rng = np.random.default_rng(5)
+    data = rng.random((geometry.n_views, *SHAPE)).astype(np.float32)
+    weights = (rng.random(data.shape) > 0.1).astype(np.float32)
+    problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
+    state, told = fit.init(g, 11, 1.5, backend), []
+    fit.run(state, problem, settings, 5, lambda s: told.append((s.n, float(s.loss), float(s.residual))) is not None)
+    return state, [*told, fit.misfit_of(state, problem, settings)]
 
 
-def test_a_step_of_a_fit_is_the_same_on_both_backends(random_gaussians: Make) -> None:
-    g, geometry = random_gaussians(24, 8.0), parallel()
-    grid = Grid.matching(geometry)
+@pytest.mark.parametrize(
+    ("make", "changes"),
+    [
+        (parallel, {"loss": "poisson", "views_per_step": 2}),
+        (cone, {"loss": "l1", "rays": RayModel(exact_above=0.05)}),
+    ],
+)
+def test_a_fit_is_the_same_on_both_backends(make: object, changes: dict, random_gaussians: Make) -> None:
+    g, geometry = random_gaussians(14, 8.0), make()  # type: ignore[operator]
     # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.
-    settings = fit.FitSettings(policy=None, truncation=Truncation(9.0, 1e-12))
-    data = np.random.default_rng(5).random((2, *SHAPE)).astype(np.float32)
-    problem = fit.problem_of(data, geometry, grid, UNIT, settings)
-    state = fit.init(g, 11)
-    box = Grid((6, 6, 6), grid.voxel_size, (0.2, -0.4, 0.1))
-    ours, theirs = (_step(backend, state, problem, settings, box) for backend in (Cpu(), backend_for("cuda")))
-    assert theirs[0] == pytest.approx(ours[0], rel=1e-5)
-    for a, b in zip(ours[1:], theirs[1:], strict=True):
-        np.testing.assert_allclose(b, a, atol=2e-5 * float(np.abs(a).max()))
+    policy = DensityPolicy(start=0.0, stop=1.0, every=2, threshold=1e-4, prune_below=0.3)
+    settings = fit.FitSettings(
+        truncation=Truncation(9.0, 1e-12), policy=policy, tv_size=5, pace=10.0, smallest=0.8, **changes
+    )
+    (ours, said), (theirs, told) = (_fit(backend, g, geometry, settings) for backend in (Cpu(), backend_for("cuda")))
+    assert len({n for n, *_ in said[:-1]}) > 1  # density control changed the model
+    np.testing.assert_allclose(np.hstack(told), np.hstack(said), rtol=2e-5)
+    device = backend_for("cuda")
+    for name in fit.NAMES:
+        a, b = ours.parameters[name], device.numpy(theirs.parameters[name])
+        np.testing.assert_allclose(b, a, atol=2e-5 * float(np.abs(a).max()), err_msg=name)
+    np.testing.assert_allclose(device.numpy(theirs.statistic), ours.statistic, atol=2e-5 * ours.statistic.max())
+    checkpoint = arrays_of(theirs, device)
+    again = state_from(checkpoint, device)
+    for key, array in arrays_of(again, device).items():
+        np.testing.assert_array_equal(array, checkpoint[key], err_msg=key)
+
+
+def test_project_and_voxelize_go_where_they_are_sent(random_gaussians: Make) -> None:
+    g, geometry, grid = random_gaussians(9, 8.0), cone(), Grid((4, 6, 5), 0.9)
+    model, cut = RayModel(exact_above=0.05), Truncation(9.0, 1e-12)
+    shown = project(g, geometry, truncation=cut, model=model, kernel="gpu")
+    np.testing.assert_allclose(shown, project(g, geometry, truncation=cut, model=model), rtol=1e-4, atol=1e-5)
+    dense = voxelize(g, grid, truncation=cut, kernel="gpu")
+    np.testing.assert_allclose(dense, voxelize(g, grid, truncation=cut), rtol=1e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="gpu kernel works in float32"):
+        project(in_double(g), geometry, kernel="gpu")
 
 
 def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,10 +20,10 @@ _INDICES = "boxes owners starts"
 _ARRAYS = (
     "means scales rotations densities table moments layers gradient log_scales quaternions raw d_means d_log_scales "
     "d_rotations d_densities d_centres d_quaternions d_raw image target out window source half target_maps partials "
-    "sums volume p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
+    "weights terms sums volume p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
 )
 # Those that other kernels call.
-_PARTS = {"_ray", "_slope", "_unit_quaternion", "_adam_one"}
+_PARTS = {"along_ray", "_at_pixels", "_slope", "_unit_quaternion", "_adam_one"}
 
 
 def _load_without_triton() -> None:
@@ -43,7 +43,8 @@ def _compile_all() -> None:
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from recon.kernels.gpu import footprints, images, losses, parameters, voxels
+    from recon.kernels.gpu import footprints, images, losses, parameters, rays, voxels
+    from recon.kernels.losses_cpu import L1, L2, POISSON
 
     block = {"BLOCK": 128}
     wanted = [
@@ -53,15 +54,21 @@ def _compile_all() -> None:
         (footprints, "_footprints_backward", 4, block | {"CONE": True}),
         (images, "_render", 2, {"EDGE": images._EDGE, "GROUP": images._GROUP}),
         (images, "_moments", 1, {"HIGH": images._BLOCK[0], "WIDE": images._BLOCK[1]}),
+        (rays, "_terms", 4, block),
+        (rays, "_render", 2, {"EDGE": rays._EDGE, "GROUP": rays._GROUP}),
+        (rays, "_sums", 1, {"HIGH": rays._PIXELS[0], "WIDE": rays._PIXELS[1]}),
+        (rays, "_bend", 4, block),
         (voxels, "_placed", 4, block),
         (voxels, "_fill", 4, {"EDGE": voxels._EDGE, "GROUP": voxels._GROUP}),
         (voxels, "_moments", 1, {"DEEP": voxels._DEEP, "HIGH": voxels._HIGH, "WIDE": voxels._WIDE}),
         (voxels, "_backward", 4, block | {"MEANS": True}),
         (losses, "_blur", 4, block | {"ACROSS": True}),
         (losses, "_blur", 4, block | {"ACROSS": False}),
-        (losses, "_products_across", 4, block),
-        (losses, "_ssim_terms", 4, block),
-        (losses, "_combine", 4, block),
+        *((losses, "_products_across", 4, block | {"WEIGHTED": weighted}) for weighted in (False, True)),
+        *((losses, "_ssim_terms", 4, block | {"WEIGHTED": weighted}) for weighted in (False, True)),
+        (losses, "_combine", 4, block | {"KIND": L1, "WEIGHTED": False}),
+        (losses, "_combine", 4, block | {"KIND": L2, "WEIGHTED": True}),
+        (losses, "_combine", 4, block | {"KIND": POISSON, "WEIGHTED": True}),
         (losses, "_total_variation", 4, block),
         (parameters, "_activate", 4, block),
         (parameters, "_activation_backward", 4, block),
