@@ -17,8 +17,8 @@ from recon.kernels import lanes
 F32 = NDArray[np.float32]
 OPTIONS = {"parallel": True, "fastmath": True, "boundscheck": False, "error_model": "numpy", "cache": True}
 _f = np.float32
-# A quaternion shorter than this (squared) has no direction worth a gradient; it acts as the identity.
-_SHORTEST = np.float32(1e-24)
+# A quaternion shorter than this has no direction worth a gradient; it acts as the identity.
+_SHORTEST = np.float32(1e-12)
 _TASK = 1024  # Gaussians
 
 
@@ -44,6 +44,15 @@ def _sigmoid(r):  # type: ignore[no-untyped-def]
     return lanes.exp((r - size) * _f(0.5)) / (lanes.exp(lanes.zero() - size) + _f(1))
 
 
+@njit(inline="always", fastmath=True)
+def _shrunk(quaternions, i):  # type: ignore[no-untyped-def]
+    """Quaternion i over its largest entry, whose squares no length can overflow, and the factor; zeros if too short."""
+    w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
+    most = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
+    factor = _f(1) / most if most > _SHORTEST else _f(0)
+    return w * factor, x * factor, y * factor, z * factor, factor
+
+
 @njit(**OPTIONS)
 def activate(
     log_scales: F32, quaternions: F32, raw: F32, unit: float, scales: F32, rotations: F32, densities: F32
@@ -62,9 +71,8 @@ def activate(
             density = _softplus(lanes.load_first(raws, 0, j, count)) * _f(unit)
             lanes.store_first(dense, 0, j, density, count)
         for i in range(begin, end):
-            w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
-            length2 = w * w + x * x + y * y + z * z
-            scale = two / length2 if length2 > _SHORTEST else _f(0)
+            w, x, y, z, factor = _shrunk(quaternions, i)
+            scale = two / (w * w + x * x + y * y + z * z) if factor > 0 else _f(0)
             xs, ys, zs = x * scale, y * scale, z * scale
             rotations[i, 0] = one - (y * ys + z * zs)
             rotations[i, 1] = x * ys - w * zs
@@ -91,10 +99,10 @@ def activation_backward(
             slope = _sigmoid(lanes.load_first(raws, 0, j, count)) * _f(unit)
             lanes.store_first(out, 0, j, lanes.load_first(d_dense, 0, j, count) * slope, count)
         for i in range(begin, end):
-            w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
-            length2 = w * w + x * x + y * y + z * z
-            inverse = _f(1) / np.sqrt(length2) if length2 > _SHORTEST else _f(0)
+            w, x, y, z, factor = _shrunk(quaternions, i)
+            inverse = _f(1) / np.sqrt(w * w + x * x + y * y + z * z) if factor > 0 else _f(0)
             w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+            inverse *= factor
             g = d_rotations[i]
             gw = two * (-z * g[1] + y * g[2] + z * g[3] - x * g[5] - y * g[6] + x * g[7])
             gx = two * (y * g[1] + z * g[2] + y * g[3] - w * g[5] + z * g[6] + w * g[7]) - four * x * (g[4] + g[8])

@@ -150,7 +150,10 @@ def _forward(straight: bool) -> Any:
             within = _f(1) / np.sqrt(hh)  # mm of the ray in one standard deviation
             scale = within / (g * (scales[i, 0] * scales[i, 1] * scales[i, 2]))  # g / sqrt(det Σ₂)
             table[i, U], table[i, V] = _f(col) + f * tu, _f(row) + f * tv
-            table[i, K], table[i, SHEAR], table[i, KV] = vv * scale * scale, uv / vv, _f(1) / (vv * g * g)
+            # Squares of square roots: those of a Gaussian of 1e-12 px would leave float32's range on the way.
+            wide, high = np.sqrt(uu), np.sqrt(vv)
+            steep, level = high * scale, _f(1) / (high * g)
+            table[i, K], table[i, SHEAR], table[i, KV] = steep * steep, uv / vv, level * level
             weight = densities[i] * (_f(length) if plain else _ROOT_TWO_PI * ray * within)
             table[i, W] = weight
             reach = _f(HIDDEN)
@@ -166,7 +169,7 @@ def _forward(straight: bool) -> Any:
                     if first / (depth * depth) + _f(6) * eta * eta > _f(exact_above * exact_above):
                         table[i, HU] = table[i, HV] = _f(INEXACT)
                         continue
-            table[i, HU], table[i, HV] = reach * np.sqrt(uu), reach * np.sqrt(vv)
+            table[i, HU], table[i, HV] = reach * wide, reach * high
 
     return kernel
 

@@ -87,3 +87,20 @@ def test_a_quaternion_without_direction_is_the_identity_and_feels_nothing() -> N
         g = np.ones((1, 9), np.float32)
         activation_backward(quaternion, np.zeros(1, np.float32), 1.0, g, g[0, :1].copy(), d_quaternions, d_raw)
         assert not d_quaternions.any()
+
+
+@pytest.mark.parametrize("length", [1e-11, 1e-3, 1e12, 1e30, 1e38])
+def test_a_quaternion_of_any_length_has_its_direction(length: float) -> None:
+    # The square of 1e30 is no float32: a naive length is infinite, and the rotation silently none.
+    quaternion = (np.array([[0.1, -0.7, 0.5, 0.5]]) * length).astype(np.float32)
+    _, rotations, _ = _activated(np.zeros((1, 3)), quaternion, np.zeros(1))
+    leaf = torch.from_numpy(quaternion.astype(np.float64)).requires_grad_()
+    turned = rotation_matrices(leaf).reshape(1, 9)
+    np.testing.assert_allclose(rotations, turned.detach().numpy(), atol=4e-7)
+    g = np.random.default_rng(0).normal(size=(1, 9)).astype(np.float32)
+    d_quaternion, d_raw = np.empty((1, 4), np.float32), np.empty(1, np.float32)
+    activation_backward(quaternion, np.zeros(1, np.float32), 1.0, g, g[0, :1].copy(), d_quaternion, d_raw)
+    (turned * torch.from_numpy(g)).sum().backward()
+    assert leaf.grad is not None
+    expected = leaf.grad.numpy()
+    np.testing.assert_allclose(d_quaternion, expected, atol=3e-6 * np.abs(expected).max() + 1e-37)
