@@ -46,7 +46,7 @@ def _compile_all() -> None:
     from recon.kernels.gpu import footprints, images, losses, parameters, rays, voxels
     from recon.kernels.losses_cpu import L1, L2, POISSON
 
-    block = {"BLOCK": 128}
+    block, pixels = {"BLOCK": footprints._BLOCK}, {"BLOCK": losses._BLOCK}
     wanted = [
         (footprints, "_footprints", 4, block | {"CONE": False}),
         (footprints, "_footprints", 4, block | {"CONE": True}),
@@ -62,17 +62,17 @@ def _compile_all() -> None:
         (voxels, "_fill", 4, {"EDGE": voxels._EDGE, "GROUP": voxels._GROUP}),
         (voxels, "_moments", 1, {"DEEP": voxels._DEEP, "HIGH": voxels._HIGH, "WIDE": voxels._WIDE}),
         (voxels, "_backward", 4, block | {"MEANS": True}),
-        (losses, "_blur", 4, block | {"ACROSS": True}),
-        (losses, "_blur", 4, block | {"ACROSS": False}),
-        *((losses, "_products_across", 4, block | {"WEIGHTED": weighted}) for weighted in (False, True)),
-        *((losses, "_ssim_terms", 4, block | {"WEIGHTED": weighted}) for weighted in (False, True)),
-        (losses, "_combine", 4, block | {"KIND": L1, "WEIGHTED": False}),
-        (losses, "_combine", 4, block | {"KIND": L2, "WEIGHTED": True}),
-        (losses, "_combine", 4, block | {"KIND": POISSON, "WEIGHTED": True}),
-        (losses, "_total_variation", 4, block),
+        (losses, "_blur", 4, pixels | {"ACROSS": True}),
+        (losses, "_blur", 4, pixels | {"ACROSS": False}),
+        *((losses, "_products_across", 4, pixels | {"WEIGHTED": weighted}) for weighted in (False, True)),
+        *((losses, "_ssim_terms", 4, pixels | {"WEIGHTED": weighted}) for weighted in (False, True)),
+        (losses, "_combine", 4, pixels | {"KIND": L1, "WEIGHTED": False}),
+        (losses, "_combine", 4, pixels | {"KIND": L2, "WEIGHTED": True}),
+        (losses, "_combine", 4, pixels | {"KIND": POISSON, "WEIGHTED": True}),
+        (losses, "_total_variation", 4, pixels),
         (parameters, "_activate", 4, block),
         (parameters, "_activation_backward", 4, block),
-        (parameters, "_adam", 4, block),
+        (parameters, "_adam", 4, {"BLOCK": 4 * parameters._BLOCK}),
     ]
     modules = {module for module, *_ in wanted}
     kernels = {
@@ -95,8 +95,9 @@ def _compile_all() -> None:
             else:
                 signature[argument] = "*fp32" if argument in _ARRAYS.split() else "fp32"
         source = ASTSource(kernel, signature, values)
-        compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": warps})
-        assert len(compiled.asm["cubin"]) > 0, name
+        for capability in (80, 90):
+            compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32), options={"num_warps": warps})
+            assert len(compiled.asm["cubin"]) > 0, name
 
 
 def test_triton_is_loaded_when_asked_for_and_compiles_every_kernel_for_cuda() -> None:
