@@ -17,8 +17,9 @@ from recon.kernels import lanes
 F32 = NDArray[np.float32]
 OPTIONS = {"parallel": True, "fastmath": True, "boundscheck": False, "error_model": "numpy", "cache": True}
 _f = np.float32
-# A quaternion shorter than this has no direction worth a gradient; it acts as the identity.
-_SHORTEST = np.float32(1e-12)
+# A quaternion shorter than this (squared) has no direction worth a gradient; it acts as the identity.
+_SHORTEST = np.float32(1e-24)
+_LONGEST = np.float32(1e30)  # squared
 _TASK = 1024  # Gaussians
 
 
@@ -45,12 +46,15 @@ def _sigmoid(r):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def _shrunk(quaternions, i):  # type: ignore[no-untyped-def]
-    """Quaternion i over its largest entry, whose squares no length can overflow, and the factor; zeros if too short."""
+def _tamed(quaternions, i):  # type: ignore[no-untyped-def]
+    """Quaternion i times a factor that keeps its square in float32's range, the square, the factor; 0 if too short."""
     w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
-    most = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
-    factor = _f(1) / most if most > _SHORTEST else _f(0)
-    return w * factor, x * factor, y * factor, z * factor, factor
+    length2, factor = w * w + x * x + y * y + z * z, _f(1)
+    if not length2 < _LONGEST:
+        factor = _f(1) / max(max(abs(w), abs(x)), max(abs(y), abs(z)))
+        w, x, y, z = w * factor, x * factor, y * factor, z * factor
+        length2 = w * w + x * x + y * y + z * z
+    return w, x, y, z, length2, factor if length2 > _SHORTEST else _f(0)
 
 
 @njit(**OPTIONS)
@@ -71,8 +75,8 @@ def activate(
             density = _softplus(lanes.load_first(raws, 0, j, count)) * _f(unit)
             lanes.store_first(dense, 0, j, density, count)
         for i in range(begin, end):
-            w, x, y, z, factor = _shrunk(quaternions, i)
-            scale = two / (w * w + x * x + y * y + z * z) if factor > 0 else _f(0)
+            w, x, y, z, length2, factor = _tamed(quaternions, i)
+            scale = two / length2 if factor > 0 else _f(0)
             xs, ys, zs = x * scale, y * scale, z * scale
             rotations[i, 0] = one - (y * ys + z * zs)
             rotations[i, 1] = x * ys - w * zs
@@ -99,8 +103,8 @@ def activation_backward(
             slope = _sigmoid(lanes.load_first(raws, 0, j, count)) * _f(unit)
             lanes.store_first(out, 0, j, lanes.load_first(d_dense, 0, j, count) * slope, count)
         for i in range(begin, end):
-            w, x, y, z, factor = _shrunk(quaternions, i)
-            inverse = _f(1) / np.sqrt(w * w + x * x + y * y + z * z) if factor > 0 else _f(0)
+            w, x, y, z, length2, factor = _tamed(quaternions, i)
+            inverse = _f(1) / np.sqrt(length2) if factor > 0 else _f(0)
             w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
             inverse *= factor
             g = d_rotations[i]
