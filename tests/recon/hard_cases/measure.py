@@ -1,0 +1,112 @@
+"""Errors of the float32 kernels against the float64 twin, and the bounds that float32 sets; see docs/numerics.md."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.splat import RayModel, Truncation, project, voxelize
+from recon.volume import Grid
+from tests.recon.helpers import as_leaves, gradients, in_double
+
+WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and twin sum the same terms
+STEP = 2.0**-24  # half a float32 step, relative: the error of one rounding
+RECURRENCE = 1e-5  # of a footprint's weight, stated in project_cpu
+ROUNDINGS = 12  # of a position on the detector: sums of three products, turned into pixels
+
+
+@dataclass(frozen=True)
+class Found:
+    """One comparison.
+
+    Attributes:
+        image: the kernel's picture or volume.
+        value: largest error of it, of the largest value or the largest single weight, whichever is more.
+        gradients: largest error of the gradients by parameter, of the largest gradient of that parameter.
+        slopes: the kernel's gradients.
+    """
+
+    image: Tensor
+    value: float
+    gradients: dict[str, float]
+    slopes: dict[str, Tensor]
+
+    @property
+    def worst(self) -> float:
+        return max(self.gradients.values())
+
+
+def compare(g: Gaussians, where: Geometry | Grid, *, model: RayModel | None = None, seed: int = 0) -> Found:
+    """Kernel against twin, on a picture or a volume weighed by random numbers; asserts that all of it is finite."""
+    fast, twin = as_leaves(g), in_double(g)
+    if isinstance(where, Grid):
+        found, expected = voxelize(fast, where, truncation=WHOLE), voxelize(twin, where)
+        weight = float(g.densities.max())
+    else:
+        found = project(fast, where, truncation=WHOLE, model=model)
+        expected = project(twin, where, model=model)
+        weight = float((g.densities * g.scales.amin(1)).max()) * math.sqrt(2 * math.pi)
+    y = torch.from_numpy(np.random.default_rng(seed).normal(size=tuple(expected.shape)))
+    (found * y.float()).sum().backward()
+    (expected * y).sum().backward()
+    slopes, exact = gradients(fast), gradients(twin)
+    for name, values in (("image", found.detach()), *slopes.items()):
+        assert torch.isfinite(values).all(), name
+    top = max(float(expected.detach().abs().max()), weight)
+    off = float((found - expected).detach().abs().max()) / top
+    worst = {
+        name: float((slopes[name] - value).abs().max()) / max(float(value.abs().max()), 1e-300)
+        for name, value in exact.items()
+    }
+    return Found(found.detach(), off, worst, slopes)
+
+
+def bound(far: float, thin: float) -> float:
+    """Largest error of G: where a float32 position `far` from the origin may be off, times the steepest slope.
+
+    |∂G/∂δ| <= exp(-1/2) / σ; both in the same unit, pixels, voxels or mm. `thin` is the least standard deviation that
+    the picture has anywhere.
+    """
+    return RECURRENCE + math.exp(-0.5) * ROUNDINGS * STEP * far / thin
+
+
+def gradient_bound(far: float, thin: float) -> float:
+    """The same for first and second moments, which weigh the flanks: sup |δ|²G' is some three times as large.
+
+    Of the largest gradient; random weights of the pixels cancel by at most another factor of three in these sets.
+    """
+    return 9 * bound(far, thin)
+
+
+def directional(g: Gaussians, where: Geometry | Grid, steps: dict[str, float], seed: int = 0) -> tuple[float, float]:
+    """The twin's slope along a random direction with these lengths by parameter: by autograd and by differences.
+
+    In float64. The differences are central, over 1e-3 of the direction each way.
+    """
+    rng = np.random.default_rng(seed)
+    twin = in_double(g)
+    named = {
+        "means": twin.means, "log_scales": twin.log_scales, "quaternions": twin.quaternions,
+        "raw_densities": twin.raw_densities,
+    }  # fmt: skip
+    moves = {k: torch.from_numpy(rng.normal(size=tuple(v.shape))) * steps[k] for k, v in named.items()}
+    sample: Tensor | None = None
+
+    def loss(t: float) -> Tensor:
+        nonlocal sample
+        moved = Gaussians(*(v + t * moves[k] for k, v in named.items()), density_unit=g.density_unit)
+        image = voxelize(moved, where) if isinstance(where, Grid) else project(moved, where)
+        if sample is None:
+            sample = torch.from_numpy(rng.normal(size=tuple(image.shape)))
+        return (image * sample).sum()
+
+    loss(0.0).backward()
+    slope = sum(float((value * moves[k]).sum()) for k, value in gradients(twin).items())
+    with torch.no_grad():
+        return slope, float(loss(1e-3) - loss(-1e-3)) / 2e-3
