@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import recon
+from beamline.held_out import with_held_out
 from beamline.pipeline import Prepared
 from recon.binning import bin_views
 from recon.calibrate import calibrate
@@ -107,9 +108,10 @@ def within(
     voxelize(placed, slab)
     fill = (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
     end = begin + budget * (1 - _RESERVE) - fill
+    data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     result = recon.reconstruct(
-        data, geometry, grid, seconds=max(0.0, end - now()), gaussians=placed, seed=seed, on_progress=on_progress,
-        should_stop=lambda: stopped() or now() >= end, now=now,
+        data, geometry, grid, seconds=max(0.0, end - now()), gaussians=placed, seed=seed, held_out=held_out,
+        on_progress=on_progress, should_stop=lambda: stopped() or now() >= end, now=now,
     )  # fmt: skip
     return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
 

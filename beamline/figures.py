@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from beamline.history import judged_by, judged_views
+from beamline.history import judged_by
 from recon.geometry import Geometry
 from recon.quality import NextDecibel, parts_of, record
 from recon.volume import Volume
@@ -148,7 +148,7 @@ def quality_against_time(
     psnr: Sequence[tuple[float, float]] = (),
     further: NextDecibel | None = None,
 ) -> bytes:
-    """The fit against time: loss and residuals, the residual as dB, PSNR of snapshots, and what grew.
+    """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, and what grew.
 
     Args:
         history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
@@ -171,6 +171,8 @@ def quality_against_time(
         ("residual", "residual", "tab:orange"),
         ("held_out", "residual, held out", "tab:red"),
     ):
+        if name == "residual" and np.array_equal(history.get(name, []), history.get("loss", [])):
+            continue  # what iterations lower is the residual itself
         if name in history and np.any(np.isfinite(history[name])):
             left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in left.get_lines()])
@@ -184,7 +186,7 @@ def quality_against_time(
     left.set(xlabel="time (s)", title="Misfit")
     left.legend(fontsize=8)
     if judge is not None:
-        _decibels(others.pop(0), *record(seconds, history[judge]), judged_views(judge), further)
+        _decibels(others.pop(0), *record(judge.seconds, judge.residuals), judge.views, further)
     if psnr:
         axes = others.pop(0)
         axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from beamline.deliver import deliver
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event, Sink
+from beamline.fit_progress import progress_events
 from beamline.measure import fit_truth, read_truth
-from beamline.offline import ReconOptions, Warnings, progress_events
+from beamline.offline import ReconOptions, Warnings
 from beamline.pipeline import (
     Corrector,
     check_axis,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -38,14 +38,27 @@ def history_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
     return tuple(Progress(*values) for values in zip(*columns, strict=True))
 
 
-def judged_by(arrays: Mapping[str, NDArray[np.floating]]) -> str | None:
-    """The name of the residual that tells how good a fit is: of views held out where there are any, else of those used.
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The residual that tells how good a fit is, each time that it was looked at.
 
-    None where neither was recorded.
+    Attributes:
+        views: which views it is of, in words.
+        seconds, residuals: [look].
     """
-    return next((name for name in _WORDS if name in arrays and np.isfinite(arrays[name]).any()), None)
+
+    views: str
+    seconds: NDArray[np.float64]
+    residuals: NDArray[np.float64]
 
 
-def judged_views(name: str) -> str:
-    """Which views a residual is of, in words."""
-    return _WORDS[name]
+def judged_by(arrays: Mapping[str, NDArray[np.floating]]) -> Judged | None:
+    """The residual of views held out where there are any, else of those used; None where neither was recorded."""
+    name = next((name for name in _WORDS if name in arrays and np.isfinite(arrays[name]).any()), None)
+    if name is None:
+        return None
+    seconds, residuals = np.asarray(arrays["seconds"], np.float64), np.asarray(arrays[name], np.float64)
+    looks = np.isfinite(residuals)
+    if name == "held_out":  # looked at now and then, and said again in between
+        looks &= np.concatenate(([True], np.diff(residuals) != 0))
+    return Judged(_WORDS[name], seconds[looks], residuals[looks])

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import recon
 from beamline.budget import within
+from beamline.checkpoints import Keeper, made_from
 from beamline.deliver import Target, deliver
-from beamline.errors import DataError
+from beamline.errors import ConfigError, DataError
 from beamline.events import Event, Sink
+from beamline.fit_progress import progress_events
+from beamline.held_out import keep_back, with_held_out
 from beamline.measure import fit_truth, read_truth
 from beamline.pipeline import Prepared, Selection, prepare
 from beamline.recon_report import Context, Made, facts_of
 from beamline.stop import Stoppable, never_stopped
 from beamline.storage.source import Quantity, ScanSource, open_scan
 from drivers.clock import Clock
+from recon.backend import backend_for
 from recon.fbp import Filter
-from recon.fit import Progress
-from recon.initialise import default_count
+from recon.fit import FitSettings
+from recon.initialise import Start, default_count
+from recon.problem import Loss
 from recon.quality import PRESETS, Quality
-from recon.reconstruction import Method
+from recon.reconstruction import DEFAULT_STEPS, Method
 from recon.volume import Grid
 from recon.warm_up import warm_up
 
@@ -63,6 +69,10 @@ class ReconOptions:
         budget: s for everything from line integrals to volume; chooses all settings of the fit.
         quality: a preset instead of steps and Gaussians.
         gaussians: how many to start from; None derives it from the volume.
+        start, loss, device: of the fit.
+        early_stop: end the fit when views held out no longer gain; some are kept back where all were chosen.
+        keeper: of the fit's state.
+        iterations, tv_weight: of an iterative method; None takes its own.
         filter: of the FBP.
         seed: of everything random.
         truth: FILE or FILE:first:end to compare with.
@@ -79,6 +89,13 @@ class ReconOptions:
     budget: float | None = None
     quality: Quality | None = None
     gaussians: int | None = None
+    start: Start = "fbp"
+    loss: Loss = "l1"
+    device: str = "cpu"
+    early_stop: bool = False
+    keeper: Keeper = field(default_factory=Keeper)
+    iterations: int | None = None
+    tv_weight: float | None = None
     filter: Filter = "hann"
     seed: int = 0
     truth: str | None = None
@@ -109,6 +126,8 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = 
     """
     started = clock.now()
     options.target.refuse_existing()
+    options.keeper.refuse_existing()
+    check_device(options.device)
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:
@@ -123,12 +142,17 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = 
         facts = facts_of(source)
         prepared = prepare(source, options.selection, warn)
     selection = options.selection
+    if options.early_stop and prepared.held_out is None:
+        prepared = keep_back(prepared)
+        n = prepared.projections.view_ids.size
+        message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
+        sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
     with stoppable() as stopped:
         if options.budget is None:
-            made = reconstruct(options, prepared, Grid.matching(prepared.geometry), sink, clock, stopped)
+            made = reconstruct(options, prepared, Grid.matching(prepared.geometry), sink, clock, stopped, warn)
         else:
             made, prepared, factor = spend(options, options.budget, prepared, sink, clock, stopped)
             selection = replace(selection, binning=selection.binning * factor)
@@ -151,41 +175,111 @@ def announce(options: ReconOptions, prepared: Prepared, sink: Sink, clock: Clock
     sink(Event("recon_started", clock.now(), data))
 
 
+def check_device(device: str) -> None:
+    """Raises ConfigError where a fit cannot compute there."""
+    try:
+        backend_for(device)
+    except (ImportError, RuntimeError, ValueError) as error:
+        raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
+
+
 def reconstruct(
-    options: ReconOptions, prepared: Prepared, grid: Grid, sink: Sink, clock: Clock, stopped: Callable[[], bool]
+    options: ReconOptions,
+    prepared: Prepared,
+    grid: Grid,
+    sink: Sink,
+    clock: Clock,
+    stopped: Callable[[], bool],
+    warn: Warnings,
 ) -> Made:
     """Run the reconstructor on prepared views."""
-    steps, gaussians, said = options.steps, options.gaussians, ""
     if options.method == "r2":
-        warm_up()  # so that the fit's time, and the time it says is left, hold no compilation
-    if options.quality is not None:
-        preset = PRESETS[options.quality]
-        steps = preset.steps
-        gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
-        said = f"{options.quality}: {steps} steps from {gaussians} Gaussians"
+        return _fit(options, prepared, grid, sink, clock, stopped, warn)
     try:
         result = recon.reconstruct(
             prepared.projections.data,
             prepared.geometry,
             grid,
             method=options.method,
-            steps=steps,
-            gaussians=gaussians,
             seed=options.seed,
             filter=options.filter,
-            seconds=options.seconds,
+            iterations=options.iterations,
+            tv_weight=options.tv_weight,
             on_progress=progress_events(sink, clock),
             should_stop=stopped,
             now=clock.now,
         )
     except ValueError as error:
         raise DataError(f"{options.source.path} cannot be reconstructed by {options.method}: {error}") from error
+    early = {"ended_early": True} if stopped() and options.method != "fbp" else {}
     return Made(
         volume=result.volume,
         method=options.method,
         seconds=result.seconds,
         history=result.history,
-        settings={**result.settings, **({"ended_early": True} if stopped() and options.method != "fbp" else {})},
+        settings={**result.settings, **early},
+        filter=options.filter,
+    )
+
+
+def _fit(
+    options: ReconOptions,
+    prepared: Prepared,
+    grid: Grid,
+    sink: Sink,
+    clock: Clock,
+    stopped: Callable[[], bool],
+    warn: Warnings,
+) -> Made:
+    """Fit Gaussians, by steps, by seconds or by a preset; keeping its state and taking it up where that is wanted."""
+    steps, gaussians, said = options.steps, options.gaussians, ""
+    if options.quality is not None:
+        preset = PRESETS[options.quality]
+        steps = preset.steps
+        gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
+        said = f"{options.quality}: {steps} steps from {gaussians} Gaussians"
+    if steps is None and options.seconds is None:
+        steps = DEFAULT_STEPS
+    settings, keeper = FitSettings(loss=options.loss), options.keeper
+    origin, resume = {}, None
+    if keeper.wanted:
+        others = {"seed": options.seed, "start": options.start, "gaussians": gaussians or 0}
+        origin = made_from(prepared, settings, others)
+        resume = keeper.begin(origin, steps or 0, warn)
+    warm_up(options.device, options.loss)  # so that the fit's time, and the time it says is left, hold no compilation
+    data, geometry, held_out = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
+    try:
+        result = recon.reconstruct(
+            data,
+            geometry,
+            grid,
+            steps=steps,
+            gaussians=gaussians,
+            seed=options.seed,
+            settings=settings,
+            seconds=options.seconds,
+            start=options.start,
+            held_out=held_out,
+            early_stop=options.early_stop,
+            resume=resume,
+            device=options.device,
+            on_progress=progress_events(sink, clock, options.seconds),
+            should_stop=stopped,
+            on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, warn),
+            now=clock.now,
+        )
+    except ValueError as error:
+        raise DataError(f"{options.source.path} cannot be reconstructed by r2: {error}") from error
+    if result.checkpoint is not None:
+        keeper.write(origin, steps or 0, warn, result.checkpoint)
+    used = {name: value for name, value in result.settings.items() if name != "held_out"}
+    resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
+    return Made(
+        volume=result.volume,
+        method="r2",
+        seconds=result.seconds,
+        history=result.history,
+        settings={**used, **resumed, **({"ended_early": True} if stopped() else {})},
         filter=options.filter,
         chosen=said,
     )
@@ -197,7 +291,8 @@ def spend(
     """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
     warm_up()  # compilation happens once on a machine; no budget pays for it
     try:
-        done = within(budget, prepared, options.seed, options.filter, clock.now, progress_events(sink, clock), stopped)
+        listen = progress_events(sink, clock, budget)
+        done = within(budget, prepared, options.seed, options.filter, clock.now, listen, stopped)
     except ValueError as error:
         raise DataError(f"{options.source.path} cannot be reconstructed: {error}") from error
     early = {"ended_early": True} if stopped() and done.choice.method != "fbp" else {}
@@ -211,12 +306,3 @@ def spend(
         chosen=done.said(budget),
     )
     return made, done.prepared, done.choice.binning
-
-
-def progress_events(sink: Sink, clock: Clock) -> Callable[[Progress], None]:
-    """A listener that passes the fit's progress on as events."""
-
-    def listen(progress: Progress) -> None:
-        sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress)}))
-
-    return listen

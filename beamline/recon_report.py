@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from beamline import figures
-from beamline.history import history_arrays, judged_by, judged_views
+from beamline.history import history_arrays, judged_by
 from beamline.pipeline import Prepared, Selection
 from beamline.report import METRICS, Picture, Report, formatted
 from beamline.storage.recon_file import Value
@@ -22,7 +22,10 @@ from recon.fit import Progress
 from recon.quality import NextDecibel, next_decibel, parts_of
 from recon.volume import Volume
 
-METHOD_NAMES = {"fbp": "FBP", "r2": "R²-Gaussian"}
+METHOD_NAMES: Mapping[str, str] = {
+    "r2": "R²-Gaussian", "fbp": "FBP", "sirt": "SIRT", "sart": "SART", "cgls": "CGLS", "asd-pocs": "ASD-POCS",
+    "fista-tv": "FISTA-TV", "os-sirt-tv": "OS-SIRT-TV",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,9 @@ class Made:
     """A reconstruction and how it was made.
 
     Attributes:
-        volume, method: "r2" or "fbp".
+        volume, method: of recon.reconstruct.
         seconds: of reconstruction alone.
-        history: of the fit; empty for FBP.
+        history: of the fit or the iterations; empty for FBP.
         settings: every setting of the reconstructor, by name.
         filter: of the FBP (also of the one it is compared with).
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
@@ -70,24 +73,21 @@ class Made:
 
     @property
     def next_decibel(self) -> NextDecibel | None:
-        """What another dB would cost by the fit's own record; None for a direct method, and while views still came."""
-        arrays = history_arrays(self.history)
-        name = judged_by(arrays)
-        if name is None or _grew(self):
-            return None
-        return next_decibel(arrays["seconds"], arrays[name])
+        """What another dB would cost by its own record; None for a direct method, and while views still came."""
+        judged = judged_by(history_arrays(self.history))
+        return None if judged is None or _grew(self) else next_decibel(judged.seconds, judged.residuals)
 
     @property
     def next_decibel_said(self) -> str:
         """The same in words; empty where there is nothing to say."""
-        found, name = self.next_decibel, judged_by(history_arrays(self.history))
-        if found is None or name is None:
+        found, judged = self.next_decibel, judged_by(history_arrays(self.history))
+        if found is None or judged is None:
             return ""
         if not found.measurable:
-            return f"none measurable in the residual of {judged_views(name)}"
+            return f"none measurable in the residual of {judged.views}"
         high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
         span = f"{parts_of(found.low)} {high}"
-        return f"about {parts_of(found.seconds)} more ({span}), from the residual of {judged_views(name)} as it fell"
+        return f"about {parts_of(found.seconds)} more ({span}), from the residual of {judged.views} as it fell"
 
 
 @dataclass(frozen=True)
@@ -227,12 +227,12 @@ def _grew(made: Made) -> bool:
 def _told_by_history(made: Made) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
-    parts = ["Misfit of the model to the views it had"]
-    if (name := judged_by(history_arrays(made.history))) is not None:
-        parts.append(f"the same residual of {judged_views(name)} as dB below the data")
+    parts = ["Misfit to the views it had"]
+    if (judged := judged_by(history_arrays(made.history))) is not None:
+        parts.append(f"the residual of {judged.views} as dB below the data")
     parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
     parts += [f"how many {' and '.join(growing)} there were"] if growing else []
-    return f"{', '.join(parts)}, in the time since {'the file was first seen' if _grew(made) else 'the fit began'}."
+    return f"{', '.join(parts)}, in the time since {'the file was first seen' if _grew(made) else 'it began'}."
 
 
 def _text(value: object) -> str:

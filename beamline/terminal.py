@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Mapping
@@ -114,14 +115,21 @@ def trials(data: Mapping[str, Any]) -> str:
 
 
 def fit(data: Mapping[str, Any]) -> str:
-    """Steps, views, Gaussians, residual and, where the end is known, the time left, of a fit's `progress` event."""
+    """n/N, rate, what there is, residuals and, where the end is known, the time left, of a `progress` event of a fit
+    (or of iterations, which have no Gaussians)."""
     step, steps = data["step"], data["steps"]
-    parts = [f"{step}/{steps} steps"] if steps else []
-    parts += [f"{data['n_views']} views", f"{data['n_gaussians']} Gaussians"]
+    word = "steps" if data["n_gaussians"] else "iterations"
+    parts = [f"{step}/{steps} {word}"] if steps else []
+    parts += [f"{data['per_s']:.3g} {word}/s"] if data.get("per_s") else []
+    parts += [f"{data['n_views']} views"]
+    parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []
     if data["residual"] is not None:
         parts.append(f"residual {data['residual']:.4f}")
-    if steps and step:
-        parts.append(f"{_clock_time(data['seconds'] / step * (steps - step))} left")
+    unseen = data.get("held_out")  # another process's NaN comes as None
+    if unseen is not None and math.isfinite(unseen):
+        parts.append(f"held out {unseen:.4f}")
+    if data.get("eta_s") is not None:
+        parts.append(f"{_clock_time(data['eta_s'])} left")
     return ", ".join(parts)
 
 

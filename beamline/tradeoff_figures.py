@@ -16,12 +16,12 @@ from beamline.trials import Trial
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best: what is worse is counted, not drawn
 _COLOURS = {
-    "r2": "tab:blue", "fbp": "0.35", "fdk": "0.35", "sirt": "tab:green", "sart": "tab:olive", "cgls": "tab:cyan",
+    "r2": "tab:blue", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive", "cgls": "tab:cyan",
     "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
 }  # fmt: skip
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "cut-off": "P",
-    "loss": "X",
+    "loss": "X", "start": "*",
 }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from beamline.tradeoff_figures import cost_curves, pareto_plot
 from beamline.trials import Outcome
 from beamline.version import version
 
-_FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "iterations")
+_FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import recon
+from beamline.held_out import with_held_out
 from beamline.history import history_arrays, judged_by
 from beamline.memory import peak_memory
 from beamline.trials import Trial
@@ -153,17 +154,20 @@ def reconstruct(
 
     A fit of binned views fills `grid` all the same; voxel methods have one voxel a binned pixel.
     """
+    if trial.method == "r2":
+        projections, geometry, unseen = with_held_out(projections, geometry, held_out)
     binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
     if trial.method != "r2":
         target = grid if trial.binning == 1 else Grid.matching(coarse)
         own: dict[str, Any] = {} if trial.iterations is None else {"iterations": trial.iterations}
-        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, **own)  # type: ignore[arg-type]
-    settings = FitSettings(truncation=replace(Truncation(), sigmas=trial.sigmas))
-    if trial.loss == "l1":
+        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, on_progress=on_progress, **own)  # type: ignore[arg-type]
+    loss, _, ssim = trial.loss.partition("+")
+    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))  # type: ignore[arg-type]
+    if not ssim:
         settings = replace(settings, ssim_weight=0.0)
     return recon.reconstruct(
         binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=settings,
-        on_progress=on_progress,
+        start=trial.start, held_out=unseen, on_progress=on_progress,
     )  # fmt: skip
 
 
@@ -199,11 +203,10 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
 
 def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
     """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
-    arrays = history_arrays(result.history)
-    name = judged_by(arrays)
-    if name is None:
+    judged = judged_by(history_arrays(result.history))
+    if judged is None:
         return []
-    seconds, quality = record(arrays["seconds"], arrays[name])
+    seconds, quality = record(judged.seconds, judged.residuals)
     return list(zip(seconds.tolist(), quality.tolist(), strict=True))
 
 

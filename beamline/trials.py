@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-Loss = Literal["l1+ssim", "l1"]
+from recon.initialise import Start
+
+Loss = Literal["l1+ssim", "l1", "l2+ssim", "poisson+ssim"]
 Depth = Literal["quick", "full"]
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
-DIRECT = ("fbp", "fdk")
+DIRECT = ("fbp",)
 SIGMAS = 3.5  # where the fit cuts Gaussians off when nobody says otherwise
 
 _STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (125, 250, 500, 1000), "full": (250, 500, 1000, 2000, 4000)}
@@ -20,7 +22,7 @@ _BINNED_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (500,), "full": (250,
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 _FACTORS: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.5, 2.0)}
 _SIGMAS: Mapping[Depth, tuple[float, ...]] = {"quick": (3.0,), "full": (2.5, 3.0, 4.5)}
-_LOSSES: Mapping[Depth, tuple[Loss, ...]] = {"quick": ("l1",), "full": ("l1",)}
+_LOSSES: tuple[Loss, ...] = ("l1", "l2+ssim", "poisson+ssim")
 # Passes over the data; about what each method needs to get near its best, and a few fewer and more.
 _ITERATIONS: Mapping[str, Mapping[Depth, tuple[int, ...]]] = {
     "sirt": {"quick": (20, 60), "full": (10, 30, 100, 300)},
@@ -42,6 +44,7 @@ class Trial:
         views: how many, spread evenly over those chosen.
         binning: detector pixels joined a side, on top of the selection's.
         steps, gaussians, loss, sigmas: of the r2 fit; how many Gaussians it starts from, where they are cut off.
+        start: the volume that the fit's Gaussians are drawn from.
         iterations: of the classical methods.
         halves: measure the half-set resolution too, which takes two more reconstructions.
     """
@@ -54,6 +57,7 @@ class Trial:
     gaussians: int | None = None
     loss: Loss = "l1+ssim"
     sigmas: float = SIGMAS
+    start: Start = "fbp"
     iterations: int | None = None
     halves: bool = False
 
@@ -68,6 +72,7 @@ class Trial:
         parts += [thousands(self.gaussians)] if self.gaussians is not None else []
         parts += [self.loss] if self.loss != "l1+ssim" else []
         parts += [f"cut at {self.sigmas:g} σ"] if self.sigmas != SIGMAS else []
+        parts += [f"start {self.start}"] if self.start != "fbp" else []
         parts += [f"{self.iterations} iterations"] if self.iterations is not None else []
         return ", ".join(parts)
 
@@ -161,7 +166,8 @@ def _of_method(method: str, n_views: int, gaussians: int, depth: Depth) -> list[
     coarse = replace(plain, group="binning", binning=2, gaussians=max(1, gaussians // 4))
     trials += [replace(coarse, steps=n) for n in _BINNED_STEPS[depth]]
     trials += [replace(plain, group="cut-off", sigmas=s) for s in _SIGMAS[depth]]
-    return trials + [replace(plain, group="loss", loss=loss) for loss in _LOSSES[depth]]
+    trials.append(replace(plain, group="start", start="tv"))
+    return trials + [replace(plain, group="loss", loss=loss) for loss in _LOSSES]
 
 
 def work(trial: Trial) -> float:

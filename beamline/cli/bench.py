@@ -17,7 +17,6 @@ from recon.bench import N_GAUSSIANS, SIDE, Timing, VolumeRow, kernel_timings, st
 from recon.reconstruction import Method
 from recon.warm_up import warm_up
 
-_CONE_ONLY = ("fdk",)
 _STEPS = (125, 500, 2000)
 
 
@@ -65,8 +64,7 @@ def _timings(gaussians: int, side: int) -> Iterator[Timing]:
 
 
 def _rows() -> Iterator[VolumeRow]:
-    methods = tuple(name for name in get_args(Method) if name not in _CONE_ONLY)
-    yield from volume_rows(time.perf_counter, methods, _STEPS)
+    yield from volume_rows(time.perf_counter, get_args(Method), _STEPS)
 
 
 def _line(timing: Timing) -> str:

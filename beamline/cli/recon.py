@@ -10,6 +10,8 @@ from typing import Any, get_args
 
 import click
 
+from beamline.checkpoints import Keeper
+from beamline.cli.method_options import SETTINGS, method_options, refuse_contradictions
 from beamline.cli.narrate import results
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
@@ -21,18 +23,8 @@ from beamline.offline import ReconOptions, run
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock
 from recon.fbp import Filter
-from recon.quality import PRESETS, Quality, parse_budget
+from recon.quality import Quality
 from recon.reconstruction import Method
-
-
-def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
-    """A time such as 30s, 2m or 1h, in s."""
-    if value is None:
-        return None
-    try:
-        return parse_budget(value)
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from error
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
@@ -50,27 +42,10 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     type=click.Choice(get_args(Method)),
     default="r2",
     show_default=True,
-    help="r2: Gaussians fitted to the views; fbp: filtered back-projection.",
+    help="r2: Gaussians fitted to the views; fbp: filtered back-projection; the others work on voxels, iteratively.",
 )
 @selection_options
-@click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2).")
-@click.option(
-    "--seconds",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Time for the fit (r2), instead of --steps; with --follow, after the scan has ended.",
-)
-@click.option(
-    "--budget",
-    callback=time_given,
-    metavar="30s|2m|1h",
-    help="Time from line integrals to volume; chooses method, Gaussians, steps and binning, and ends in time.",
-)
-@click.option(
-    "--quality",
-    type=click.Choice(list(PRESETS)),
-    help="A preset of steps and Gaussians, instead of naming them.",
-)
-@click.option("--gaussians", type=click.IntRange(min=1), help="How many to start from (r2).")
+@method_options
 @click.option(
     "--filter",
     "ramp",
@@ -101,11 +76,10 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 def recon(
     file: Path,
     method: Method,
-    steps: int | None,
-    seconds: float | None,
     budget: float | None,
     quality: Quality | None,
-    gaussians: int | None,
+    checkpoint: Path | None,
+    resume: Path | None,
     ramp: Filter,
     max_residual: float | None,
     seed: int,
@@ -120,14 +94,11 @@ def recon(
     """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
 
     Writes a volume [z, y, x] in 1/mm (1/px where the pixel size is unknown) as NXtomoproc, with everything that it was
-    made with, and a report. Nothing is overwritten, and a failure leaves nothing behind. Ctrl-C during the fit ends it
-    with the volume as it is (exit code 4), a second one without.
+    made with, and a report. Nothing is overwritten, and a failure leaves nothing behind. Ctrl-C during a fit or
+    iterations ends them with the volume as it is (exit code 4), a second one without.
     """
-    if steps is not None and seconds is not None:
-        raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
-    if method != "r2" and any(value is not None for value in (steps, seconds, gaussians)):
-        raise click.UsageError(f"--steps, --seconds and --gaussians are of the r2 fit; {method} has none.")
-    refuse_contradictions(method, follow, {"--budget": budget, "--quality": quality}, steps, seconds, gaussians)
+    settings = {name: said.pop(name) for name in SETTINGS}
+    refuse_contradictions(click.get_current_context(), method, follow)
     output = output or Path(f"{file.stem}_{method}.h5")
     source, selection = chosen(file, seed, said)
     options = ReconOptions(
@@ -135,11 +106,10 @@ def recon(
         target=Target(output, report_beside(output) if report else None),
         selection=selection,
         method=method,
-        steps=steps,
-        seconds=seconds,
         budget=budget,
         quality=quality,
-        gaussians=gaussians,
+        keeper=Keeper(checkpoint, resume),
+        **settings,
         filter=ramp,
         seed=seed,
         truth=truth,
@@ -157,30 +127,6 @@ def recon(
         raise ScanStopped(f"The fit was ended early; {output} holds the volume as it then was.")
     if max_residual is not None:
         require(metrics, max_residual)
-
-
-def refuse_contradictions(
-    method: str,
-    follow: bool,
-    plans: Mapping[str, object | None],
-    steps: int | None,
-    seconds: float | None,
-    gaussians: int | None,
-) -> None:
-    """Raises UsageError where `plans` (--budget, --quality) would choose what was also given."""
-    wanted = [name for name, value in plans.items() if value is not None]
-    if not wanted:
-        return
-    given = {"--steps": steps, "--seconds": seconds, "--gaussians": gaussians}
-    others = [*wanted[1:], *(name for name, value in given.items() if value is not None)]
-    if others:
-        raise click.UsageError(
-            f"{wanted[0]} and {others[0]} exclude each other: {wanted[0]} chooses what the other says."
-        )
-    if method != "r2":
-        raise click.UsageError(f"{wanted[0]} chooses settings of the r2 fit; it does not go with --method {method}.")
-    if follow:
-        raise click.UsageError(f"{wanted[0]} is for a finished scan; with --follow give --seconds.")
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:

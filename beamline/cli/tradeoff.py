@@ -22,9 +22,9 @@ METHODS: tuple[str, ...] = get_args(Method)
 
 
 def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    """Names of methods, separated by commas; all that fit where none are given."""
+    """Names of methods, separated by commas; all where none are given."""
     if value is None:
-        return tuple(name for name in METHODS if name != "fdk")  # of a cone beam
+        return METHODS
     names = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     unknown = [name for name in names if name not in METHODS]
     if unknown:

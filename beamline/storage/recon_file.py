@@ -161,21 +161,22 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
     longest = max((z, y, x), key=len)
     size = float(longest[-1] - longest[0]) / (len(longest) - 1) if len(longest) > 1 else 1.0
     grid = Grid(data["data"].shape, size, tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x)))  # type: ignore[arg-type]
-    parameters = {name: _value(node) for name, node in process["parameters"].items()}
+    parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(
         volume=Volume(np.asarray(data["data"][:], dtype=np.float32), grid),
         length_unit=str(data["x"].attrs["units"]),
         raw_file=str(parameters.pop("raw_file")),
-        title=str(_value(entry["title"])),
-        sample=str(_value(entry["sample/name"])),
-        time=datetime.fromisoformat(str(_value(process["date"]))).timestamp(),
+        title=str(value_of(entry["title"])),
+        sample=str(value_of(entry["sample/name"])),
+        time=datetime.fromisoformat(str(value_of(process["date"]))).timestamp(),
         parameters=parameters,
         metrics={name: float(node[()]) for name, node in process["metrics"].items()},
         history={name: np.asarray(node[()]) for name, node in process["history"].items()},
     )
 
 
-def _value(node: h5py.Dataset) -> Value:
+def value_of(node: h5py.Dataset) -> Value:
+    """What a dataset holds, as plain text or number where it is one."""
     value = node[()]
     if isinstance(value, bytes):
         return value.decode()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.figures import quality_against_time
-from beamline.history import history_arrays, history_of, judged_by, judged_views
+from beamline.history import history_arrays, history_of, judged_by
 from beamline.recon_report import Made
 from recon.fit import Progress
 from recon.quality import next_decibel
@@ -46,10 +46,23 @@ def test_what_was_not_recorded_is_not_a_number() -> None:
 
 def test_views_held_out_judge_before_views_used() -> None:
     seconds = np.arange(3.0)
-    assert judged_by({"seconds": seconds, "residual": seconds, "held_out": seconds}) == "held_out"
-    assert judged_by({"seconds": seconds, "residual": seconds, "held_out": np.full(3, np.nan)}) == "residual"
-    assert judged_by({"seconds": seconds}) is None
-    assert judged_views("held_out") == "views held out"
+
+    def words(**arrays: np.ndarray) -> str | None:
+        judged = judged_by({"seconds": seconds, **arrays})
+        return None if judged is None else judged.views
+
+    assert words(residual=seconds, held_out=seconds) == "views held out"
+    assert words(residual=seconds, held_out=np.full(3, np.nan)) == "views used"
+    assert words() is None
+
+
+def test_each_look_at_views_held_out_counts_once() -> None:
+    """Between two looks the record says the last one again, which is no evidence."""
+    looks = np.array([np.nan, np.nan, 0.5, 0.5, 0.5, 0.4, 0.4, 0.3])
+    judged = judged_by({"seconds": np.arange(8.0), "residual": looks, "held_out": looks})
+    assert judged is not None
+    np.testing.assert_array_equal(judged.seconds, [2, 5, 7])
+    np.testing.assert_array_equal(judged.residuals, [0.5, 0.4, 0.3])
 
 
 def test_a_fit_says_what_another_decibel_would_cost() -> None:

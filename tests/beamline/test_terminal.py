@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -91,9 +92,22 @@ def test_the_fit_has_a_bar_of_its_own() -> None:
 
 
 def test_a_fit_with_an_end_says_how_far_it_is() -> None:
-    progress = {"step": 500, "steps": 2000, "seconds": 25.0, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344}
-    assert fit(progress) == "500/2000 steps, 91 views, 2000 Gaussians, residual 0.1234, 0:01:15 left"
-    assert shown(io.StringIO(), ("progress", progress)) == f"volume: {fit(progress)}\n"
+    progress = {
+        "step": 500, "steps": 2000, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344, "held_out": None,
+        "per_s": 20.0, "eta_s": 75.0,
+    }  # fmt: skip
+    said = "500/2000 steps, 20 steps/s, 91 views, 2000 Gaussians, residual 0.1234, 0:01:15 left"
+    assert fit(progress) == said
+    assert shown(io.StringIO(), ("progress", progress)) == f"volume: {said}\n"
+    assert "residual 0.1234, held out 0.2000, 0:01" in fit({**progress, "held_out": 0.2})
+
+
+def test_iterations_are_told_as_such() -> None:
+    progress = {
+        "step": 3, "steps": 40, "n_views": 60, "n_gaussians": 0, "residual": 0.2, "held_out": math.nan,
+        "per_s": 0.5, "eta_s": 74.0,
+    }  # fmt: skip
+    assert fit(progress) == "3/40 iterations, 0.5 iterations/s, 60 views, residual 0.2000, 0:01:14 left"
 
 
 def test_the_same_snapshot_is_said_once() -> None:

@@ -16,7 +16,7 @@ METHODS = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
     "views": {"views"}, "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"binning", "gaussians", "steps"},
-    "loss": {"loss"}, "cut-off": {"sigmas"}, "iterations": {"iterations"},
+    "loss": {"loss"}, "start": {"start"}, "cut-off": {"sigmas"}, "iterations": {"iterations"},
 }  # fmt: skip
 
 
@@ -53,6 +53,7 @@ def test_labels_say_what_is_not_the_default() -> None:
     assert replace(trial, sigmas=3.0, loss="l1", binning=2).label == (
         "r2, 60 views, bin 2, 500 steps, 50k Gaussians, l1, cut at 3 σ"
     )
+    assert replace(trial, start="tv").label == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
 
 
 @given(st.floats(0.1, 1e4), st.integers(1, 20))

@@ -1,0 +1,148 @@
+"""Options of reconstruction methods, and which of them go together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+from click.core import ParameterSource
+
+from recon.initialise import Start
+from recon.problem import Loss
+from recon.quality import PRESETS, parse_budget
+
+SETTINGS = ("steps", "seconds", "gaussians", "start", "loss", "device", "early_stop", "iterations", "tv_weight")
+"""Options that are handed to the reconstructor as they are."""
+
+_FIT = ("steps", "seconds", "gaussians", "start", "loss", "device", "early_stop", "checkpoint", "resume")
+_PLANS = ("budget", "quality")
+# What each of the options that choose a plan leaves no room for.
+_CHOSEN = {
+    "budget": ("quality", *_FIT),
+    "quality": ("budget", "steps", "seconds", "gaussians"),
+}
+_WITHOUT_END = ("start", "loss", "device", "early_stop", "checkpoint", "resume")
+_DIRECT, _SMOOTHED = ("r2", "fbp"), ("fista-tv", "os-sirt-tv")
+
+
+def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
+    """A time such as 30s, 2m or 1h, in s."""
+    if value is None:
+        return None
+    try:
+        return parse_budget(value)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
+
+
+def checkpoint_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+    """A file name."""
+    if value is not None and not value.name:
+        raise click.BadParameter(f"{str(value)!r} is no file; name one, such as fit.checkpoint.h5")
+    return value
+
+
+def method_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options of the fit and of the iterative methods."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None:
+    """Raises UsageError for options that exclude each other, or are of another method.
+
+    Args:
+        ctx: of a command with `method_options`; what its user did not say, cannot contradict.
+        method: of recon.reconstruct.
+        follow: the scan is still running.
+    """
+    given = [name for name in (*_PLANS, *SETTINGS, *_FIT) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    if {"steps", "seconds"} <= set(given):
+        raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
+    for plan in _PLANS:
+        others = [name for name in given if name in _CHOSEN[plan]]
+        if plan in given and others:
+            raise click.UsageError(
+                f"{_option(plan)} and {_option(others[0])} exclude each other: {_option(plan)} chooses what the other "
+                "says, or leaves no room for it."
+            )
+        if plan in given and follow:
+            raise click.UsageError(f"{_option(plan)} is for a finished scan; with --follow give --seconds.")
+    foreign = [name for name in given if method != "r2" and name in (*_PLANS, *_FIT)]
+    if foreign:
+        raise click.UsageError(f"{_option(foreign[0])} is of the r2 fit; it does not go with --method {method}.")
+    if "iterations" in given and method in _DIRECT:
+        raise click.UsageError(f"--iterations is of the iterative methods; it does not go with --method {method}.")
+    if "tv_weight" in given and method not in _SMOOTHED:
+        raise click.UsageError(f"--tv-weight is of {' and '.join(_SMOOTHED)}; it does not go with --method {method}.")
+    endless = [name for name in given if follow and name in _WITHOUT_END]
+    if endless:
+        raise click.UsageError(f"{_option(endless[0])} is for a finished scan; it does not go with --follow.")
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+_OPTIONS = (
+    click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2). Default: 2000."),
+    click.option(
+        "--seconds",
+        type=click.FloatRange(min=0, min_open=True),
+        help="Time for the fit (r2), instead of --steps; with --follow, after the scan has ended.",
+    ),
+    click.option(
+        "--budget",
+        callback=time_given,
+        metavar="30s|2m|1h",
+        help="Time from line integrals to volume; chooses method, Gaussians, steps and binning, and ends in time.",
+    ),
+    click.option(
+        "--quality",
+        type=click.Choice(list(PRESETS)),
+        help="A preset of steps and Gaussians, instead of naming them.",
+    ),
+    click.option("--gaussians", type=click.IntRange(min=1), help="How many to start from (r2)."),
+    click.option(
+        "--start",
+        type=click.Choice(get_args(Start)),
+        default="fbp",
+        show_default=True,
+        help="Volume that the first Gaussians are drawn from (r2); tv is slower, without streaks of few views.",
+    ),
+    click.option(
+        "--loss",
+        type=click.Choice(get_args(Loss)),
+        default="l1",
+        show_default=True,
+        help="Misfit of the fit (r2), beside SSIM: absolute, squared, or squared and weighed as photon noise is.",
+    ),
+    click.option("--device", default="cpu", show_default=True, metavar="cpu|cuda", help="Of the fit (r2)."),
+    click.option(
+        "--early-stop",
+        is_flag=True,
+        help="End the fit (r2) when views held out no longer gain; every tenth is held out where --views leaves none.",
+    ),
+    click.option(
+        "--checkpoint",
+        type=click.Path(path_type=Path, dir_okay=False),
+        callback=checkpoint_output,
+        help="Keep the fit's state here (r2): every minute, when it ends, and at Ctrl-C.",
+    ),
+    click.option(
+        "--resume",
+        type=click.Path(path_type=Path, dir_okay=False),
+        help="Go on from a checkpoint of the same data and options (r2).",
+    ),
+    click.option(
+        "--iterations", type=click.IntRange(min=1), help="Of an iterative method. Default: each method's own."
+    ),
+    click.option(
+        "--tv-weight",
+        type=click.FloatRange(min=0, min_open=True),
+        help="Of the total variation in fista-tv and os-sirt-tv, in units of the sample's density.",
+    ),
+)
