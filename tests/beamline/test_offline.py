@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import h5py
 import numpy as np
 import pytest
 
 from beamline import deliver
+from beamline.checkpoints import Keeper
 from beamline.deliver import Target
 from beamline.digest import digest
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event
 from beamline.offline import ReconOptions, SourceOptions, run
 from beamline.pipeline import Selection
+from beamline.recon_report import METHOD_NAMES
+from beamline.storage.checkpoint_file import read_checkpoint
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.geometry import Geometry
 from recon.metrics import psnr
+from recon.reconstruction import Method
 from recon.volume import Grid
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 
@@ -202,6 +209,98 @@ def test_the_same_seed_gives_the_same_volume(tmp_path: Path) -> None:
         run(options, lambda e: None, SystemClock())
         volumes.append(read_reconstruction(tmp_path / name).volume.data)
     np.testing.assert_allclose(volumes[0], volumes[1], atol=1e-4 * np.abs(volumes[0]).max())
+
+
+FIT = {"method": "r2", "steps": 80, "gaussians": 300, "selection": Selection(axis_col=SCAN.axis_col)}
+
+
+def _volume(path: Path) -> np.ndarray:
+    return read_reconstruction(path).volume.data
+
+
+def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None:
+    """Ended after some steps, begun again from its file: the same volume to the bit, with views held out as well."""
+    selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
+    whole = _options(tmp_path, **{**FIT, "selection": selection})
+    run(whole, lambda e: None, SystemClock())
+    asked: list[int] = []
+
+    @contextmanager
+    def after_30_steps() -> Iterator[Callable[[], bool]]:
+        yield lambda: len(asked) >= 30 or asked.append(0) is not None
+
+    kept = tmp_path / "fit.checkpoint.h5"
+    part = replace(whole, target=Target(tmp_path / "part.h5", None), keeper=Keeper(kept))
+    run(part, lambda e: None, SystemClock(), after_30_steps)
+    assert read_reconstruction(tmp_path / "part.h5").parameters["ended_early"]
+    assert read_checkpoint(kept).state["counts"][1] == len(asked) + 1 < 80
+    rest = replace(whole, target=Target(tmp_path / "rest.h5", None), keeper=Keeper(None, kept))
+    run(rest, lambda e: None, SystemClock())
+    np.testing.assert_array_equal(_volume(tmp_path / "rest.h5"), _volume(tmp_path / "out.h5"))
+    assert np.abs(_volume(tmp_path / "part.h5") - _volume(tmp_path / "out.h5")).max() > 0
+    parameters = read_reconstruction(tmp_path / "rest.h5").parameters
+    assert parameters["resumed_from"] == str(kept) and parameters["steps"] == 80
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
+    kept = tmp_path / "fit.checkpoint.h5"
+    run(_options(tmp_path, **FIT, keeper=Keeper(kept)), lambda e: None, SystemClock())
+    other = _options(
+        tmp_path, **FIT, loss="l2", seed=4, keeper=Keeper(None, kept), target=Target(tmp_path / "b.h5", None)
+    )
+    with pytest.raises(DataError, match=r"loss \(l2, l1 in the checkpoint\); seed \(4, 0 in the checkpoint\)"):
+        run(other, lambda e: None, SystemClock())
+    with pytest.raises(DataError, match="axis_col"):
+        run(replace(other, loss="l1", seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5", "out.h5", "fit.checkpoint.h5"}
+
+
+def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> None:
+    events: list[Event] = []
+    options = _options(tmp_path, **{**FIT, "steps": 120}, early_stop=True)
+    metrics = run(options, events.append, SystemClock())
+    said = [event.data["message"] for event in events if event.event == "state"]
+    assert said == ["4 of 45 views are held out to say when to stop"]
+    assert "residual_held_out" in metrics
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.parameters["n_views"] == 41
+    assert np.isfinite(record.history["held_out"][-1])
+
+
+@pytest.mark.parametrize("loss", ["l2", "poisson"])
+def test_every_loss_is_fitted_and_kept(tmp_path: Path, loss: str) -> None:
+    metrics = run(_options(tmp_path, **FIT, loss=loss, start="tv"), lambda e: None, SystemClock())
+    parameters = read_reconstruction(tmp_path / "out.h5").parameters
+    assert (parameters["loss"], parameters["start"], parameters["device"]) == (loss, "tv", "cpu")
+    assert metrics["residual"] < 0.2
+
+
+@pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
+def test_iterations_become_volume_history_and_report(tmp_path: Path, method: Method) -> None:
+    events: list[Event] = []
+    options = _options(
+        tmp_path, method=method, iterations=8, selection=Selection(axis_col=SCAN.axis_col),
+        target=Target(tmp_path / "out.h5", tmp_path / "out.html"),
+    )  # fmt: skip
+    metrics = run(options, events.append, SystemClock())
+    assert metrics["residual"] < 0.2
+    progress = [event.data for event in events if event.event == "progress"]
+    assert [p["step"] for p in progress] == list(range(1, 9))
+    assert progress[-1]["per_s"] > 0 and progress[-1]["eta_s"] == 0
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert (record.parameters["method"], record.parameters["iterations"]) == (method, 8)
+    np.testing.assert_array_equal(record.history["step"], np.arange(1, 9))
+    assert METHOD_NAMES[method] in (tmp_path / "out.html").read_text(encoding="utf-8")
+
+
+def test_every_method_has_a_name() -> None:
+    assert set(METHOD_NAMES) == set(get_args(Method))
+
+
+def test_a_device_that_is_not_there_is_told_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--device abacus"):
+        run(_options(tmp_path, **FIT, device="abacus"), lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5"}
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from beamline import offline
 from beamline.cli.main import main
 from beamline.cli.recon import repeated, report_beside
 from beamline.storage.recon_file import read_reconstruction
 from recon import fit
+from recon.fit import Progress
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -132,6 +135,21 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "truth missing": ({}, ["--truth", "truth.npz"], 2, "truth.npz"),
     "truth of another shape": ({}, ["--truth", "scan.npy"], 2, "shape"),
     "of the other method": ({}, ["--gaussians", "5"], 2, "r2"),
+    "a loss of fbp": ({}, ["--loss", "l2"], 2, "--loss is of the r2 fit"),
+    "a checkpoint of fbp": ({}, ["--checkpoint", "fit.h5"], 2, "--checkpoint is of the r2 fit"),
+    "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of the iterative methods"),
+    "iterations of a fit": ({}, ["-m", "r2", "--iterations", "5"], 2, "does not go with --method r2"),
+    "steps of iterations": ({}, ["-m", "sirt", "--steps", "5"], 2, "--steps is of the r2 fit"),
+    "smoothing of sirt": ({}, ["-m", "sirt", "--tv-weight", "0.1"], 2, "fista-tv and os-sirt-tv"),
+    "budget and loss": ({}, ["--budget", "30s", "--loss", "l2"], 2, "exclude"),
+    "budget and early stop": ({}, ["--budget", "30s", "--early-stop"], 2, "exclude"),
+    "following with a start": ({}, ["-m", "r2", "--follow", "--start", "tv"], 2, "finished scan"),
+    "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),
+    "no such device": ({}, ["-m", "r2", "--device", "abacus"], 2, "--device abacus"),
+    "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5"),
+    "not a checkpoint": ({}, ["-m", "r2", "--resume", "scan.h5"], 5, "no checkpoint"),
+    "a checkpoint in the way": ({}, ["-m", "r2", "--checkpoint", "scan.h5"], 5, "never overwritten"),
+    "a nameless checkpoint": ({}, ["-m", "r2", "--checkpoint", ""], 2, "fit.checkpoint.h5"),
     "no file": ({}, ["-o", "."], 2, "directory"),
     "nameless": ({}, ["-o", ""], 2, "HDF5"),
     "a page": ({}, ["-o", "out.html"], 2, "HDF5"),
@@ -215,6 +233,51 @@ def test_a_fit_that_is_interrupted_twice_leaves_nothing(folder: Path, monkeypatc
     result = _beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
     assert result.exit_code == 130
     assert _left(folder) == {"scan.h5"}
+
+
+def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = offline.progress_events
+
+    def watched(*arguments: Any) -> Callable[[Progress], None]:
+        listen = told(*arguments)
+
+        def heard(progress: Progress) -> None:
+            listen(progress)
+            if progress.step == 5:
+                signal.raise_signal(signal.SIGINT)
+
+        return heard
+
+    monkeypatch.setattr(offline, "progress_events", watched)
+    result = _beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "100000", "--no-report")
+    assert result.exit_code == 4, result.output
+    assert "ended early" in result.stderr
+    record = read_reconstruction(folder / "scan_sirt.h5")
+    assert record.parameters["ended_early"] and record.history["step"][-1] == 5
+
+
+def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ("--steps", "60", "--gaussians", "50", "--axis", "20.7", "--no-report")
+    assert _beamline("recon", "scan.h5", *options, "-o", "whole.h5").exit_code == 0
+    with monkeypatch.context() as patched:
+        _signal_at_step(patched, signal.SIGINT, {20})
+        result = _beamline("recon", "scan.h5", *options, "-o", "part.h5", "--checkpoint", "fit.h5")
+    assert result.exit_code == 4, result.output
+    result = _beamline("recon", "scan.h5", *options, "-o", "rest.h5", "--checkpoint", "fit.h5", "--resume", "fit.h5")
+    assert result.exit_code == 0, result.output
+    whole, rest = (read_reconstruction(folder / name) for name in ("whole.h5", "rest.h5"))
+    np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
+    assert _left(folder) == {"scan.h5", "whole.h5", "part.h5", "rest.h5", "fit.h5"}
+    result = _beamline("recon", "scan.h5", *options, "-o", "other.h5", "--resume", "fit.h5", "--rows", "0:1")
+    assert result.exit_code == 5
+    assert "is of another fit: projections" in result.stderr and "detector_shape" in result.stderr
+    assert "other.h5" not in _left(folder)
+
+
+def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:
+    result = _beamline("recon", "scan.h5", "--steps", "60", "--gaussians", "50", "--early-stop", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "3 of 30 views are held out to say when to stop" in result.stderr
 
 
 def _signal_at_step(monkeypatch: pytest.MonkeyPatch, number: signal.Signals, at: set[int], times: int = 1) -> list[int]:
