@@ -28,7 +28,8 @@ class Found:
     Attributes:
         image: the kernel's picture or volume.
         value: largest error of it, of the largest value or the largest single weight, whichever is more.
-        gradients: largest error of the gradients by parameter, of the largest gradient of that parameter.
+        gradients: largest error of the gradients by parameter, of the largest gradient of that parameter, or of the
+            largest that a Gaussian's whole weight would make.
         slopes: the kernel's gradients.
     """
 
@@ -60,8 +61,16 @@ def compare(g: Gaussians, where: Geometry | Grid, *, model: RayModel | None = No
         assert torch.isfinite(values).all(), name
     top = max(float(expected.detach().abs().max()), weight)
     off = float((found - expected).detach().abs().max()) / top
+    # The size of a gradient is at least what one Gaussian's whole weight makes, even where symmetry cancels it.
+    pull = (exact["raw_densities"] / torch.sigmoid(twin.raw_densities.detach()) * g.densities / g.density_unit).abs()
+    size = {
+        "means": float((pull / g.scales.amax(1)).max()),
+        "log_scales": float(pull.max()),
+        "quaternions": float((pull / g.quaternions.norm(dim=1)).max()),
+        "raw_densities": 0.0,
+    }
     worst = {
-        name: float((slopes[name] - value).abs().max()) / max(float(value.abs().max()), 1e-300)
+        name: float((slopes[name] - value).abs().max()) / max(float(value.abs().max()), size[name], 1e-300)
         for name, value in exact.items()
     }
     return Found(found.detach(), off, worst, slopes)
