@@ -32,7 +32,7 @@ def require(device: str | torch.device) -> torch.device:
     """The device to run on.
 
     Raises:
-        ValueError: where the device is not CUDA (and Triton not interpreted).
+        ValueError: where the device is not CUDA (and Triton not interpreted), or not the one that Triton launches on.
         RuntimeError: where torch sees no CUDA device.
     """
     wanted = torch.device(device)
@@ -44,5 +44,11 @@ def require(device: str | torch.device) -> torch.device:
         raise RuntimeError(
             f"device {wanted} was asked for, but torch {torch.__version__} sees no CUDA device: check the driver and "
             "that this torch is a CUDA build, or fit on the cpu"
+        )
+    current = torch.cuda.current_device()
+    if wanted.index not in (None, current):
+        raise ValueError(
+            f"the GPU kernels run on the current device, cuda:{current}, and {wanted} was asked for: start Python with "
+            f"CUDA_VISIBLE_DEVICES={wanted.index} and ask for cuda"
         )
     return wanted

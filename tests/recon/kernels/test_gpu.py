@@ -46,16 +46,16 @@ def device() -> torch.device:
     return gpu.require("cuda")
 
 
-def parallel() -> Geometry:
-    return Geometry.parallel([0.7, -4.0], SHAPE, pixel_pitch=0.5, axis_col=11.3)
+def parallel(shape: tuple[int, int] = SHAPE) -> Geometry:
+    return Geometry.parallel([0.7, -4.0], shape, pixel_pitch=0.5, axis_col=shape[1] / 2 - 1.7)
 
 
 def leaned() -> Geometry:
     return Geometry.parallel([2.5], SHAPE, 0.5, axis_row=8.2, shifts=[[1.3, -0.8]], roll=0.2, tilt=0.3)
 
 
-def cone() -> Geometry:
-    return Geometry.cone([0.4], SHAPE, 1.1, 22.0, 45.0, 11.9, shifts=[[-0.6, 0.4]], roll=-0.1, tilt=0.2)
+def cone(shape: tuple[int, int] = SHAPE) -> Geometry:
+    return Geometry.cone([0.4], shape, 1.1, 22.0, 45.0, shape[1] / 2 - 1.1, shifts=[[-0.6, 0.4]], roll=-0.1, tilt=0.2)
 
 
 def raw_of(g: Gaussians, device: torch.device) -> tuple[Tensor, ...]:
@@ -429,7 +429,7 @@ def test_total_variation_and_gradient_equal_the_twin(
 def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: fit.FitSettings) -> tuple[fit.FitState, list]:
     """Five steps with rounds of density control on data and weights that are always the same."""
     rng = np.random.default_rng(5)
-    data = rng.random((geometry.n_views, *SHAPE)).astype(np.float32)
+    data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
     weights = (rng.random(data.shape) > 0.1).astype(np.float32)
     problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
     state, told = fit.init(g, 11, 1.5, backend), []
@@ -445,7 +445,7 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: fit.FitSe
     ],
 )
 def test_a_fit_is_the_same_on_both_backends(make: object, changes: dict, random_gaussians: Make) -> None:
-    g, geometry = random_gaussians(14, 8.0), make()  # type: ignore[operator]
+    g, geometry = random_gaussians(14, 6.0), make((11, 14))  # type: ignore[operator]
     # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.
     policy = DensityPolicy(start=0.0, stop=1.0, every=2, threshold=1e-4, prune_below=0.3)
     settings = fit.FitSettings(
@@ -483,3 +483,8 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="sees no CUDA device"):
         gpu.require("cuda:1")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    with pytest.raises(ValueError, match="CUDA_VISIBLE_DEVICES=1"):
+        gpu.require("cuda:1")
+    assert gpu.require("cuda:0") == torch.device("cuda:0")
