@@ -1,4 +1,4 @@
-"""Many steps on data that a model can explain exactly: nothing drifts, nothing grows, nothing that is not pulled moves."""
+"""Many steps on data that a model can explain exactly: nothing drifts or grows, what is not pulled does not move."""
 
 from __future__ import annotations
 
@@ -45,12 +45,13 @@ def test_steps_without_drift(steps: int, residual: float) -> None:
         return False
 
     fit.run(state, problem, settings, steps, kept)
-    # After the first steps the running loss rises and falls with the rate, which is highest at first, but stays within
-    # a factor of the best so far, and ends there.
+    # The running loss of 20 steps rises and falls with views and rates, but never to five times its best so far; a
+    # twentieth of all steps averages over that and is never much above the best twentieth.
     after = np.array(losses[100:])
-    best = np.minimum.accumulate(after)
-    assert (after < 5 * best).all()
-    assert after[-1] < 1.2 * best[-1]
+    assert (after < 5 * np.minimum.accumulate(after)).all()
+    twentieths = np.array(losses).reshape(20, -1).mean(axis=1)
+    assert (twentieths < 1.3 * np.minimum.accumulate(twentieths)).all()
+    assert twentieths[-1] < 0.2 * twentieths[1]
     assert fit.misfit_of(state, problem, settings) < residual
     p = state.parameters
     assert all(np.isfinite(values).all() for arrays in (p, state.first, state.second) for values in arrays.values())
