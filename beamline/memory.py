@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from contextlib import suppress
 from pathlib import Path
 
-_STATUS = Path("/proc/self/status")
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def peak_memory() -> int | None:
@@ -22,6 +23,12 @@ def peak_memory() -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak) if sys.platform == "darwin" else int(peak) * 1024
+
+
+def forget_peak() -> None:
+    """Let `peak_memory` count from now on, where the system can do that (Linux); elsewhere nothing happens."""
+    with suppress(OSError):
+        _CLEAR.write_text("5", encoding="ascii")  # proc_pid_clear_refs(5): reset the peak resident set size
 
 
 def _high_water(status: str) -> int | None:

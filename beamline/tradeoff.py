@@ -104,6 +104,9 @@ def run(options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], fl
     stopped = False
     try:
         data.save(work / "data.npz")
+        said = {"state": "compiling", "message": "Compiling what is not in the cache yet"}
+        sink(Event("state", clock.now(), said))
+        compile_kernels(trials, work)
         for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each is the one before and a trial more
             write_table(folder, table)
     except KeyboardInterrupt:
@@ -165,6 +168,12 @@ def command(job: Path) -> Sequence[str]:
     return [sys.executable, "-m", "beamline.trial_process", str(job)]
 
 
+def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
+    """Fill the cache of compiled kernels for these trials, so that no trial's memory is that of a compiler."""
+    kinds = {trial.method: trial for trial in trials if trial.group != "precision"}
+    _process({"compile": [asdict(trial) for trial in kinds.values()]}, work)  # what fails here, a trial will tell
+
+
 def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = None) -> Outcome:
     """One trial in its own process; it is gone when this returns, whatever ended it.
 
@@ -172,12 +181,27 @@ def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = N
         work: a folder with data.npz.
         max_seconds: after which it is ended.
     """
-    job, words = work / "job.json", work / "stderr.txt"
-    job.write_text(json.dumps({"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed}), encoding="utf-8")
+    job = {"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed}
+    return _outcome(trial, _process(job, work, max_seconds))
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """A process that has ended: the last thing it said, its code, its last words, and whether its time was over."""
+
+    said: Mapping[str, Any]
+    code: int
+    words: str
+    late: bool
+
+
+def _process(job: Mapping[str, Any], work: Path, max_seconds: float | None = None) -> _Ended:
+    path, words = work / "job.json", work / "stderr.txt"
+    path.write_text(json.dumps(job), encoding="utf-8")
     late = threading.Event()
     with words.open("w", encoding="utf-8") as stderr:
         process = subprocess.Popen(
-            command(job),
+            command(path),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -209,7 +233,7 @@ def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = N
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
-    return _outcome(trial, last, late.is_set(), process.returncode, words)
+    return _Ended(last, process.returncode, words.read_text(encoding="utf-8", errors="replace"), late.is_set())
 
 
 def _said(line: str) -> Mapping[str, Any] | None:
@@ -220,14 +244,14 @@ def _said(line: str) -> Mapping[str, Any] | None:
     return said if isinstance(said, dict) else None
 
 
-def _outcome(trial: Trial, last: Mapping[str, Any], late: bool, code: int, words: Path) -> Outcome:
-    said = dict(last)
+def _outcome(trial: Trial, ended: _Ended) -> Outcome:
+    said = dict(ended.said)
     if said.pop("event", None) == "result":
         curve = [(float(s), float(q)) for s, q in said.pop("curve", [])]
         return Outcome(trial, "done", curve=tuple(curve), **said)
-    status: Status = "out of time" if late else "failed"
-    if late:
+    status: Status = "out of time" if ended.late else "failed"
+    if ended.late:
         return Outcome(trial, status, message="ended: the time given with --max-seconds was over")
-    lines = words.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    default = f"its process ended with code {code}" + (f": {lines[-1]}" if lines else "")
+    lines = ended.words.strip().splitlines()
+    default = f"its process ended with code {ended.code}" + (f": {lines[-1]}" if lines else "")
     return Outcome(trial, status, math.nan, message=str(said.get("message", default)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from beamline.figures import png
-from beamline.trials import Trial
+from beamline.trials import Outcome, Trial
 
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best: what is worse is counted, not drawn
@@ -40,8 +40,8 @@ def pareto_plot(
     shown = [(t, c, q) for t, c, q in points if math.isfinite(c) and math.isfinite(q)]
     for trial, cost, quality in shown:
         axes.scatter(
-            cost, quality, s=46, marker=_MARKERS.get(trial.group, "o"), color=_COLOURS.get(trial.method, "tab:pink"),
-            edgecolors="white", linewidths=0.6, zorder=3,
+            cost, quality, s=_size(trial.group), marker=_MARKERS.get(trial.group, "o"),
+            color=_COLOURS.get(trial.method, "tab:pink"), edgecolors="white", linewidths=0.6, zorder=3,
         )  # fmt: skip
     kept = [points[i] for i in front]
     axes.step([p[1] for p in kept], [p[2] for p in kept], where="post", color="black", lw=1.1, alpha=0.5, zorder=2)
@@ -66,16 +66,27 @@ def pareto_plot(
     return png(figure)
 
 
-def cost_curves(curves: Mapping[str, Sequence[tuple[float, float]]]) -> bytes:
-    """(seconds, dB) of each fit while it ran."""
-    figure = Figure(figsize=(_SIZE[0], 3.6), dpi=_DPI, layout="constrained")
+def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
+    """The residual of each while it ran, dB against s; dashed where it is of the views used."""
+    figure = Figure(figsize=(_SIZE[0], 4.0), dpi=_DPI, layout="constrained")
     axes: Axes = figure.subplots()
-    for label, curve in curves.items():
-        axes.plot(*np.array(curve).T, lw=1.4, label=label)
+    for outcome in outcomes:
+        seconds, quality = np.array(outcome.curve).T
+        axes.plot(
+            seconds, quality, lw=1.4, color=_COLOURS.get(outcome.trial.method, "tab:pink"),
+            ls="-" if outcome.curve_of == "views held out" else "--",
+            label=f"{outcome.trial.method} ({outcome.curve_of})",
+        )  # fmt: skip
+    _scale(axes, [seconds for outcome in outcomes for seconds, _ in outcome.curve])
     axes.set(xlabel="time (s)", ylabel="residual (dB below the data)")
-    axes.legend(fontsize=8, loc="lower right")
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
     return png(figure)
+
+
+def _size(group: str) -> float:
+    """Of a marker: a star looks smaller than it is."""
+    return 90 if _MARKERS.get(group) == "*" else 46
 
 
 def _scale(axes: Axes, costs: Sequence[float]) -> None:
@@ -91,14 +102,18 @@ def _scale(axes: Axes, costs: Sequence[float]) -> None:
 
 def _legend(figure: Figure, axes: Axes, shown: Sequence[tuple[Trial, float, float]]) -> None:
     methods = dict.fromkeys(t.method for t, _, _ in shown)
-    groups = dict.fromkeys(t.group for t, _, _ in shown)
+    groups = dict.fromkeys("steps" if t.group == "iterations" else t.group for t, _, _ in shown)
     handles = [
         axes.scatter([], [], color=_COLOURS.get(m, "tab:pink"), s=40, label=m) for m in methods
     ] + [
-        axes.scatter([], [], color="white", edgecolors="0.2", marker=_MARKERS.get(g, "o"), s=40, label=_WORDS.get(g, g))
+        axes.scatter(
+            [], [], color="white", edgecolors="0.2", marker=_MARKERS.get(g, "o"), s=_size(g), label=_WORDS.get(g, g)
+        )
         for g in groups
     ]  # fmt: skip
     figure.legend(handles=handles, loc="outside right upper", fontsize=8, frameon=False, title="method, what varies")
 
 
-_WORDS = {"method": "baseline", "views": "fewer views", "cut-off": "cut-off", "gaussians": "number of Gaussians"}
+_WORDS = {
+    "method": "baseline", "steps": "steps, iterations", "views": "fewer views", "gaussians": "number of Gaussians",
+}  # fmt: skip

@@ -23,6 +23,15 @@ from beamline.version import version
 _FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
 
 
+_SHORT = {"psnr": "PSNR", "ssim3d": "SSIM", "residual_held_out": "held out", "resolution": "FSC"}
+_LONG = {
+    "psnr": "dB against the truth",
+    "ssim3d": "mean over the slices of three directions",
+    "residual_held_out": "residual of views held out",
+    "resolution": "period in {} to which two halves of the views agree",
+}
+
+
 @dataclass(frozen=True)
 class Table:
     """All trials of a trade-off and what they were made on.
@@ -90,11 +99,10 @@ class Table:
 def text(table: Table) -> str:
     """The table for people; * marks what no other trial beats in both time and quality."""
     lines = [machine_line(dict(table.machine)), ""]
-    width = max(len(outcome.trial.label) for outcome in table.outcomes)
+    shown = [o for o in table.outcomes if o.trial.group != "precision"]
+    width = max((len(outcome.trial.label) for outcome in shown), default=5)
     names = _metric_names(table)
-    lines.append(
-        f"  {'trial':<{width}}{'s':>9}{'CPU s':>9}{'MB':>8}" + "".join(f"{_heading(n, table):>15}" for n in names)
-    )
+    lines.append(f"  {'trial':<{width}}{'s':>8}{'CPU s':>8}{'MB':>6}" + "".join(f"{_SHORT[n]:>9}" for n in names))
     best = {table.compared[i].trial for i in table.front("seconds")}
     for outcome in table.outcomes:
         if outcome.trial.group == "precision" and outcome.status == "done":
@@ -102,12 +110,18 @@ def text(table: Table) -> str:
         mark = "*" if outcome.trial in best else " "
         row = f"{mark} {outcome.trial.label:<{width}}"
         if outcome.status == "done":
-            row += f"{outcome.seconds:9.2f}{outcome.cpu_seconds:9.2f}{_megabytes(outcome):>8}"
-            row += "".join(f"{_cell(n, outcome):>15}" for n in names)
+            row += f"{_time(outcome.seconds):>8}{_time(outcome.cpu_seconds):>8}{_megabytes(outcome):>6}"
+            row += "".join(f"{_cell(n, outcome):>9}" for n in names)
         else:
             row += f"  {outcome.status}" + (f": {outcome.message}" if outcome.message else "")
         lines.append(row)
-    return "\n".join([*lines, "", *conclusions(table)])
+    legend = "; ".join(f"{_SHORT[n]}: {_LONG[n].format(table.length_unit)}" for n in names)
+    return "\n".join([*lines, "", *([f"{legend}."] if legend else []), *conclusions(table)])
+
+
+def _time(seconds: float) -> str:
+    """s in at most seven characters; hours of a large scan need no hundredths."""
+    return f"{seconds:.2f}" if not seconds >= 1000 else f"{seconds:.0f}"
 
 
 def conclusions(table: Table) -> list[str]:
@@ -181,10 +195,13 @@ def write_figures(folder: Path, table: Table) -> None:
                 "the line is the best that can be had for so much, its corners the trials that no other beats in both."
             )
             pictures.append((f"quality_{cost}.png", Picture(title, caption, _pareto(table, cost))))
-    curves = {o.trial.label: o.curve for o in table.compared if o.trial.group == "method" and len(o.curve) > 1}
+    curves = [o for o in table.compared if o.trial.group == "method" and len(o.curve) > 1]
     if curves:
-        caption = "−20 log₁₀ of the residual that each fit recorded while it ran."
-        pictures.append(("curves.png", Picture("Each fit's own curve", caption, cost_curves(curves))))
+        caption = (
+            "−20 log₁₀ of the residual that each baseline recorded while it ran: solid where it is of views held out, "
+            "dashed where of the views used, which falls on when the volume already follows their noise."
+        )
+        pictures.append(("curves.png", Picture("Each method's own curve", caption, cost_curves(curves))))
     for name, picture in pictures:
         with whole_file(folder / name, replace=True) as partial:
             partial.write_bytes(picture.png)

@@ -1,6 +1,7 @@
 """One trial in a process of its own, so that its peak memory is its own: `python -m beamline.trial_process JOB.json`.
 
-Reads the job and its arrays, says progress and the result as lines of JSON on stdout.
+Reads the job and its arrays, says progress and the result as lines of JSON on stdout. A job may also be to compile what
+trials will need, once for all of them: compiling takes memory that would otherwise count as the first trial's.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from scipy import ndimage
 import recon
 from beamline.held_out import with_held_out
 from beamline.history import history_arrays, judged_by
-from beamline.memory import peak_memory
+from beamline.memory import forget_peak, peak_memory
 from beamline.trials import Trial
 from recon import metrics
 from recon.binning import bin_views
@@ -106,6 +107,7 @@ def run(
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)
     warm_up(trial)
+    forget_peak()
     before = cpu()
     result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
     cpu_seconds = cpu() - before
@@ -126,6 +128,7 @@ def run(
         "metrics": {name: float(value) for name, value in found.items()},
         "gaussians": None if result.gaussians is None else result.gaussians.n,
         "curve": curve_of(result),
+        "curve_of": "" if (judged := judged_by(history_arrays(result.history))) is None else judged.views,
     }
 
 
@@ -223,12 +226,16 @@ def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], 
 
 
 def main(job: Path) -> int:
-    """Run the job in the file `job`: {"data": .npz, "trial": {...}, "seed": n}."""
+    """Run the job in the file `job`: {"data": .npz, "trial": {...}, "seed": n}, or {"compile": [{...}, ...]}."""
 
     def say(line: Mapping[str, Any]) -> None:
         print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
 
     said = json.loads(job.read_text(encoding="utf-8"))
+    if "compile" in said:
+        for trial in said["compile"]:
+            warm_up(Trial(**trial))
+        return 0
     trial = Trial(**said["trial"])
     try:
         result = run(trial, Data.load(Path(said["data"])), int(said["seed"]), say)

@@ -88,7 +88,8 @@ class Outcome:
         peak_bytes: of its process; None where the system does not tell.
         metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), by name.
         gaussians: in the model at the end; None for voxel methods.
-        curve: (seconds, dB) of the fit's own record.
+        curve: (seconds, dB) of its own record of the residual.
+        curve_of: of which views that is, in words.
         message: why there are no figures.
         details: of the comparison with the float64 twin.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
@@ -101,6 +102,7 @@ class Outcome:
     metrics: Mapping[str, float] = field(default_factory=dict)
     gaussians: int | None = None
     curve: Sequence[tuple[float, float]] = ()
+    curve_of: str = ""
     message: str = ""
     details: Mapping[str, float] = field(default_factory=dict)
     cpu_seconds: float = math.nan

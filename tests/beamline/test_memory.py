@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from beamline.memory import _high_water, _ProcessMemoryCounters, peak_memory
+from beamline.memory import _high_water, _ProcessMemoryCounters, forget_peak, peak_memory
 
 
 @pytest.mark.skipif(sys.platform not in ("linux", "darwin", "win32"), reason="nothing is promised elsewhere")
@@ -23,6 +23,17 @@ def test_the_peak_is_bytes_and_stays() -> None:
     # What was free before may be taken up again, so that the peak grows by less than what is held.
     assert 10e6 < before <= after < before + 2 * size
     assert peak_memory() == pytest.approx(after, rel=0.2)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can do it")
+def test_a_peak_can_be_forgotten() -> None:
+    held = np.ones(40_000_000)  # 320 MB, given back at once: it is mapped memory
+    high = peak_memory()
+    del held
+    forget_peak()
+    low = peak_memory()
+    assert high is not None and low is not None
+    assert low < high - 2e8
 
 
 def test_the_status_file_of_linux() -> None:

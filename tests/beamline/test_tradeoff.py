@@ -17,12 +17,13 @@ import pytest
 from beamline import tradeoff
 from beamline.errors import ConfigError, DataError, ScanStopped
 from beamline.events import Event
+from beamline.machine import machine
 from beamline.offline import SourceOptions
 from beamline.pipeline import Selection
 from beamline.tradeoff import TradeoffOptions, run, run_trial
-from beamline.tradeoff_report import text
+from beamline.tradeoff_report import Table, text
 from beamline.trial_process import Data
-from beamline.trials import Outcome, Trial
+from beamline.trials import Depth, Outcome, Trial, plan
 from drivers.clock import SystemClock
 from recon.geometry import Geometry
 from recon.volume import Grid
@@ -51,6 +52,11 @@ def _made_up(trial: Trial, *_: object) -> Outcome:
     amount = float((trial.steps or 20) * trial.views / trial.binning)
     metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
     return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics, curve=((0.1, 10.0), (0.2, 11.0)))
+
+
+@pytest.fixture(autouse=True)
+def _nothing_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tradeoff, "compile_kernels", lambda *_: None)
 
 
 @pytest.fixture
@@ -87,7 +93,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
     assert page.count("data:image/png;base64,") == 3
     assert all(outcome.trial.label in page for outcome in table.compared)
     assert [e.event for e in events if e.event != "progress"] == [
-        "tradeoff_started", *["trial"] * len(rows), "done"
+        "tradeoff_started", "state", *["trial"] * len(rows), "done"
     ]  # fmt: skip
     progress = [e.data for e in events if e.event == "progress"]
     assert [p["n"] for p in progress] == list(range(len(rows)))
@@ -102,6 +108,24 @@ def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path
     assert marked == best
     assert said.count("s a dB") == len(best) - 1
     assert "float64 twin" in said
+
+
+@pytest.mark.parametrize("depth", ["quick", "full"])
+def test_the_table_fits_into_120_columns(depth: Depth) -> None:
+    """Also with four-digit numbers of views, and with everything that can be measured."""
+    metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784, "resolution": 0.6221}
+    methods = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
+    outcomes = tuple(
+        Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4)
+        for trial in plan(methods, 1801, 200_000, depth)
+    )
+    said = text(Table(outcomes, "psnr", "mm", machine(), {}, ""))
+    rows = [line for line in said.splitlines() if " views" in line and ":" not in line]
+    assert len(rows) == sum(o.trial.group != "precision" for o in outcomes)
+    assert max(map(len, rows)) <= 120
+    head = next(line for line in said.splitlines() if line.startswith("  trial"))
+    assert {len(row) for row in rows} == {len(head)}
+    assert all(" 12346 " in row and " 40000 " in row for row in rows)
 
 
 def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> None:
@@ -206,6 +230,16 @@ def test_what_becomes_of_a_process(
     outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
     assert (outcome.status, said in outcome.message) == (status, True)
     assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
+
+
+def test_kernels_are_compiled_once_for_each_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
+    out = tmp_path / "seen.json"
+    monkeypatch.setattr(tradeoff, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
+    tradeoff.compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
+    asked = json.loads(out.read_text())["compile"]
+    assert sorted(trial["method"] for trial in asked) == ["fbp", "r2", "sirt"]
 
 
 def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:

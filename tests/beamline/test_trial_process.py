@@ -83,7 +83,7 @@ def test_a_fit_with_each_setting(data: Data, change: dict[str, Any]) -> None:
     trial = Trial("method", "r2", 27, steps=120, gaussians=150, **change)
     found = run(trial, data, 0, said.append)
     assert found["metrics"]["psnr"] > 15
-    assert found["gaussians"] >= 100
+    assert found["gaussians"] >= 100 and found["curve_of"] == "views held out"
     assert found["curve"][-1][1] > 15
     assert said and said[0]["steps"] == 120
     json.dumps(found)
@@ -103,7 +103,7 @@ def test_a_fit_is_judged_by_views_that_it_does_not_see(data: Data) -> None:
 def test_iterations(data: Data, method: str) -> None:
     few, more = (run(Trial("iterations", method, 27, iterations=n), data, 0, _silent) for n in (1, 4))
     assert more["metrics"]["residual_held_out"] < few["metrics"]["residual_held_out"]
-    assert len(more["curve"]) == 4 and more["gaussians"] is None
+    assert len(more["curve"]) == 4 and more["curve_of"] == "views used" and more["gaussians"] is None
 
 
 def test_the_two_precisions(data: Data) -> None:
@@ -123,6 +123,14 @@ def test_a_volume_of_joined_pixels_lies_where_the_fine_one_does() -> None:
     moved = on_grid(Volume(ramp(coarse), coarse), grid)
     inner = (slice(1, -1),) * 3  # a linear function is interpolated exactly where nothing is beyond the ends
     np.testing.assert_allclose(moved.data[inner], ramp(grid)[inner], atol=1e-5)
+
+
+def test_a_job_may_be_to_compile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It needs no data and says nothing."""
+    trials = [Trial("method", "r2", 60, steps=500, gaussians=1000), Trial("method", "cgls", 60, iterations=10)]
+    (tmp_path / "job.json").write_text(json.dumps({"compile": [asdict(trial) for trial in trials]}))
+    assert main(tmp_path / "job.json") == 0
+    assert capsys.readouterr().out == ""
 
 
 def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str]) -> None:
