@@ -171,7 +171,7 @@ def quality_against_time(
         ("residual", "residual", "tab:orange"),
         ("held_out", "residual, held out", "tab:red"),
     ):
-        if name == "residual" and np.array_equal(history.get(name, []), history.get("loss", [])):
+        if name == "loss" and np.array_equal(history[name], history.get("residual", [])):
             continue  # what iterations lower is the residual itself
         if name in history and np.any(np.isfinite(history[name])):
             left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)

@@ -38,7 +38,7 @@ class Terminal:
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._said: dict[str, float] = {}
+        self._said: dict[str, tuple[float, int]] = {}  # real s, and how far it was
         self._last_text = ""
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
@@ -90,8 +90,11 @@ class Terminal:
             self._bar.update(self._tasks[what], completed=done, total=total or None, note=note)
             return
         now = time.monotonic()
-        if now - self._said.get(what, -PLAIN_EVERY) >= PLAIN_EVERY or done == total:
-            self._said[what] = now
+        last, at = self._said.get(what, (-PLAIN_EVERY, -1))
+        if done == at == total:
+            return
+        if now - last >= PLAIN_EVERY or done == total:
+            self._said[what] = now, done
             self._console.print(f"{what}: {note}")
 
 

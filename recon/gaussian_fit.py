@@ -131,7 +131,7 @@ def run_fit(
         fraction = min(1.0, max(state.step / planned if planned else 0.0, spent / seconds if seconds else 0.0))
         fit.step(state, rough if fraction < settings.coarse_until else problem, settings, fraction)
         done += 1
-        if state.step % _LOOK == 0:
+        if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             watch.look(state, request.early_stop)
         if now() - said > 0.1 or done == 1:
             said = now()

@@ -102,6 +102,13 @@ def test_a_fit_with_an_end_says_how_far_it_is() -> None:
     assert "residual 0.1234, held out 0.2000, 0:01" in fit({**progress, "held_out": 0.2})
 
 
+def test_the_end_is_said_once() -> None:
+    progress = {"step": 9, "steps": 9, "n_views": 9, "n_gaussians": 9, "residual": 0.1}
+    again = ("progress", {**progress, "residual": 0.2})
+    text = shown(io.StringIO(), ("progress", {**progress, "step": 8}), ("progress", progress), again)
+    assert [line[:11] for line in text.splitlines()] == ["volume: 8/9", "volume: 9/9"]
+
+
 def test_iterations_are_told_as_such() -> None:
     progress = {
         "step": 3, "steps": 40, "n_views": 60, "n_gaussians": 0, "residual": 0.2, "held_out": math.nan,
