@@ -15,6 +15,7 @@ _f = np.float32
 RADIUS = 5  # an 11 x 11 window
 MARGIN = 16  # zeros to the left and right of a line
 TASK_ROWS = 8
+_LARGEST = np.float32(1e38)
 L1, L2, POISSON = range(3)
 
 
@@ -108,19 +109,20 @@ def _ssim_terms(
             for start in range(0, width, lanes.WIDTH):
                 first, fresh, high = _columns(start, cols, width)
                 mx, my = _across(half, 0, first, window), lanes.load(target_blurred[0], row, first)
-                vx = _across(half, 1, first, window) - mx * mx
-                vy = lanes.load(target_blurred[1], row, first) - my * my
+                # Differences of squares: what rounding makes of them must neither be negative nor break Cauchy-Schwarz.
+                vx = lanes.clamp(_across(half, 1, first, window) - mx * mx, _f(0), _LARGEST)
+                vy = lanes.clamp(lanes.load(target_blurred[1], row, first) - my * my, _f(0), _LARGEST)
                 vxy = _across(half, 2, first, window) - mx * my
-                top1, top2 = two * mx * my + k1, two * vxy + k2
                 low1, low2 = one / (mx * mx + my * my + k1), one / (vx + vy + k2)
-                low = low1 * low2
+                structure = two * lanes.clamp(vxy * low2, _f(-0.5), _f(0.5)) + k2 * low2
+                luminance, heavy = (two * mx * my + k1) * low1, low2
                 if weights is not None:
-                    low = low * lanes.load(weights, row, first)
-                part = top1 * low
-                value = part * top2
+                    weight = lanes.load(weights, row, first)
+                    structure, heavy = structure * weight, low2 * weight
+                value = luminance * structure
                 d_vx = lanes.zero() - value * low2
-                d_vxy = two * part
-                d_mx = two * (my * top2 * low - mx * value * low1)
+                d_vxy = two * luminance * heavy
+                d_mx = two * low1 * (my * structure - mx * value)
                 amount = amount + lanes.between(value, fresh, high)
                 # Columns that only fill up sixteen lanes are no part of the mean.
                 d_x = d_mx - two * mx * d_vx - my * d_vxy

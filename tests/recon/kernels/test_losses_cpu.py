@@ -107,6 +107,29 @@ def test_the_weighted_loss_has_the_gradient_of_its_finite_differences(rng: np.ra
     )
 
 
+@pytest.mark.parametrize("size", [10.0, 1e3, 1e4, 1e8])
+def test_images_far_brighter_than_they_should_be_do_not_break_the_loss(rng: np.random.Generator, size: float) -> None:
+    # Variances are differences of squares. Of values of 1e3 none of their digits is left: naively they come out
+    # negative, 1 / (vx + vy + c2) anything, and one hot pixel gives NaN to a whole model.
+    target = np.full((40, 48), size, np.float32)
+    image = (target + 0.05 * rng.normal(size=target.shape)).astype(np.float32)
+    naive = np.float32(np.mean(image * image)) - np.float32(np.mean(image)) ** 2
+    loss, gradient = ProjectionLoss(image.shape, 0.25), np.empty_like(image)
+    value = loss(image, target, loss.target_maps(target), gradient)
+    absolute = float(np.abs(image.astype(np.float64) - target).mean())
+    assert absolute <= value <= absolute + 0.25 * 2.001  # SSIM lies in -1..1
+    assert np.isfinite(gradient).all()
+    if size == 10.0:
+        twin = projection_loss(torch.from_numpy(image).double(), torch.from_numpy(target).double(), 0.25)
+        assert value == pytest.approx(float(twin), rel=1e-3)
+    else:
+        assert abs(naive - 0.05**2) > 0.05**2
+    one = np.zeros((40, 48), np.float32)
+    one[20, 20] = size
+    value = loss(one, target / size, loss.target_maps(target / size), gradient)
+    assert np.isfinite(value) and np.isfinite(gradient).all()
+
+
 def test_ssim_equals_scikit_image_in_the_interior(rng: np.random.Generator) -> None:
     # The borders differ by choice (zeros there, reflection here), so only the inside is compared.
     image, target = (a.astype(np.float64) for a in _images(rng, (60, 60)))
