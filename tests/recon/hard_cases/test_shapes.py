@@ -165,7 +165,16 @@ def test_gaussians_larger_than_the_field(beam: str, sigma: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", [(1e-12, 1e-12, 1e-12), (1e-10, 1.0, 1.0), (1e-10, 1e-10, 1.0), (1e-8, 1.0, 1e8), (1e-12, 1e-12, 1e12)]
+    "shape",
+    [
+        (1e-15, 1e-15, 1e-15),
+        (1e15, 1e15, 1e15),
+        (1e-12, 1e-12, 1e-12),
+        (1e-10, 1.0, 1.0),
+        (1e-10, 1e-10, 1.0),
+        (1e-8, 1.0, 1e8),
+        (1e-12, 1e-12, 1e12),
+    ],
 )
 @pytest.mark.parametrize("where", [*BEAMS, "voxels"])
 def test_a_covariance_that_is_singular_to_rounding_is_finite(shape: Shape, where: str) -> None:
