@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from beamline import pareto
@@ -23,6 +24,7 @@ from beamline.version import version
 _FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
 
 
+_COLUMNS = 120
 _SHORT = {"psnr": "PSNR", "ssim3d": "SSIM", "residual_held_out": "held out", "resolution": "FSC"}
 _LONG = {
     "psnr": "dB against the truth",
@@ -116,7 +118,8 @@ def text(table: Table) -> str:
             row += f"  {outcome.status}" + (f": {outcome.message}" if outcome.message else "")
         lines.append(row)
     legend = "; ".join(f"{_SHORT[n]}: {_LONG[n].format(table.length_unit)}" for n in names)
-    return "\n".join([*lines, "", *([f"{legend}."] if legend else []), *conclusions(table)])
+    said = [*([f"{legend}."] if legend else []), *conclusions(table)]
+    return "\n".join([*lines, "", *(fill(line, _COLUMNS, subsequent_indent="  ") for line in said)])
 
 
 def _time(seconds: float) -> str:

@@ -59,6 +59,7 @@ def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pyte
     assert done.result.volume.grid == Grid.matching(prepared.geometry)
     assert f"of {budget:.3g} s" in done.said(budget)
     assert done.settings(budget)["measured_step_s"] == 0.01
+    assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
 
 
 def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:

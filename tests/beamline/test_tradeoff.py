@@ -106,8 +106,8 @@ def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path
     best = {table.compared[i].trial.label for i in table.front("seconds")}
     marked = {line[2:].split("  ")[0] for line in said.splitlines() if line.startswith("* ")}
     assert marked == best
-    assert said.count("s a dB") == len(best) - 1
-    assert "float64 twin" in said
+    assert " ".join(said.split()).count("s a dB") == len(best) - 1
+    assert "float64 twin" in " ".join(said.split())
 
 
 @pytest.mark.parametrize("depth", ["quick", "full"])
@@ -120,9 +120,9 @@ def test_the_table_fits_into_120_columns(depth: Depth) -> None:
         for trial in plan(methods, 1801, 200_000, depth)
     )
     said = text(Table(outcomes, "psnr", "mm", machine(), {}, ""))
-    rows = [line for line in said.splitlines() if " views" in line and ":" not in line]
+    rows = said.split("\n\n")[1].splitlines()[1:]
     assert len(rows) == sum(o.trial.group != "precision" for o in outcomes)
-    assert max(map(len, rows)) <= 120
+    assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's
     head = next(line for line in said.splitlines() if line.startswith("  trial"))
     assert {len(row) for row in rows} == {len(head)}
     assert all(" 12346 " in row and " 40000 " in row for row in rows)
