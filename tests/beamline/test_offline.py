@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import get_args
 
@@ -12,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline import deliver
+from beamline import checkpoints, deliver
 from beamline.checkpoints import Keeper
 from beamline.deliver import Target
 from beamline.digest import digest
@@ -240,6 +241,17 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     assert np.abs(_volume(tmp_path / "part.h5") - _volume(tmp_path / "out.h5")).max() > 0
     parameters = read_reconstruction(tmp_path / "rest.h5").parameters
     assert parameters["resumed_from"] == str(kept) and parameters["steps"] == 80
+
+
+def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that is a second on at each look."""
+    looks = count()
+    clock = SystemClock()
+    monkeypatch.setattr(clock, "now", lambda: float(next(looks)))
+    steps: list[int] = []
+    monkeypatch.setattr(checkpoints, "write_checkpoint", lambda _, kept: steps.append(int(kept.state["counts"][1])))
+    run(_options(tmp_path, **FIT, keeper=Keeper(tmp_path / "fit.h5")), lambda e: None, clock)
+    assert len(steps) > 2 and steps == sorted(steps) and steps[-1] == 80
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
