@@ -1,0 +1,126 @@
+"""Scans for quality tables: real volumes seen by a cone as in the published protocol, a measured walnut, a battery.
+
+The published protocol (Zha et al. 2024): DSO 5, DSD 7, a detector of 4 x 4 of 512² pixels, the volume a cube of edge 2
+with 256³ voxels; Poisson noise of 1e5 photons plus normal noise of 10 on views scaled to a largest value of 1. Half the
+size (256² pixels, 128³ voxels) keeps all ratios; its data come from the volume of twice the resolution, so that no
+method is given data of its own making.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from recon.geometry import Geometry
+from recon.operators import Projector
+from recon.volume import Grid, Volume
+from simulators.battery import battery
+from simulators.phantom import Detector, Phantom
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Views and what they should become; PSNR is taken with `peak`, on values clipped at 0."""
+
+    name: str
+    projections: F32
+    geometry: Geometry
+    grid: Grid
+    truth: F32
+    peak: float
+
+
+def cone(folder: Path, name: str, views: int, size: int) -> Case:
+    """An object of the protocol on size³ voxels and (2 size)² pixels."""
+    fine = _padded(OBJECTS[name](folder), 256)
+    factor = 256 // size
+    truth = fine.reshape(size, factor, size, factor, size, factor).mean(axis=(1, 3, 5), dtype=np.float32)
+    angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
+    geometry = Geometry.cone(angles, (2 * size, 2 * size), 4 / (2 * size), 5.0, 7.0)
+    clean = Projector(geometry, Grid((256, 256, 256), 2 / 256)).forward(fine)
+    return Case(name, _noisy(clean), geometry, Grid((size, size, size), 2 / size), truth, 1.0)
+
+
+def walnut(folder: Path, views: int) -> Case:
+    """Every so many-th of 240 measured views of a slab; its reference is an FDK of all 241 cone views."""
+    with h5py.File(folder / "walnut_parallel_rebinned_240x96x256.h5") as file:
+        found: list[h5py.Dataset] = []
+        file.visititems(lambda _, node: found.append(node) if getattr(node, "ndim", 0) == 3 else None)
+        chosen = np.linspace(0, 240, views, endpoint=False).astype(int)
+        data = np.asarray(found[0][:][chosen], np.float32)
+    geometry = Geometry.parallel(np.deg2rad(0.75 * chosen), (96, 256), 0.15217249972911476, 127.5)
+    truth = np.maximum(_first(folder / "walnut_fdk_256.npz")[70:166], 0)
+    return Case("walnut slab", data, geometry, Grid.matching(geometry), truth, float(truth.max()))
+
+
+def dense_battery(views: int, side: int = 256, photons: float = 2e4, particles: int = 300) -> Case:
+    """A can full of particles: piecewise constant, the home ground of total variation. Four rays a pixel."""
+    pitch = 1.0 / side
+    rng = np.random.default_rng(0)
+    phantom = Phantom.of(battery(rng, (1.0, 1.0), particles))
+    angles = np.linspace(0, np.pi, views, endpoint=False)
+    fine = Detector.centred((2 * side, 2 * side), pitch / 2)
+    clean = np.stack(
+        [phantom.line_integrals(a, fine).reshape(side, 2, side, 2).mean(axis=(1, 3)) for a in angles]
+    )  # fmt: skip
+    data = -np.log(np.maximum(rng.poisson(photons * np.exp(-clean)), 1) / photons)
+    geometry = Geometry.parallel(angles, (side, side), pitch)
+    truth = phantom.attenuation(Grid.matching(geometry))
+    return Case("battery", data.astype(np.float32), geometry, Grid.matching(geometry), truth, float(truth.max()))
+
+
+def _first(path: Path) -> F32:
+    with np.load(path, allow_pickle=False) as file:
+        return np.asarray(file[next(iter(file))], np.float32)
+
+
+def _thorax(folder: Path) -> F32:
+    """Hounsfield units of a NIfTI-1 file, -1000 to 1500 to 0 to 1."""
+    raw = gzip.decompress((folder / "totalseg_thorax_ct_191x167x233.nii.gz").read_bytes())
+    shape = np.frombuffer(raw, np.int16, 4, 40)[1:]
+    kind = {4: np.int16, 16: np.float32}[int(np.frombuffer(raw, np.int16, 1, 70)[0])]
+    start = int(np.frombuffer(raw, np.float32, 1, 108)[0])
+    volume = np.frombuffer(raw, kind, int(np.prod(shape, dtype=int)), start).reshape(shape[::-1])
+    return (np.clip(volume.astype(np.float32), -1000, 1500) + 1000) / 2500
+
+
+def _unit(volume: F32, high: float) -> F32:
+    return np.clip(volume.astype(np.float32) / high, 0, 1)
+
+
+OBJECTS: dict[str, Callable[[Path], F32]] = {
+    "teapot": lambda folder: _unit(_first(folder / "scivis_teapot_256.npz"), 255.0),
+    "shell": lambda folder: (lambda v: _unit(v, float(v.max())))(
+        tifffile.imread(folder / "qim3d_shell_225x128x128.tif")
+    ),
+    "thorax": _thorax,
+    "walnut": lambda folder: (lambda v: _unit(v, float(np.percentile(v, 99.99))))(
+        _first(folder / "walnut_fdk_256.npz")
+    ),
+}  # fmt: skip
+
+
+def _padded(volume: F32, side: int) -> F32:
+    low = [(side - n) // 2 for n in volume.shape]
+    return np.pad(volume, [(a, side - n - a) for a, n in zip(low, volume.shape, strict=True)])
+
+
+def _noisy(clean: F32, photons: float = 1e5, sigma: float = 10.0) -> F32:
+    rng = np.random.default_rng(0)
+    top = float(clean.max())
+    counts = rng.poisson(photons * np.exp(-clean / top)) + rng.normal(0, sigma, clean.shape)
+    return np.maximum(-np.log(np.maximum(counts, 1) / photons) * top, 0).astype(np.float32)
+
+
+def clipped(volume: Volume) -> F32:
+    """Attenuation is not negative: what a user would do with what is."""
+    return np.maximum(volume.data, 0)
