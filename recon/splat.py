@@ -318,7 +318,7 @@ def project(
 def voxelize(
     gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, kernel: Kernel = "auto"
 ) -> Tensor:
-    """Density [z, y, x] (1/mm) of the Gaussians at the grid's voxel centres: any box and voxel size. Raises as above."""
+    """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
     g, which = gaussians, _kernel(gaussians, kernel)
     if which == "reference":
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
