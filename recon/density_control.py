@@ -12,6 +12,10 @@ from recon.kernels.activation import F32
 # A split moves the halves this many standard deviations apart from the middle along the longest axis.
 _APART = 0.75
 
+# Gaussians go whose centre is this many standard deviations (of their longest axis) outside the box: of a nearer one
+# the views need the tail that reaches in, and cutting it takes matter from the border (0.05 to 0.16 dB, measured).
+_LOST = 3.0
+
 
 @dataclass(frozen=True)
 class DensityPolicy:
@@ -70,16 +74,22 @@ def control(
 ) -> Change:
     """Decide one round. Mass ρ √|Σ| is conserved by every clone and split, so the projections barely move.
 
+    Pruning comes first, and a model at its limit grows into the room that it leaves. There the two together relocate
+    Gaussians: from where they are faint or lost to where the data ask for more, most wanted first, at a constant
+    number. Only the mass of those pruned is lost, which is next to none.
+
     Args:
         means [n, 3] mm, log_scales [n, 3], rotations [n, 9], raw [n]: the model; ρ = softplus(raw) in density units.
         statistic: [n], the mean gradient that `policy.threshold` is held against.
         field: mm, the width of the field of view.
         limit: no more Gaussians than this.
-        box: [2, 3] mm, lower and upper corner (x, y, z); Gaussians whose centre is outside go.
+        box: [2, 3] mm, lower and upper corner (x, y, z); Gaussians whose centre is more than three standard deviations
+            of their longest axis outside go.
         rng: picks sides of clones.
     """
     density = np.logaddexp(0, raw)
-    alive = (density >= policy.prune_below) & ((means >= box[0]) & (means <= box[1])).all(axis=1)
+    reach = _LOST * np.exp(log_scales.max(axis=1, keepdims=True))
+    alive = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
     wanted = np.flatnonzero(alive & (statistic > policy.threshold))
     room = max(0, limit - int(alive.sum()))
     if wanted.size > room:
