@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import recon
 from beamline.budget import within
@@ -195,6 +196,7 @@ def reconstruct(
     """Run the reconstructor on prepared views."""
     if options.method == "r2":
         return _fit(options, prepared, grid, sink, clock, stopped, warn)
+    own: dict[str, Any] = {"filter": options.filter} if options.method == "fbp" else {}
     try:
         result = recon.reconstruct(
             prepared.projections.data,
@@ -202,7 +204,7 @@ def reconstruct(
             grid,
             method=options.method,
             seed=options.seed,
-            filter=options.filter,
+            **own,
             iterations=options.iterations,
             tv_weight=options.tv_weight,
             on_progress=progress_events(sink, clock),

@@ -30,6 +30,12 @@ from recon.volume import Grid, Volume
 Method = Literal["r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"]
 DEFAULT_STEPS = 2000
 
+# The methods that take an option; one that is not listed is of the fit.
+_FIT: tuple[Method, ...] = ("r2",)
+_TAKEN_BY: Mapping[str, tuple[Method, ...]] = MappingProxyType(
+    {"filter": ("fbp",), "iterations": get_args(iterative.Method), "tv_weight": ("fista-tv", "os-sirt-tv")}
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
@@ -103,9 +109,10 @@ def reconstruct(
         resume: the checkpoint of a fit with the same data and settings, to be taken up where it was left.
         device: "cpu", or a CUDA device for the fit.
         iterations, tv_weight: of a classical method; None: its defaults. The weight is in density units.
-        weights: of each ray [view, row, col], 0 or more; for "r2" and the iterative methods.
-        on_progress: called about ten times a second, or after each iteration.
-        should_stop: asked between steps; a stopped fit returns what it has.
+        weights: of each ray [view, row, col], 0 or more. "fbp" fills rays of weight 0 from their neighbours, and to it
+            all others are alike.
+        on_progress: called about ten times a second, or after each iteration ("fbp" has none).
+        should_stop: asked between steps or iterations; what is stopped returns what it has.
         on_checkpoint: given the checkpoint of an "r2" fit every `checkpoint_every` s.
         now: a clock in s.
 
@@ -119,11 +126,14 @@ def reconstruct(
         "start": (start, get_args(Start)),
     }
     _check(options, geometry, steps, seconds)
-    fits = {"steps": steps, "seconds": seconds, "resume": resume}
-    if method != "r2" and any(value is not None for value in fits.values()):
-        raise ValueError(f"{', '.join(fits)} are of the r2 fit; {method} has none")
-    if method in ("r2", "fbp") and (iterations is not None or tv_weight is not None):
-        raise ValueError(f"iterations and tv_weight are of the classical iterative methods; {method} has none")
+    said = {
+        "steps": steps is not None, "seconds": seconds is not None, "gaussians": gaussians is not None,
+        "densify": not densify, "settings": settings is not None, "start": start != "fbp",
+        "held_out": len(held_out) > 0, "early_stop": early_stop, "resume": resume is not None,
+        "device": device != "cpu", "on_checkpoint": on_checkpoint is not None, "filter": filter != "hann",
+        "iterations": iterations is not None, "tv_weight": tv_weight is not None,
+    }  # fmt: skip
+    _refuse_foreign(method, [name for name, given in said.items() if given])
     data = _line_integrals(projections, geometry)
     begin = now()
     target = grid or Grid.matching(geometry)
@@ -148,9 +158,7 @@ def reconstruct(
         volume = Volume((fdk if geometry.is_cone else fbp)(filled, geometry, target, filter), target)
         return Reconstruction(volume, now() - begin, (), method, None, MappingProxyType({"filter": filter}))
     how = iterative.default_settings(method)
-    if tv_weight is not None:
-        if not isinstance(how, FistaTv | OsSirtTv):
-            raise ValueError(f"tv_weight is of fista-tv and os-sirt-tv; {method} has none")
+    if tv_weight is not None and isinstance(how, FistaTv | OsSirtTv):
         how = replace(how, tv_weight=tv_weight)
     if iterations is not None:
         how = replace(how, iterations=iterations)
@@ -188,6 +196,14 @@ def _check(
         raise ValueError(f"steps must be 0 or more, got {steps}")
     if seconds is not None and not (math.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"seconds must be a time of 0 or more, got {seconds}")
+
+
+def _refuse_foreign(method: Method, said: Sequence[str]) -> None:
+    """Raises ValueError for options that would silently do nothing."""
+    foreign = [name for name in said if method not in _TAKEN_BY.get(name, _FIT)]
+    if foreign:
+        owners = ", ".join(f"{name} (of {', '.join(_TAKEN_BY.get(name, _FIT))})" for name in foreign)
+        raise ValueError(f"method {method!r} does not take {owners}: leave that out, or choose another method")
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

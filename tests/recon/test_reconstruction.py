@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 
 import numpy as np
@@ -144,10 +145,6 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
         ({"held_out": (24,)}, "views 0 to 23"),
         ({"held_out": tuple(range(24))}, "none is left"),
         ({"early_stop": True}, "there are none"),
-        ({"iterations": 3}, "r2 has none"),
-        ({"method": "sirt", "steps": 3}, "sirt has none"),
-        ({"method": "sirt", "tv_weight": 0.1}, "sirt has none"),
-        ({"method": "fbp", "iterations": 3}, "fbp has none"),
         ({"resume": {}}, "no checkpoint"),
         ({"device": "abacus"}, "not on 'abacus'"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
@@ -157,6 +154,48 @@ def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], mess
     arguments = {"projections": noisy, "geometry": VIEWS} | change
     with pytest.raises(ValueError, match=message):
         recon.reconstruct(**arguments)  # type: ignore[arg-type]
+
+
+OF_THE_FIT: dict[str, object] = {
+    "steps": 3, "seconds": 1.0, "gaussians": 100, "densify": False, "settings": fit.FitSettings(), "start": "tv",
+    "held_out": (3,), "early_stop": True, "resume": {}, "device": "cuda", "on_checkpoint": print,
+}  # fmt: skip
+OF_ITERATIONS: dict[str, object] = {"iterations": 3}
+OF_TV: dict[str, object] = {"tv_weight": 0.1}
+OF_FBP: dict[str, object] = {"filter": "ram-lak"}
+
+
+@pytest.mark.parametrize(
+    ("method", "foreign"),
+    [
+        ("r2", OF_ITERATIONS | OF_TV | OF_FBP),
+        ("fbp", OF_THE_FIT | OF_ITERATIONS | OF_TV),
+        ("sirt", OF_THE_FIT | OF_TV | OF_FBP),
+        ("fista-tv", OF_THE_FIT | OF_FBP),
+        ("os-sirt-tv", OF_THE_FIT | OF_FBP),
+    ],
+)
+def test_no_option_silently_does_nothing(
+    noisy: np.ndarray, method: recon.reconstruction.Method, foreign: dict[str, object]
+) -> None:
+    for name, value in foreign.items():
+        with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} \(of "):
+            recon.reconstruct(noisy, VIEWS, method=method, **{name: value})  # type: ignore[arg-type]
+
+
+def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> None:
+    with pytest.raises(
+        ValueError, match=r"'sirt' does not take steps \(of r2\), tv_weight \(of fista-tv, os-sirt-tv\)"
+    ):
+        recon.reconstruct(noisy, VIEWS, method="sirt", steps=5, tv_weight=0.1)
+
+
+def test_each_option_but_the_data_and_hooks_is_checked_against_the_method() -> None:
+    # A new option that nobody assigns to a method would be one that may silently do nothing.
+    free = {"projections", "geometry", "grid", "method", "seed", "weights", "on_progress", "should_stop",
+            "checkpoint_every", "now"}  # fmt: skip
+    assigned = set(OF_THE_FIT | OF_ITERATIONS | OF_TV | OF_FBP)
+    assert set(inspect.signature(recon.reconstruct).parameters) == free | assigned
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,25 @@ def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str,
     assert _left(folder) == before
 
 
+@pytest.mark.parametrize(
+    "option",
+    ["--steps 5", "--seconds 5", "--gaussians 5", "--start tv", "--loss l2", "--device cuda", "--early-stop",
+     "--checkpoint fit.h5", "--resume scan.h5", "--budget 30s", "--quality best"],
+)  # fmt: skip
+@pytest.mark.parametrize("method", ["fbp", "sirt"])
+def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str, method: str) -> None:
+    result = _beamline("recon", "scan.h5", "-m", method, *option.split())
+    assert result.exit_code == 2 and result.stdout == ""
+    assert f"{option.split()[0]} is of the r2 fit; it does not go with --method {method}." in result.stderr
+    assert _left(folder) == {"scan.h5"}
+
+
+def test_a_filter_with_an_iterative_method_is_of_the_fbp_it_is_compared_with(folder: Path) -> None:
+    result = _beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--filter", "ram-lak", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert read_reconstruction(folder / "scan_sirt.h5").parameters["iterations"] == 2
+
+
 @pytest.mark.parametrize("name", ["missing.h5", "text.h5", "empty.h5", "half.h5", "folder"])
 def test_files_that_cannot_be_read(folder: Path, name: str) -> None:
     (folder / "text.h5").write_text("no scan")
