@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +44,7 @@ def fill(image: Image, plan: Fill) -> None:
 
 
 def masked(
-    projections: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+    projections: NDArray[np.float32], weight: NDArray[np.float32] | None = None, largest: float = math.inf
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Projections without a value that is not finite, and the weights that go with them.
 
@@ -52,6 +54,7 @@ def masked(
     Args:
         projections: [view, row, col]; not changed.
         weight: of each ray, 0 or more, [view, row, col]; None: one for all.
+        largest: values beyond ± this count as not finite.
 
     Returns:
         Projections (the given ones where there is nothing to fill) and weights; None where every ray weighs one.
@@ -64,7 +67,8 @@ def masked(
             raise ValueError(f"weights have shape {weight.shape}, the projections {projections.shape}")
         if not (np.isfinite(weight).all() and weight.min(initial=0) >= 0):
             raise ValueError("weights must be finite and 0 or more")
-    bad = ~np.isfinite(projections)
+    most = min(largest, float(np.finfo(np.float32).max))
+    bad = ~((projections >= -most) & (projections <= most))
     if weight is not None:
         bad |= weight == 0
     marred = np.flatnonzero(bad.any(axis=(1, 2)))
@@ -72,8 +76,9 @@ def masked(
         return projections, weight
     blind = np.flatnonzero(bad.all(axis=(1, 2)))
     if blind.size:
+        within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
-            f"{blind.size} of {len(bad)} views have no value that is finite and weighs something "
+            f"{blind.size} of {len(bad)} views have no value that is {within} and weighs something "
             f"({blind[:8].tolist()} ...); leave these views out"
         )
     filled = np.array(projections, np.float32)

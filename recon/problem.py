@@ -19,6 +19,10 @@ from recon.volume import Grid
 Loss = Literal["l1", "l2", "poisson"]
 _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 
+# Images hold values of about one. Of ones beyond this no matter in the field can be the cause, and sums of products of
+# their squares, which SSIM takes, would leave float32's range.
+_LARGEST = 1e6
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -70,7 +74,8 @@ def make_problem(
 ) -> Problem:
     """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
 
-    Values that are not finite get no weight, see `masks.masked`. The squared losses are made of the size of the
+    Values that are not finite, or more than a million half fields times density units, get no weight, see
+    `masks.masked`. The squared losses are made of the size of the
     absolute one at the data's noise (see `noise_level`), so that the weights of SSIM and total variation keep their
     meaning.
 
@@ -78,7 +83,7 @@ def make_problem(
         weights: of each ray [view, row, col], 0 or more; None: one for all.
 
     Raises:
-        ValueError: where shapes disagree, a view has no finite value, or the loss is unknown.
+        ValueError: where shapes disagree, a view has no value that can be used, or the loss is unknown.
     """
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:
@@ -87,7 +92,7 @@ def make_problem(
         raise ValueError(f"loss must be one of {get_args(Loss)}, got {loss!r}")
     half_field = max(n * edge for n, edge in zip(grid.shape, grid.spacing, strict=True)) / 2
     scale = half_field * unit
-    filled, known = masked(projections, weights)
+    filled, known = masked(projections, weights, _LARGEST * scale)
     delta = max(noise_level(filled) / scale, 1e-4)
     projection_loss = backend.projection_loss(
         geometry.detector_shape, ssim_weight, DataTerm(_KINDS[loss], delta, scale)
@@ -97,21 +102,32 @@ def make_problem(
 
 
 def extend(problem: Problem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None) -> Problem:
-    """The problem with more views [view, row, col]; those it has are not copied."""
+    """The problem with more views [view, row, col]; those it has are not copied.
+
+    The size of new values is not judged: where the first views showed nothing, it is the density unit that is wrong.
+    """
     geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
     return replace(_with_views(problem, *masked(projections, weights)), geometry=geometry)
 
 
 def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Problem:
-    """The same problem on joined pixels: a first look at the large scales for a fraction of the time."""
-    weights = None
+    """The same problem on joined pixels: a first look at the large scales for a fraction of the time.
+
+    A joined pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
+    have no part in it.
+    """
+    data, weights = problem.projections, None
     if any(w is not None for w in problem.weights):
         ones = np.ones(problem.geometry.detector_shape, np.float32)
-        weights = np.stack([ones if w is None else problem.backend.numpy(w) for w in problem.weights])
-        weights = bin_views(weights, factor)
+        each = np.stack([ones if w is None else problem.backend.numpy(w) for w in problem.weights])
+        weights = bin_views(each, factor)
+        sums = bin_views(each * data, factor)
+        data = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)  # make_problem fills the others
+    else:
+        data = bin_views(data, factor)
     return make_problem(
-        bin_views(problem.projections, factor), problem.geometry.binned(factor), problem.grid, problem.unit,
-        problem.backend, weights=weights, loss=loss, ssim_weight=ssim_weight,
+        data, problem.geometry.binned(factor), problem.grid, problem.unit, problem.backend,
+        weights=weights, loss=loss, ssim_weight=ssim_weight,
     )  # fmt: skip
 
 

@@ -40,6 +40,18 @@ def test_rays_of_no_weight_are_filled_too_and_others_keep_theirs() -> None:
     assert given_back[0, 2, 2] == 0 == given_back[0, 0, 3] and given_back[0, 0, 0] == 0.25
 
 
+def test_values_beyond_the_largest_count_as_not_finite() -> None:
+    data = np.ones((1, 4, 4), np.float32)
+    data[0, 0, 0], data[0, 2, 2], data[0, 3, 0] = 1e30, -1e7, 99.0
+    filled, weight = masked(data, largest=100.0)
+    assert weight is not None
+    np.testing.assert_array_equal(np.argwhere(weight[0] == 0), [[0, 0], [2, 2]])
+    np.testing.assert_array_equal(filled[0, 0, 0], 1.0)
+    assert masked(data)[1] is None and masked(data, largest=1e300)[1] is None
+    with pytest.raises(ValueError, match=r"1 of 1 views have no value that is finite, within ±0\.5"):
+        masked(data, largest=0.5)
+
+
 @pytest.mark.parametrize(
     ("data", "weight", "message"),
     [

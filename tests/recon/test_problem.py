@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from recon import fit
 from recon.backend import Cpu
+from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.problem import coarser, extend, make_problem, noise_level
 from recon.volume import Grid
@@ -48,6 +50,94 @@ def test_weights_follow_their_pixels(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(
         joined.projections[0], data[0].reshape(6, 2, 9, 2).mean(axis=(1, 3)), rtol=1e-5
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("value", [1e7, -1e7, 1e12, 3e38, -3e38])
+@pytest.mark.parametrize("unit", [1e-6, 0.3, 1e6])
+def test_values_that_no_matter_explains_weigh_nothing_and_spread_nowhere(
+    rng: np.random.Generator, value: float, unit: float
+) -> None:
+    scale = 4.5 * unit  # half field (mm) times density unit
+    data = (scale * rng.random((3, 12, 18))).astype(np.float32)
+    spoilt, absent = data.copy(), data.copy()
+    at = np.s_[1, 3:5, 4:9]
+    spoilt[at] = np.clip(value * scale, -3e38, 3e38)
+    absent[at] = np.nan
+    wild, expected = (make_problem(d, VIEWS, GRID, unit, Cpu(), ssim_weight=0.25) for d in (spoilt, absent))
+    image = rng.random((12, 18)).astype(np.float32)
+    assert [w is None for w in wild.weights] == [True, False, True]
+    assert not wild.weights[1][at[1:]].any() and wild.weights[1].sum() == 12 * 18 - 10
+    for view in range(3):
+        # Not only is nothing NaN: it is the very problem in which nothing was measured there.
+        np.testing.assert_array_equal(wild.images[view], expected.images[view])
+        assert np.isfinite(wild.images[view]).all()
+        assert all(np.isfinite(part).all() for part in wild.target_maps[view])
+        loss, slope = wild.loss(image, wild.images[view], wild.target_maps[view], wild.weights[view])
+        assert np.isfinite(float(loss)) and np.isfinite(slope).all()
+        if view == 1:
+            assert not slope[at[1:]].any() and slope.any()
+        assert 0 < float(Cpu().misfit(image, wild.images[view], wild.weights[view])) < 10
+    assert np.isfinite(wild.projections).all()
+
+
+def test_what_is_large_but_can_be_squared_keeps_its_weight(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    data[0, 5, 5] = 0.99e6 * 4.5
+    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    assert problem.weights == (None, None, None)
+    loss, slope = problem.loss(problem.images[1], problem.images[0], problem.target_maps[0], None)
+    assert np.isfinite(float(loss)) and np.isfinite(slope).all()
+
+
+def test_a_fit_goes_on_beside_values_that_no_matter_explains(rng: np.random.Generator) -> None:
+    u = np.arange(18) - 8.5
+    data = np.broadcast_to(np.exp(-(u**2) / 8).astype(np.float32), (3, 12, 18)).copy()
+    start = Gaussians.from_physical(rng.normal(size=(20, 3)), np.ones(20), np.full(20, 0.1), density_unit=0.2)
+    ends = []
+    for value in (np.nan, 1e25):
+        data[2, 5, 6] = value
+        settings = fit.FitSettings(policy=None, tv_size=6, coarse=2, coarse_until=0.5)
+        problem = fit.problem_of(data, VIEWS, GRID, 0.2, settings)
+        rough = coarser(problem, 2, "l1", 0.25)
+        state = fit.run(fit.init(start, 0), rough, settings, 4)
+        ends.append(fit.run(state, problem, settings, 4).parameters)
+    for name in fit.NAMES:
+        assert np.isfinite(ends[1][name]).all()
+        np.testing.assert_array_equal(ends[0][name], ends[1][name])
+
+
+@given(seed=st.integers(0, 1000), share=st.floats(0, 0.9), factor=st.sampled_from([2, 3]))
+def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, factor: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = rng.uniform(0.5, 1.5, (3, 12, 18)).astype(np.float32)
+    weights = rng.uniform(0.1, 2, data.shape).astype(np.float32)
+    weights[rng.random(data.shape) < share] = 0
+    weights[:, 0, 0] = 1  # no view is blind
+    joined = coarser(make_problem(data, VIEWS, GRID, 1.0, Cpu(), weights=weights), factor, "l1", 0.25)
+    rows, cols = 12 // factor, 18 // factor
+    assert joined.projections.shape == (3, rows, cols)
+    for view, row, col in np.ndindex(3, rows, cols):
+        cell = np.s_[view, row * factor : (row + 1) * factor, col * factor : (col + 1) * factor]
+        p, w = data[cell].astype(np.float64), weights[cell].astype(np.float64)
+        kept = joined.weights[view]
+        assert (1.0 if kept is None else kept[row, col]) == pytest.approx(w.mean(), rel=1e-5)
+        if w.any():
+            assert joined.projections[view, row, col] == pytest.approx((w * p).sum() / w.sum(), rel=1e-5)
+
+
+def test_joined_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    joined = coarser(problem, 3, "l1", 0.25)
+    np.testing.assert_allclose(joined.projections, data.reshape(3, 4, 3, 6, 3).mean(axis=(2, 4)), rtol=1e-5)
+    assert joined.weights == (None, None, None)
+
+
+def test_a_view_of_nothing_else_is_refused_with_the_range(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    data[1] = 1e8
+    with pytest.raises(ValueError, match=r"1 of 3 views.*within ±4\.5e\+06.*\[1\]"):
+        make_problem(data, VIEWS, GRID, 1.0, Cpu())
 
 
 def test_what_makes_no_problem_is_refused(rng: np.random.Generator) -> None:
