@@ -6,6 +6,7 @@ into none of them. Losses come as something `float` takes: on a GPU that waits f
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, Protocol, SupportsFloat, TypeVar
 
@@ -108,17 +109,20 @@ class Backend(Protocol[Array]):
 
 
 def backend_for(device: str) -> Backend[Any]:
-    """The backend for "cpu" or for a CUDA device ("cuda", "cuda:1").
+    """The backend for "cpu", or for "cuda", the current CUDA device ("cuda:0" where that is its number).
 
     Raises:
         ImportError: triton is not installed.
         RuntimeError: torch sees no CUDA device.
-        ValueError: another kind of device.
+        ValueError: another kind of device, or a CUDA device that is not there or not the current one.
     """
     if device == "cpu":
         return Cpu()
-    if not device.startswith("cuda"):
-        raise ValueError(f"a fit computes on 'cpu' or on a CUDA device ('cuda', 'cuda:1'), not on {device!r}")
+    if not re.fullmatch(r"cuda(:\d+)?", device):
+        raise ValueError(
+            f"device {device!r} was asked for, and a fit computes on 'cpu' or on 'cuda', the current CUDA device: name "
+            "one of these; which CUDA device is the current one, CUDA_VISIBLE_DEVICES says when Python starts"
+        )
     from recon.kernels.gpu.engine import Gpu  # triton is loaded only where a GPU is asked for
 
     return Gpu(device)

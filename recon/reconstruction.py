@@ -107,7 +107,7 @@ def reconstruct(
         held_out: views that the fit does not see; their residual is in the history.
         early_stop: end the fit when that residual has not fallen for a while, and return the model that had it lowest.
         resume: the checkpoint of a fit with the same data and settings, to be taken up where it was left.
-        device: "cpu", or a CUDA device for the fit.
+        device: that the fit computes on, "cpu" or "cuda" (the current CUDA device).
         iterations, tv_weight: of a classical method; None: its defaults. The weight is in density units.
         weights: of each ray [view, row, col], 0 or more. "fbp" fills rays of weight 0 from their neighbours, and to it
             all others are alike.

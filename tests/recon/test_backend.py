@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from numba import get_num_threads, set_num_threads
 from numpy.typing import NDArray
 
@@ -130,10 +131,26 @@ def test_bounds_hold_after_an_update_and_none_is_none(rng: np.random.Generator) 
 
 def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(backend_for("cpu"), Cpu)
-    with pytest.raises(ValueError, match="'mps'"):
-        backend_for("mps")
+    for unknown in ("mps", "gpu", "CUDA", "cuda1", "cuda:", "cuda:one", "cuda:-1", "cuda:0,1", ""):
+        with pytest.raises(ValueError, match=rf"'{unknown}' was asked for.*'cpu' or on 'cuda'.*name one of these"):
+            backend_for(unknown)
     for name in [name for name in sys.modules if name.startswith("recon.kernels.gpu")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)  # as if it were not installed
-    with pytest.raises(ImportError, match=r"splatline\[gpu\]"):
-        backend_for("cuda")
+    for device in ("cuda", "cuda:1"):
+        with pytest.raises(ImportError, match=r"splatline\[gpu\]"):
+            backend_for(device)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a CUDA device")
+@pytest.mark.parametrize("device", ["cuda", "cuda:0", "cuda:1"])
+def test_a_cuda_device_that_is_not_there_is_said_by_name(device: str) -> None:
+    pytest.importorskip("triton")
+    from recon.kernels import gpu
+
+    if gpu.interpreted():
+        pytest.skip("the interpreter stands in for any device")
+    with pytest.raises(
+        RuntimeError, match=rf"device {device} was asked for, but torch .* sees no CUDA device.*on the cpu"
+    ):
+        backend_for(device)

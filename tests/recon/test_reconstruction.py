@@ -146,7 +146,7 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
         ({"held_out": tuple(range(24))}, "none is left"),
         ({"early_stop": True}, "there are none"),
         ({"resume": {}}, "no checkpoint"),
-        ({"device": "abacus"}, "not on 'abacus'"),
+        ({"device": "abacus"}, "'abacus' was asked for"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
     ],
 )

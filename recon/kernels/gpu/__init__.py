@@ -45,10 +45,15 @@ def require(device: str | torch.device) -> torch.device:
             f"device {wanted} was asked for, but torch {torch.__version__} sees no CUDA device: check the driver and "
             "that this torch is a CUDA build, or fit on the cpu"
         )
-    current = torch.cuda.current_device()
+    current, count = torch.cuda.current_device(), torch.cuda.device_count()
+    if wanted.index is not None and not 0 <= wanted.index < count:
+        raise ValueError(
+            f"device {device} was asked for, and torch sees {count} CUDA device{'' if count == 1 else 's'}, counted "
+            f"from 0: ask for cuda, which is cuda:{current}, or fit on the cpu"
+        )
     if wanted.index not in (None, current):
         raise ValueError(
-            f"the GPU kernels run on the current device, cuda:{current}, and {wanted} was asked for: start Python with "
-            f"CUDA_VISIBLE_DEVICES={wanted.index} and ask for cuda"
+            f"device {wanted} was asked for, and the GPU kernels run on the current one, cuda:{current}: start Python "
+            f"with CUDA_VISIBLE_DEVICES={wanted.index} and ask for cuda"
         )
     return wanted
