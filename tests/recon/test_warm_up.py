@@ -1,29 +1,92 @@
-"""After warm_up no kernel of a fit is compiled any more."""
+"""After warm_up no kernel of a fit of the same kind is compiled or loaded any more."""
 
 from __future__ import annotations
 
-import numpy as np
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from recon.fdk import covers_the_circle
+from recon.geometry import Geometry
+from recon.warm_up import toy_of
+
+# In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
+_SCRIPT = """
+import gc
+import numpy as np
 import recon
-from recon.kernels import activation, adam_cpu, footprints_cpu, losses_cpu, project_cpu, voxelize_cpu
+from recon.fit import FitSettings
+from recon.splat import RayModel
 from recon.warm_up import warm_up
 
+def compiled():
+    kernels = [o for o in gc.get_objects() if type(o).__name__ == "CPUDispatcher"]
+    return {id(k): (k.py_func.__qualname__, len(k.signatures)) for k in kernels if "recon" in k.py_func.__module__}
 
-def _compiled() -> dict[str, int]:
-    """Specialisations of each jitted function of the kernels."""
-    found = {}
-    for module in (activation, adam_cpu, footprints_cpu, losses_cpu, project_cpu, voxelize_cpu):
-        for name, value in vars(module).items():
-            if type(value).__name__ == "CPUDispatcher":
-                found[f"{module.__name__}.{name}"] = len(value.signatures)
-    return found
+shape = (10, 20)
+loss, rays, start, weighted = "l1", RayModel(), "fbp", False
+SETTING
+rows, cols = (np.arange(n) - (n - 1) / 2 for n in shape)
+blob = np.exp(-(rows[:, None] ** 2 + cols**2) / 18)
+data = np.tile(blob.astype(np.float32), (views.n_views, 1, 1))
+weights = None
+if weighted:
+    weights = np.ones(data.shape, np.float32)
+    weights[2, 3:5, 4:9] = 0
+warm_up(WARM)
+before = compiled()
+assert sum(n for _, n in before.values()) > 10, before
+settings = FitSettings(loss=loss, rays=rays)
+recon.reconstruct(data, views, steps=120, gaussians=60, settings=settings, start=start, weights=weights)
+late = sorted(name for key, (name, n) in compiled().items() if n != before.get(key, ("", 0))[1])
+print("late:", *late)
+"""
+_KINDS = {
+    "parallel": "views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, 0.5)",
+    "parallel, some views lean, all are shifted, weights": """
+loss, start, weighted = "poisson", "tv", True
+tilt = [0, 0, 0, 0.05, 0.05, 0]
+views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, 0.5, tilt=tilt, shifts=np.full((6, 2), 0.7))
+""",
+    "cone": "views = recon.Geometry.cone(np.linspace(0, 6, 12), shape, 0.2, 20.0, 40.0)",
+    "cone, a short scan, rolled, exact rays": """
+loss, rays = "l2", RayModel(exact_above=1e-4)
+views = recon.Geometry.cone(np.linspace(0, 3.6, 12), shape, 0.2, 20.0, 40.0, roll=0.02)
+""",
+}
 
 
-def test_a_fit_after_warm_up_compiles_nothing() -> None:
-    warm_up()
-    before = _compiled()
-    assert len(before) > 10
-    views = recon.Geometry.parallel(np.linspace(0, 3, 6), (10, 20), pixel_pitch=0.5)
-    data = np.exp(-(((np.arange(20) - 9) / 4.0) ** 2))[None, None] * np.ones((6, 10, 1))
-    recon.reconstruct(data, views, steps=150, gaussians=60)
-    assert _compiled() == before
+def _late(kind: str, warm: str) -> list[str]:
+    """Kernels that a fit still has to compile, or to load from the cache, after `warm_up(<warm>)`."""
+    code = _SCRIPT.replace("SETTING", _KINDS[kind]).replace("WARM", warm)
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.removeprefix("late:").split()
+
+
+@pytest.mark.parametrize("kind", _KINDS)
+def test_a_fit_after_warm_up_compiles_nothing(kind: str) -> None:
+    assert _late(kind, "'cpu', loss, views, rays=rays, start=start, weighted=weighted") == []
+
+
+def test_a_cones_fit_would_compile_after_a_warm_up_for_a_parallel_beam() -> None:
+    """That is, the count above sees what it should see."""
+    late = _late("cone, a short scan, rolled, exact rays", "'cpu', loss")
+    assert any("_forward.<locals>.kernel" in name for name in late) and "_bend" in late
+
+
+@pytest.mark.parametrize("turn", [2 * np.pi, 3.6])
+def test_a_toy_is_of_the_same_kind(turn: float) -> None:
+    angles = np.linspace(0, turn, 50, endpoint=False)
+    cone = Geometry.cone(angles, (100, 200), 0.1, 30.0, 90.0, 80.0, shifts=np.ones((50, 2)), tilt=np.full(50, 0.01))
+    data, toy = toy_of(cone)
+    assert toy.is_cone and covers_the_circle(toy.angles) == covers_the_circle(angles) == (turn > 6)
+    assert (toy.tilt != 0).all() and toy.shifts.any()
+    assert data.shape == (toy.n_views, *toy.detector_shape) and data.max() > 0.1
+    assert toy.sample_pitch * toy.detector_shape[1] == pytest.approx(cone.sample_pitch * 200)  # as wide a cone
+    _, plain = toy_of()
+    assert not plain.is_cone and plain.is_straight and not plain.shifts.any()
