@@ -248,7 +248,8 @@ def _fit(
         others = {"seed": options.seed, "start": options.start, "gaussians": gaussians or 0}
         origin = made_from(prepared, settings, others)
         resume = keeper.begin(origin, steps or 0, warn)
-    warm_up(options.device, options.loss)  # so that the fit's time, and the time it says is left, hold no compilation
+    # So that the fit's time, and the time it says is left, hold no compilation.
+    warm_up(options.device, options.loss, prepared.geometry, rays=settings.rays, start=options.start)
     data, geometry, held_out = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
     try:
         result = recon.reconstruct(
@@ -291,7 +292,7 @@ def spend(
     options: ReconOptions, budget: float, prepared: Prepared, sink: Sink, clock: Clock, stopped: Callable[[], bool]
 ) -> tuple[Made, Prepared, int]:
     """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
-    warm_up()  # compilation happens once on a machine; no budget pays for it
+    warm_up(geometry=prepared.geometry)  # compilation happens once on a machine; no budget pays for it
     try:
         listen = progress_events(sink, clock, budget)
         done = within(budget, prepared, options.seed, options.filter, clock.now, listen, stopped)

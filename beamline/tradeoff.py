@@ -169,9 +169,14 @@ def command(job: Path) -> Sequence[str]:
 
 
 def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
-    """Fill the cache of compiled kernels for these trials, so that no trial's memory is that of a compiler."""
-    kinds = {trial.method: trial for trial in trials if trial.group != "precision"}
-    _process({"compile": [asdict(trial) for trial in kinds.values()]}, work)  # what fails here, a trial will tell
+    """Fill the cache of compiled kernels for these trials, so that no trial's memory is that of a compiler.
+
+    Args:
+        work: a folder with data.npz.
+    """
+    kinds = {(trial.method, trial.start): trial for trial in trials if trial.group != "precision"}
+    job = {"data": str(work / "data.npz"), "compile": [asdict(trial) for trial in kinds.values()]}
+    _process(job, work)  # what fails here, a trial will tell
 
 
 def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = None) -> Outcome:

@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from recon.splat import Truncation
 from recon.twin import compare
 from recon.views import parse_views
 from recon.volume import Grid, Volume
+from recon.warm_up import toy_of
 from recon.warm_up import warm_up as compile_fit
 
 F32 = NDArray[np.float32]
@@ -76,6 +78,12 @@ class Data:
             return cls(file["projections"], geometry, held, file.get("truth"))
 
 
+def geometry_in(path: Path) -> Geometry:
+    """The geometry of what `Data.save` left, without its views."""
+    with np.load(path, allow_pickle=False) as file:
+        return _geometry("geometry", file)
+
+
 def _geometry_arrays(prefix: str, geometry: Geometry) -> dict[str, NDArray[Any]]:
     return {f"{prefix}.{f.name}": np.asarray(getattr(geometry, f.name)) for f in fields(Geometry)}
 
@@ -106,7 +114,7 @@ def run(
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles)
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)
-    warm_up(trial)
+    warm_up(trial, data.geometry)
     forget_peak()
     before = cpu()
     result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
@@ -164,27 +172,27 @@ def reconstruct(
         target = grid if trial.binning == 1 else Grid.matching(coarse)
         own: dict[str, Any] = {} if trial.iterations is None else {"iterations": trial.iterations}
         return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, on_progress=on_progress, **own)  # type: ignore[arg-type]
-    loss, _, ssim = trial.loss.partition("+")
-    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))  # type: ignore[arg-type]
-    if not ssim:
-        settings = replace(settings, ssim_weight=0.0)
     return recon.reconstruct(
-        binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=settings,
+        binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=_settings(trial),
         start=trial.start, held_out=unseen, on_progress=on_progress,
     )  # fmt: skip
 
 
-def warm_up(trial: Trial) -> None:
-    """Compile what a trial uses on a toy of the same kind, so that compilation is in no trial's time."""
-    toy = Geometry.parallel(np.linspace(0, np.pi, 8, endpoint=False), (12, 24))
-    u = np.arange(24) - toy.axis_col
-    views = np.broadcast_to(np.exp(-(u**2) / 18).astype(np.float32), (8, 12, 24)).copy()
+def _settings(trial: Trial) -> FitSettings:
+    loss, _, ssim = trial.loss.partition("+")
+    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))  # type: ignore[arg-type]
+    return settings if ssim else replace(settings, ssim_weight=0.0)
+
+
+def warm_up(trial: Trial, geometry: Geometry) -> None:
+    """Compile what a trial of these views uses on a toy of the same kind, so that compilation is in no trial's time."""
+    if trial.method == "r2":
+        compile_fit("cpu", _settings(trial).loss, geometry, start=trial.start)
+    views, toy = toy_of(geometry)
     short = replace(
         trial, binning=1, steps=None if trial.steps is None else 3, gaussians=None if trial.gaussians is None else 60,
         iterations=None if trial.iterations is None else 1,
     )  # fmt: skip
-    if trial.method == "r2":
-        compile_fit()
     reconstruct(short, views, toy, Grid.matching(toy), None, 0, None)
 
 
@@ -226,15 +234,20 @@ def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], 
 
 
 def main(job: Path) -> int:
-    """Run the job in the file `job`: {"data": .npz, "trial": {...}, "seed": n}, or {"compile": [{...}, ...]}."""
+    """Run the job in the file `job`.
+
+    That is {"data": .npz, "trial": {...}, "seed": n}, or {"data": .npz, "compile": [{...}, ...]}.
+    """
 
     def say(line: Mapping[str, Any]) -> None:
         print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
 
     said = json.loads(job.read_text(encoding="utf-8"))
     if "compile" in said:
+        geometry = geometry_in(Path(said["data"]))
         for trial in said["compile"]:
-            warm_up(Trial(**trial))
+            with suppress(ValueError):  # a method that does not take these views: its own trial will say so
+                warm_up(Trial(**trial), geometry)
         return 0
     trial = Trial(**said["trial"])
     try:

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline import checkpoints, deliver
+from beamline import checkpoints, deliver, offline
 from beamline.checkpoints import Keeper
 from beamline.deliver import Target
 from beamline.digest import digest
@@ -94,6 +94,25 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     for said in ("R²-Gaussian", "FBP", "beamline recon scan.h5", "12 of 45 views"):
         assert said in page
     assert page.count("data:image/png;base64,") == 4  # slices, quality, projection, sinogram; the axis was given
+
+
+@pytest.mark.parametrize("changes", [{"steps": 3, "start": "tv", "loss": "l2"}, {"budget": 1.0}])
+def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
+) -> None:
+    asked: list[dict[str, object]] = []
+
+    def compiled(device: str = "cpu", loss: str = "l1", geometry: object = None, **more: object) -> None:
+        asked.append({"device": device, "loss": loss, "geometry": geometry, **more})
+
+    monkeypatch.setattr(offline, "warm_up", compiled)
+    selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
+    run(_options(tmp_path, method="r2", selection=selection, **changes), lambda event: None, SystemClock())
+    assert len(asked) == 1
+    geometry = asked[0].pop("geometry")
+    assert isinstance(geometry, Geometry) and geometry.n_views == 20 and geometry.detector_shape == (2, 40)
+    assert asked[0].get("start", "fbp") == changes.get("start", "fbp")
+    assert asked[0]["loss"] == changes.get("loss", "l1")
 
 
 def test_every_setting_is_in_the_file(tmp_path: Path) -> None:

@@ -232,14 +232,17 @@ def test_what_becomes_of_a_process(
     assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
 
 
-def test_kernels_are_compiled_once_for_each_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_compiled_once_for_each_method_and_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
     out = tmp_path / "seen.json"
     monkeypatch.setattr(tradeoff, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
     tradeoff.compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
-    asked = json.loads(out.read_text())["compile"]
-    assert sorted(trial["method"] for trial in asked) == ["fbp", "r2", "sirt"]
+    job = json.loads(out.read_text())
+    assert sorted((trial["method"], trial["start"]) for trial in job["compile"]) == [
+        ("fbp", "fbp"), ("r2", "fbp"), ("r2", "tv"), ("sirt", "fbp")
+    ]  # fmt: skip
+    assert job["data"] == str(tmp_path / "data.npz")  # whose geometry decides which kernels are used
 
 
 def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from beamline import trial_process as module
 from beamline.trial_process import Data, main, on_grid, run
 from beamline.trials import Trial
 from recon.fbp import fbp
@@ -125,12 +126,35 @@ def test_a_volume_of_joined_pixels_lies_where_the_fine_one_does() -> None:
     np.testing.assert_allclose(moved.data[inner], ramp(grid)[inner], atol=1e-5)
 
 
-def test_a_job_may_be_to_compile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It needs no data and says nothing."""
-    trials = [Trial("method", "r2", 60, steps=500, gaussians=1000), Trial("method", "cgls", 60, iterations=10)]
-    (tmp_path / "job.json").write_text(json.dumps({"compile": [asdict(trial) for trial in trials]}))
+def _cone(data: Data, **leaning: float) -> Data:
+    """The same pixels as if they were a cone's."""
+    around = Geometry.cone(2 * data.geometry.angles, SCAN.shape, 1.0, 60.0, 120.0, SCAN.axis_col, **leaning)
+    return replace(data, geometry=around, held_out=None)
+
+
+@pytest.mark.parametrize("leaning", [{}, {"tilt": 0.1}])
+def test_a_job_may_be_to_compile(
+    tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    leaning: dict[str, float],
+) -> None:  # fmt: skip
+    """It compiles for the geometry of the data and says nothing, also of methods that do not take such views."""
+    _cone(data, **leaning).save(tmp_path / "data.npz")
+    trials = [Trial("method", "cgls", 60, iterations=10), Trial("method", "r2", 60, steps=500, gaussians=1000)]
+    job = {"data": str(tmp_path / "data.npz"), "compile": [asdict(trial) for trial in trials]}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    fitted: list[Geometry] = []
+    plain = module.reconstruct
+    monkeypatch.setattr(module, "reconstruct", lambda *said: fitted.append(said[2]) or plain(*said))
     assert main(tmp_path / "job.json") == 0
     assert capsys.readouterr().out == ""
+    assert len(fitted) == 2 and all(views.is_cone and views.is_straight != bool(leaning) for views in fitted)
+
+
+def test_trials_of_a_cone(data: Data) -> None:
+    cone = _cone(data)
+    views = cone.geometry.n_views
+    for trial in (Trial("method", "fbp", views), Trial("method", "r2", views, steps=5, gaussians=50)):
+        assert np.isfinite(run(trial, cone, 0, _silent)["metrics"]["psnr"])
 
 
 def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str]) -> None:
