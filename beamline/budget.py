@@ -14,9 +14,10 @@ from beamline.pipeline import Prepared
 from recon.binning import bin_views
 from recon.calibrate import calibrate
 from recon.fbp import Filter
+from recon.fdk import has_direct_method
 from recon.fit import Progress
 from recon.initialise import default_count, place
-from recon.quality import Choice, Speeds, choose, parts_of
+from recon.quality import CURVES, Choice, Speeds, choose, parts_of
 from recon.reconstruction import Reconstruction
 from recon.splat import voxelize
 from recon.volume import Grid
@@ -93,15 +94,18 @@ def within(
     begin = now()
     data, geometry = prepared.projections.data, prepared.geometry
     speeds = calibrate(data, geometry, Grid.matching(geometry), now)
-    unbinned = default_count(Grid.of_field(geometry, geometry.pixel_pitch))  # the curves count in these
+    unbinned = default_count(Grid.of_field(geometry, geometry.sample_pitch))  # the curves count in these
     choice = choose(budget - (now() - begin), speeds, min(geometry.detector_shape))
+    if choice.method == "fbp" and not has_direct_method(geometry):
+        # There is only the volume that Gaussians are placed by; the fewest of them, and a step, are the next best.
+        choice = replace(choice, method="r2", share=min(curve.share for curve in CURVES) / choice.binning**3)
     prepared = joined(prepared, choice.binning)
     data, geometry = prepared.projections.data, prepared.geometry
     grid = Grid.matching(geometry)
     if choice.method == "fbp":
         result = recon.reconstruct(data, geometry, grid, "fbp", filter=filter, now=now)
         return Budgeted(result, prepared, choice, speeds, now() - begin)
-    field = Grid.of_field(geometry, geometry.pixel_pitch)
+    field = Grid.of_field(geometry, geometry.sample_pitch)
     placed = place(data, geometry, field, max(1, round(choice.share * unbinned)), np.random.default_rng(seed))
     before = now()
     slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))

@@ -19,6 +19,7 @@ from beamline.storage.recon_file import ReconRecord, Value, refuse_existing, wri
 from drivers.clock import Clock
 from recon.align import AxisEstimate
 from recon.fbp import fbp
+from recon.fdk import fdk, has_direct_method
 from recon.volume import Volume
 
 
@@ -53,9 +54,10 @@ def deliver(
 
     metrics = {made.method: judged(made.volume, made.seconds)}
     volumes = {made.method: made.volume}
-    if made.method != "fbp" and target.report is not None:
+    if made.method != "fbp" and target.report is not None and has_direct_method(prepared.geometry):
         before = clock.now()
-        data = fbp(prepared.projections.data, prepared.geometry, filter=made.filter)
+        direct = fdk if prepared.geometry.is_cone else fbp
+        data = direct(prepared.projections.data, prepared.geometry, made.volume.grid, made.filter)
         volumes = {"fbp": Volume(data, made.volume.grid), **volumes}
         metrics = {"fbp": judged(volumes["fbp"], clock.now() - before), **metrics}
     own = metrics[made.method]

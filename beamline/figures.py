@@ -37,7 +37,7 @@ def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: 
 def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
     """One corrected view [row, col], with the axis where the reconstruction put it."""
     rows, cols = geometry.detector_shape
-    pitch = geometry.pixel_pitch
+    pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
     height = np.clip(0.82 * _WIDTH * rows / cols, 1.6, 6.0)
     thin = rows < _THIN * cols

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.binning import bin_views
-from recon.fbp import fbp
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.initialise import MATTER, default_count, density_unit, sample_gaussians
+from recon.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
 from recon.quality import Speeds
 from recon.reconstruction import reconstruct
 from recon.splat import voxelize
-from recon.volume import Grid, Volume
+from recon.volume import Grid
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]
@@ -28,32 +27,33 @@ _STEP_VIEWS, _STEPS = 4, 6
 def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
     """Measure each part of a reconstruction on a part of the scan.
 
-    FBP, placing and filling on a slab of rows; the step on whole views, with the number of Gaussians that a fit would
-    start from, spread over what a coarse FBP shows as matter: how much they overlap decides how long a step takes.
+    The first volume (FBP, or what stands in for it, see `first_volume`), placing and filling on a slab of rows; the
+    step on whole views, with the number of Gaussians that a fit would start from, spread over what a coarse first
+    volume shows as matter: how much they overlap decides how long a step takes.
 
     Args:
         projections: [view, row, col], line integrals.
-        geometry: of the views; a parallel beam.
+        geometry: of the views.
         grid: of the volume that is wanted.
         now: a clock in s.
 
     Raises:
         ValueError: the scan holds no matter.
     """
-    field = Grid.of_field(geometry, max(geometry.pixel_pitch, grid.voxel_size))
+    field = Grid.of_field(geometry, max(geometry.sample_pitch, grid.voxel_size))
     count = default_count(field)
     slab, part = _slab(projections, geometry)
     slices = Grid.matching(part)
     whole = field.shape[0] / slices.shape[0]
     views = geometry.n_views / part.n_views
-    fbp(slab, part, slices, "hann")  # threads wake up and pages come in
+    first_volume(slab, part, slices)  # threads wake up and pages come in
     begin = now()
-    data = fbp(slab, part, slices, "hann")
+    first = first_volume(slab, part, slices)
     fbp_seconds = (now() - begin) * whole * views
 
     begin = now()
     placed = sample_gaussians(
-        Volume(data, slices), max(1, round(count / whole)), np.random.default_rng(0), field_radius=_radius(geometry)
+        first, max(1, round(count / whole)), np.random.default_rng(0), field_radius=_radius(geometry)
     )
     start_seconds = (now() - begin) * whole
     voxelize(placed, slices)
@@ -71,7 +71,7 @@ def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
     """A few views of the rows with most in them."""
     rows = geometry.detector_shape[0]
     height = min(_SLAB_ROWS, rows)
-    views = _some(geometry.n_views, _SLAB_VIEWS)
+    views = _around(geometry, _SLAB_VIEWS)
     weight = projections[views].sum(axis=(0, 2), dtype=np.float64)
     sums = np.convolve(weight, np.ones(height), "valid")
     first = int(np.argmax(sums))
@@ -82,12 +82,12 @@ def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
 
 
 def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
-    """So many Gaussians where a coarse FBP shows matter, as wide as placing makes them."""
+    """So many Gaussians where a coarse first volume shows matter, as wide as placing makes them."""
     factor = max(1, min(-(-geometry.detector_shape[1] // _COARSE_COLS), geometry.detector_shape[0]))
-    views = _some(geometry.n_views, _COARSE_VIEWS)
+    views = _around(geometry, _COARSE_VIEWS)
     coarse = geometry.select(views).binned(factor)
     grid = Grid.matching(coarse)
-    volume = Volume(np.maximum(fbp(bin_views(projections[views], factor), coarse, grid, "hann"), 0), grid)
+    volume = first_volume(bin_views(projections[views], factor), coarse, grid)
     unit = density_unit(volume)
     cells = np.flatnonzero(volume.data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
     if cells.size == 0:
@@ -98,13 +98,13 @@ def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
     means = np.stack((x[i], y[j], z[k]), 1) + (rng.random((count, 3)) - 0.5) * grid.spacing[::-1]
     # Root mean square distance of a random point to its three nearest neighbours: 0.75 of a cell for one of them each.
     distance = 0.75 * (cells.size * float(np.prod(grid.spacing)) / count) ** (1 / 3)
-    width = max(0.8 * distance, 0.5 * geometry.pixel_pitch)
+    width = max(0.8 * distance, 0.5 * geometry.sample_pitch)
     return Gaussians.from_physical(means, np.full((count, 3), width), np.full(count, 0.5 * unit), density_unit=unit)
 
 
 def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians, now: Clock) -> tuple[float, float]:
     """(s a step, s for each view before the first one): what a short fit's own record says."""
-    views = _some(geometry.n_views, _STEP_VIEWS)
+    views = _around(geometry, _STEP_VIEWS)
     point = Grid((1, 1, 1), grid.voxel_size)  # filling a volume is measured elsewhere
     made = reconstruct(
         np.ascontiguousarray(projections[views]), geometry.select(views), point, steps=_STEPS, gaussians=gaussians,
@@ -115,10 +115,13 @@ def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians
     return step, max(0.0, first.seconds - step) / len(views)
 
 
-def _some(n: int, most: int) -> NDArray[np.int64]:
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
+def _around(geometry: Geometry, most: int) -> NDArray[np.int64]:
+    """Some views from all around, so that they need the same kind of first volume as all of them."""
+    n, turn = geometry.n_views, 2 * np.pi if geometry.is_cone else np.pi
+    order = np.argsort(np.mod(geometry.angles, turn), kind="stable")
+    return np.sort(order[np.arange(min(n, most)) * n // min(n, most)])
 
 
 def _radius(geometry: Geometry) -> float:
     cols, axis = geometry.detector_shape[1], geometry.axis_col
-    return max(axis + 0.5, cols - axis - 0.5) * geometry.pixel_pitch
+    return max(axis + 0.5, cols - axis - 0.5) * geometry.sample_pitch

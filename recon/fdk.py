@@ -28,6 +28,11 @@ def covers_the_circle(angles: ArrayLike) -> bool:
     return gaps.size > 1 and not _leave_an_arc(gaps)
 
 
+def has_direct_method(geometry: Geometry) -> bool:
+    """Whether FBP or FDK takes these views: they must be straight, and a cone's must stand all around."""
+    return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))
+
+
 def circle_weights(angles: ArrayLike) -> F64:
     """Quadrature weight of each view: its Voronoi cell on the full circle, in radians; they sum to 2π.
 

@@ -82,7 +82,7 @@ def _as(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
 def _fit(start: Gaussians, data: NDArray[np.float32], geometry: Geometry, dtype: torch.dtype, steps: int) -> Gaussians:
     """Adam over the views in turn; only the precision, and with it the kernel, differs between two calls."""
     g = _as(start, dtype)
-    half_field = max(geometry.detector_shape) * geometry.pixel_pitch / 2
+    half_field = max(geometry.detector_shape) * geometry.sample_pitch / 2
     scale = half_field * g.density_unit
     leaves = [p.requires_grad_() for p in (g.means, g.log_scales, g.quaternions, g.raw_densities)]
     rates = (_RATES[0] * half_field, *_RATES[1:])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import recon
 from beamline import budget as module
 from beamline.budget import Budgeted, joined, within
 from beamline.deliver import Target
@@ -17,6 +18,9 @@ from beamline.offline import ReconOptions, SourceOptions, run
 from beamline.pipeline import Prepared, Selection, prepare
 from beamline.storage.recon_file import read_reconstruction
 from drivers.clock import SystemClock
+from recon.geometry import Geometry
+from recon.metrics import psnr
+from recon.operators import Projector
 from recon.quality import Choice, Speeds
 from recon.volume import Grid
 from recon.warm_up import warm_up
@@ -68,6 +72,57 @@ def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypat
     assert (done.choice.method, done.choice.binning) == ("fbp", 2)
     assert done.result.volume.grid.shape == (3, 20, 20)
     assert "pixels joined 2 x 2" in done.said(5.0) and done.said(5.0).startswith("fbp")
+
+
+def _cone(prepared: Prepared, turn: float, magnification: float = 10.0, tilt: float = 0.0) -> Prepared:
+    """A cone's views of the same cylinders by the voxel projector, on pixels as large at the axis as before."""
+    pitch = prepared.geometry.pixel_pitch
+    angles = np.linspace(0, turn, 36, endpoint=False)
+    cone = Geometry.cone(
+        angles, SCAN.shape, magnification * pitch, 400.0, 400.0 * magnification, SCAN.axis_col, tilt=tilt
+    )
+    grid = Grid.matching(cone)
+    assert grid == Grid.matching(prepared.geometry)
+    data = Projector(cone.straightened(), grid).forward(SCAN.truth(grid))
+    return replace(
+        prepared, projections=replace(prepared.projections, data=data), geometry=cone, held_out=None, n_projections=36
+    )
+
+
+def test_a_cones_budget_counts_pixels_at_the_axis(prepared: Prepared) -> None:
+    """Magnified ten times, a pixel is ten voxels wide on the detector, and one at the axis."""
+    cone = _cone(prepared, 2 * np.pi)
+    done = _spend(cone, 8.0, Ticking(0.01))
+    grid = Grid.matching(cone.geometry)
+    assert done.choice.method == "r2" and done.result.volume.grid == grid
+    truth = SCAN.truth(grid)
+    direct = psnr(truth, recon.reconstruct(cone.projections.data, cone.geometry, grid, "fbp").volume.data)
+    assert psnr(truth, done.result.volume.data) > direct + 1
+    assert done.result.history[-1].residual < 0.05
+
+
+def test_a_cone_is_placed_as_its_parallel_likeness_is(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    counts = [_spend(views, 3.0, Ticking(0.01)).placed for views in (prepared, _cone(prepared, 2 * np.pi))]
+    assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) > 500
+
+
+def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    done = _spend(_cone(prepared, 2 * np.pi), 5.0, Ticking(0.01))
+    assert done.said(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
+
+
+@pytest.mark.parametrize(("turn", "tilt"), [(3.6, 0.0), (2 * np.pi, 0.02)])
+def test_views_without_a_direct_method_get_the_shortest_fit(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, turn: float, tilt: float
+) -> None:
+    """A cone's short scan, and views that lean, are for neither FBP nor FDK."""
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    done = _spend(_cone(prepared, turn, tilt=tilt), 5.0, Ticking(0.01))
+    assert done.choice.method == done.result.method == "r2" and done.choice.binning == 2
+    assert done.result.history[-1].step > 0 and 0 < done.placed < 100
+    assert done.result.volume.data.max() > 0
 
 
 def test_joined_views_keep_their_scale_and_place(prepared: Prepared) -> None:

@@ -27,6 +27,16 @@ def test_a_fit_in_float32_is_as_good_as_one_in_float64(rng: np.random.Generator)
     assert found["seconds_float32"] > 0 and found["seconds_float64"] > 0
 
 
+def test_where_a_cones_detector_stands_does_not_matter(rng: np.random.Generator) -> None:
+    """Ten times as far with ten times larger pixels it sees the same: rates are fractions of the field at the axis."""
+    turn = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+    near, far = (Geometry.cone(turn, (10, 60), 0.5 * m, 100.0, 100.0 * m, 31.0) for m in (1, 10))
+    blobs = _blobs(rng)
+    found = [compare(project(blobs, cone).numpy(), cone, seed=0, steps=25) for cone in (near, far)]
+    assert found[0]["residual_float64"] < 0.2
+    assert found[1]["residual_float64"] == pytest.approx(found[0]["residual_float64"], rel=1e-3)
+
+
 def test_the_crop_shows_the_middle_of_the_scan_in_larger_pixels(rng: np.random.Generator) -> None:
     """Rendering the same Gaussians in the crop's own geometry gives the joined pixels, up to their averaging."""
     gaussians = _blobs(rng)
