@@ -16,21 +16,21 @@ def in_double(gaussians: Gaussians) -> Gaussians:
     return Gaussians(*leaves, density_unit=gaussians.density_unit)
 
 
-def as_leaves(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians as float32 leaves that collect gradients."""
+def as_leaves(gaussians: Gaussians, device: torch.device | None = None) -> Gaussians:
+    """The same Gaussians as float32 leaves that collect gradients, on a device if one is given."""
     leaves = [
-        tensor.detach().clone().requires_grad_()
+        tensor.detach().to(device, copy=True).requires_grad_()
         for tensor in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.raw_densities)
     ]
     return Gaussians(*leaves, density_unit=gaussians.density_unit)
 
 
 def gradients(gaussians: Gaussians) -> dict[str, torch.Tensor]:
-    """Gradients by parameter name, in float64."""
+    """Gradients by parameter name, in float64 on the host."""
     named = {
         "means": gaussians.means,
         "log_scales": gaussians.log_scales,
         "quaternions": gaussians.quaternions,
         "raw_densities": gaussians.raw_densities,
     }
-    return {name: tensor.grad.double() for name, tensor in named.items() if tensor.grad is not None}
+    return {name: tensor.grad.double().cpu() for name, tensor in named.items() if tensor.grad is not None}

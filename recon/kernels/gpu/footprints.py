@@ -1,12 +1,8 @@
 """Gaussians to footprints on the detector and gradients back, parallel beam and affine cone (Triton).
 
-The formulas are those of `footprints_cpu`. With Ju, Jv the gradients of a Gaussian's column and row with respect to
-its position, and n the unit vector along its ray, the columns of R S give a = S RᵀJu, b = S RᵀJv, h = S⁻¹Rᵀn:
-
-    Σ₂ = [[a·a, a·b], [a·b, b·b]]        det Σ₂ = (s₁ s₂ s₃ |Ju x Jv| |h|)²        μ = sqrt(2π) / |h|
-
-For a parallel beam Ju, Jv, n are the view's axes; for a cone, with t the position from the source in view axes and f
-the distance of the detector in pixels, Ju = f/t_d (e_u - t_u/t_d e_d), Jv alike, n = t/|t| (Zwicker et al. 2001).
+The formulas, and the letters for what is in them, are those of `footprints_cpu`: products of a, b and h in place of
+determinants, a gradient on stretch and turn in the Gaussian's own axes, from moments in a footprint's own directions.
+A Gaussian with a number that is not finite is not seen.
 """
 
 from __future__ import annotations
@@ -48,21 +44,65 @@ def along_ray(  # type: ignore[no-untyped-def]
     means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr
 ):
     """Where a Gaussian lies in the view and how the view sees it: (across, up, per, a, b, depth, norm)."""
-    x, y, z = (
-        tl.load(means + 3 * i, live, 0.0),
-        tl.load(means + 3 * i + 1, live, 0.0),
-        tl.load(means + 3 * i + 2, live, 0.0),
-    )
+    x, y = tl.load(means + 3 * i, live, 0.0), tl.load(means + 3 * i + 1, live, 0.0)
+    z = tl.load(means + 3 * i + 2, live, 0.0)
     across, up = ux * x + uy * y + uz * z, vx * x + vy * y + vz * z
     if CONE:
-        depth = sod + dx * x + dy * y + dz * z
+        depth = sod + (dx * x + dy * y + dz * z)
         ahead = tl.where(depth > 0.0, depth, 1.0)  # what lies behind the source is left out by the caller
         a, b, per = across / ahead, up / ahead, focal / ahead
         norm = tl.sqrt(1.0 + a * a + b * b)
     else:
-        zero = across * 0.0
+        zero = tl.zeros_like(across)
         a, b, per, depth, norm = zero, zero, zero + focal, zero + 1.0, zero + 1.0
     return across, up, per, a, b, depth, norm
+
+
+@triton.jit
+def turned(x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8):  # type: ignore[no-untyped-def]
+    """Rᵀ times a vector."""
+    return x * r0 + y * r3 + z * r6, x * r1 + y * r4 + z * r7, x * r2 + y * r5 + z * r8
+
+
+@triton.jit
+def shape_of(scales, rotations, i, live):  # type: ignore[no-untyped-def]
+    """The three scales and nine numbers of the rotation; a ball of radius 1 without any turn where not `live`."""
+    s, r = scales + 3 * i, rotations + 9 * i
+    return (
+        tl.load(s, live, 1.0), tl.load(s + 1, live, 1.0), tl.load(s + 2, live, 1.0),
+        tl.load(r, live, 1.0), tl.load(r + 1, live, 0.0), tl.load(r + 2, live, 0.0),
+        tl.load(r + 3, live, 0.0), tl.load(r + 4, live, 1.0), tl.load(r + 5, live, 0.0),
+        tl.load(r + 6, live, 0.0), tl.load(r + 7, live, 0.0), tl.load(r + 8, live, 1.0),
+    )  # fmt: skip
+
+
+@triton.jit
+def add_to(at, value, live):  # type: ignore[no-untyped-def]
+    """*at += value, by the lanes that live."""
+    tl.store(at, tl.load(at, live, 0.0) + value, live)
+
+
+@triton.jit
+def add_shape(  # type: ignore[no-untyped-def]
+    i, live, s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations
+):
+    """Add what follows from T, the gradient on a deformation along the Gaussian's own axes, see `footprints_cpu`."""
+    add_to(d_log_scales + 3 * i, t00, live)
+    add_to(d_log_scales + 3 * i + 1, t11, live)
+    add_to(d_log_scales + 3 * i + 2, t22, live)
+    # Quotients of equal scales are equal to the bit: a ball feels no torque.
+    x, y = 0.5 * t01 * (s1 / s0 - s0 / s1), 0.5 * t02 * (s2 / s0 - s0 / s2)
+    z = 0.5 * t12 * (s2 / s1 - s1 / s2)
+    g = d_rotations + 9 * i
+    add_to(g, -(r1 * x + r2 * y), live)
+    add_to(g + 1, r0 * x - r2 * z, live)
+    add_to(g + 2, r0 * y + r1 * z, live)
+    add_to(g + 3, -(r4 * x + r5 * y), live)
+    add_to(g + 4, r3 * x - r5 * z, live)
+    add_to(g + 5, r3 * y + r4 * z, live)
+    add_to(g + 6, -(r7 * x + r8 * y), live)
+    add_to(g + 7, r6 * x - r8 * z, live)
+    add_to(g + 8, r6 * y + r7 * z, live)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -76,39 +116,39 @@ def _footprints(  # type: ignore[no-untyped-def]
     across, up, per, a, b, depth, norm = along_ray(
         means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE
     )  # fmt: skip
-    jux, juy, juz = per * (ux - a * dx), per * (uy - a * dy), per * (uz - a * dz)
-    jvx, jvy, jvz = per * (vx - b * dx), per * (vy - b * dy), per * (vz - b * dz)
-    nx, ny, nz = (a * ux + b * vx + dx) / norm, (a * uy + b * vy + dy) / norm, (a * uz + b * vz + dz) / norm
-    uu, uv, vv, hh, product = across * 0.0, across * 0.0, across * 0.0, across * 0.0, per * per * norm
-    along_u, along_v = across * 0.0, across * 0.0
+    zero = tl.zeros((BLOCK,), tl.float32)
+    uu, uv, vv, hh, along_u, along_v = zero, zero, zero, zero, zero, zero
     for k in tl.static_range(3):
         s = tl.load(scales + 3 * i + k)
         r0, r1 = tl.load(rotations + 9 * i + k), tl.load(rotations + 9 * i + 3 + k)
         r2 = tl.load(rotations + 9 * i + 6 + k)
-        p, q = s * (jux * r0 + juy * r1 + juz * r2), s * (jvx * r0 + jvy * r1 + jvz * r2)
-        h = (nx * r0 + ny * r1 + nz * r2) / s
-        uu, uv, vv, hh, product = uu + p * p, uv + p * q, vv + q * q, hh + h * h, product * s
+        pu, pv, pd = ux * r0 + uy * r1 + uz * r2, vx * r0 + vy * r1 + vz * r2, dx * r0 + dy * r1 + dz * r2
+        p, q, h = s * (pu - a * pd), s * (pv - b * pd), (a * pu + b * pv + pd) / s
+        uu, uv, vv, hh = uu + p * p, uv + p * q, vv + q * q, hh + h * h
         if CONE:
-            along_u += h / s * (ux * r0 + uy * r1 + uz * r2)
-            along_v += h / s * (vx * r0 + vy * r1 + vz * r2)
-    length = tl.sqrt(hh)
-    inverse = 1.0 / (product * length)  # 1 / sqrt(det Σ₂)
-    weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI / length)
+            along_u += h / s * pu
+            along_v += h / s * pv
+    within = 1.0 / tl.sqrt(hh)  # mm of the ray in one standard deviation
+    # g / sqrt(det Σ₂), by quotients one after the other: a product of three small scales would leave float32's range.
+    scale = within / per / tl.load(scales + 3 * i) / tl.load(scales + 3 * i + 1) / tl.load(scales + 3 * i + 2)
+    wide, high = tl.sqrt(uu), tl.sqrt(vv)
+    steep, level = high * scale, 1.0 / (high * per)
+    ka, kv = steep * steep, level * level
+    weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI * norm * within)
     u, v = col0 + per * across, row0 + per * up
-    ka, kv = vv * inverse * inverse, 1.0 / vv
     # Comparisons with a NaN are false: what is not finite is not seen.
     seen = live & (weight > faint) & (weight < _HUGE) & (ka < _HUGE) & (kv < _HUGE) & (depth > near)
-    reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, weight, 1.0) / faint), 0.0)))
-    hu, hv = reach * tl.sqrt(uu), reach * tl.sqrt(vv)
+    reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, weight, 1.0) / faint), 0.0))) * per
+    hu, hv = reach * wide, reach * high
     hit = seen & (u + hu >= 0.0) & (u - hu <= cols - 1.0) & (v + hv >= 0.0) & (v - hv <= rows - 1.0)
     if CONE:
         # ε² of `footprints_cpu`: with α and β in px of the rotation axis' scale, Σ₂ / f² and η.
-        au, av, bu, bv = along_u / (hh * norm), along_v / (hh * norm), a / (norm * norm), b / (norm * norm)
-        eta = 1.0 / (depth * depth * norm * norm * hh)
+        au, av, bu, bv = along_u / hh, along_v / hh, a / (norm * norm), b / (norm * norm)
+        eta = 1.0 / (depth * depth * hh)
         error = uu * (0.5 * bu * bu + au * bu + 1.5 * au * au)
         error += uv * (bu * bv + au * bv + av * bu + 3.0 * au * av)
         error += vv * (0.5 * bv * bv + av * bv + 1.5 * av * av)
-        inexact = seen & (error / (focal * focal) + 6.0 * eta * eta > worst)
+        inexact = seen & (error / (depth * depth) + 6.0 * eta * eta > worst)
         hu, hv = tl.where(inexact, _INEXACT, hu), tl.where(inexact, _INEXACT, hv)
         hit = hit & (hu >= 0.0)
     f = table + 8 * i
@@ -140,83 +180,59 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
     live = i < n
     f, m = table + 8 * i, moments + 6 * i
     seen = live & (tl.load(f + HU, live, -1.0) >= 0.0)
-    across, _, per, a, b, depth, norm = along_ray(
-        means, i, seen, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE
-    )  # fmt: skip
-    m0, me, mv = tl.load(m, seen, 0.0), tl.load(m + 1, seen, 0.0), tl.load(m + 2, seen, 0.0)
-    mee, mev, mvv = tl.load(m + 3, seen, 0.0), tl.load(m + 4, seen, 0.0), tl.load(m + 5, seen, 0.0)
-    ka, shear = tl.load(f + K, seen, 0.0), tl.load(f + SHEAR, seen, 0.0)
+    _, _, g, ax, ay, depth, norm = along_ray(means, i, seen, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE)
+    m0, mt, mv = tl.load(m, seen, 0.0), tl.load(m + 1, seen, 0.0), tl.load(m + 2, seen, 0.0)
+    mtt, mtv, mvv = tl.load(m + 3, seen, 0.0), tl.load(m + 4, seen, 0.0), tl.load(m + 5, seen, 0.0)
+    k, shear = tl.load(f + K, seen, 0.0), tl.load(f + SHEAR, seen, 0.0)
     kv, w = tl.load(f + KV, seen, 0.0), tl.load(f + W, seen, 0.0)
-    # K δ and K M₂ K in the factored form: with e = δu - r δv and κ = 1 / Σvv, Kδ = (k e, κ δv - r k e).
-    gu = w * ka * me
+    gu = w * k * mt
     gv = w * kv * mv - shear * gu
     tl.store(d_centres + 2 * i, gu, live)
     tl.store(d_centres + 2 * i + 1, gv, live)
-    guu, mixed = 0.5 * w * ka * ka * mee, 0.5 * w * ka * kv * mev
-    guv, gvv = mixed - shear * guu, 0.5 * w * kv * kv * mvv - shear * (2.0 * mixed - shear * guu)
-
-    jux, juy, juz = per * (ux - a * dx), per * (uy - a * dy), per * (uz - a * dz)
-    jvx, jvy, jvz = per * (vx - b * dx), per * (vy - b * dy), per * (vz - b * dz)
-    nx, ny, nz = (a * ux + b * vx + dx) / norm, (a * uy + b * vy + dy) / norm, (a * uz + b * vz + dz) / norm
-    hh = across * 0.0
-    for k in tl.static_range(3):
-        s = tl.load(scales + 3 * i + k, seen, 1.0)
-        r0, r1 = tl.load(rotations + 9 * i + k, seen, 0.0), tl.load(rotations + 9 * i + 3 + k, seen, 0.0)
-        r2 = tl.load(rotations + 9 * i + 6 + k, seen, 0.0)
-        h = (nx * r0 + ny * r1 + nz * r2) / s
-        hh += h * h
-    hh = tl.where(seen, hh, 1.0)
-    dense = tl.load(d_densities + i, live, 0.0) + m0 * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI / tl.sqrt(hh))
-    tl.store(d_densities + i, dense, live)
-    pull = tl.where(fixed > 0.0, 0.0, -w * m0 / hh)  # ∂L/∂h = -W M₀ h / |h|²
-    # Gradients on Ju, Jv and n; a parallel beam's do not depend on where a Gaussian is.
-    gux, guy, guz = across * 0.0, across * 0.0, across * 0.0
-    gvx, gvy, gvz = across * 0.0, across * 0.0, across * 0.0
-    gnx, gny, gnz = across * 0.0, across * 0.0, across * 0.0
-    for k in tl.static_range(3):
-        s = tl.load(scales + 3 * i + k, seen, 1.0)
-        r0, r1 = tl.load(rotations + 9 * i + k, seen, 0.0), tl.load(rotations + 9 * i + 3 + k, seen, 0.0)
-        r2 = tl.load(rotations + 9 * i + 6 + k, seen, 0.0)
-        p, q = s * (jux * r0 + juy * r1 + juz * r2), s * (jvx * r0 + jvy * r1 + jvz * r2)
-        h = (nx * r0 + ny * r1 + nz * r2) / s
-        gp, gq, gh = 2.0 * (guu * p + guv * q), 2.0 * (guv * p + gvv * q), pull * h
-        at = d_log_scales + 3 * i + k
-        tl.store(at, tl.load(at, seen, 0.0) + gp * p + gq * q - gh * h, seen)
-        gp, gq, gh = gp * s, gq * s, gh / s
-        at = d_rotations + 9 * i + k
-        tl.store(at, tl.load(at, seen, 0.0) + gp * jux + gq * jvx + gh * nx, seen)
-        tl.store(at + 3, tl.load(at + 3, seen, 0.0) + gp * juy + gq * jvy + gh * ny, seen)
-        tl.store(at + 6, tl.load(at + 6, seen, 0.0) + gp * juz + gq * jvz + gh * nz, seen)
-        if CONE:
-            gux, guy, guz = gux + gp * r0, guy + gp * r1, guz + gp * r2
-            gvx, gvy, gvz = gvx + gq * r0, gvy + gq * r1, gvz + gq * r2
-            gnx, gny, gnz = gnx + gh * r0, gny + gh * r1, gnz + gh * r2
-    gx, gy, gz = gu * jux + gv * jvx, gu * juy + gv * jvy, gu * juz + gv * jvz
+    s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8 = shape_of(scales, rotations, i, seen)
+    pu0, pu1, pu2 = turned(ux, uy, uz, r0, r1, r2, r3, r4, r5, r6, r7, r8)
+    pv0, pv1, pv2 = turned(vx, vy, vz, r0, r1, r2, r3, r4, r5, r6, r7, r8)
+    pd0, pd1, pd2 = turned(dx, dy, dz, r0, r1, r2, r3, r4, r5, r6, r7, r8)
+    b0, b1, b2 = s0 * (pv0 - ay * pd0), s1 * (pv1 - ay * pd1), s2 * (pv2 - ay * pd2)
+    h0, h1, h2 = (
+        (ax * pu0 + ay * pv0 + pd0) / s0,
+        (ax * pu1 + ay * pv1 + pd1) / s1,
+        (ax * pu2 + ay * pv2 + pd2) / s2,
+    )
+    hh = h0 * h0 + h1 * h1 + h2 * h2
+    # A = (b x h) / (g s₁ s₂ s₃ h·h), the other way round since the views' axes are left-handed; B = b / Σvv in px.
+    size, level = 1.0 / (g * s0 * s1) / (s2 * hh), kv * g
+    a0, a1, a2 = size * (b2 * h1 - b1 * h2), size * (b0 * h2 - b2 * h0), size * (b1 * h0 - b0 * h1)
+    b0, b1, b2 = level * b0, level * b1, level * b2
+    add_to(d_densities + i, m0 * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI * norm / tl.sqrt(hh)), seen)
+    pull = tl.where(fixed > 0.0, 0.0, m0 / hh)
+    # T / W = (τ A + δv B)(τ A + δv B)ᵀ + M₀ hhᵀ / h·h, as A cᵀ + B eᵀ + ...
+    c0, c1, c2 = mtt * a0 + mtv * b0, mtt * a1 + mtv * b1, mtt * a2 + mtv * b2
+    e0, e1, e2 = mtv * a0 + mvv * b0, mtv * a1 + mvv * b1, mtv * a2 + mvv * b2
+    add_shape(
+        i, seen, s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8,
+        w * (a0 * c0 + b0 * e0 + pull * h0 * h0), w * (a0 * c1 + b0 * e1 + pull * h0 * h1),
+        w * (a0 * c2 + b0 * e2 + pull * h0 * h2), w * (a1 * c1 + b1 * e1 + pull * h1 * h1),
+        w * (a1 * c2 + b1 * e2 + pull * h1 * h2), w * (a2 * c2 + b2 * e2 + pull * h2 * h2),
+        d_log_scales, d_rotations,
+    )  # fmt: skip
     if CONE:
+        # ∂a = g W k Σ g G τ y and ∂b alike; a and b lose ax and ay times SRᵀd, h gains them times S⁻¹Rᵀ(u, v).
+        far_t = c0 * s0 * pd0 + c1 * s1 * pd1 + c2 * s2 * pd2
+        far_v = e0 * s0 * pd0 + e1 * s1 * pd1 + e2 * s2 * pd2
+        gax, gay = -g * k * far_t, -g * (kv * far_v - k * shear * far_t)
+        # μ grows with |ray|, and falls as h grows.
+        rays = tl.where(fixed > 0.0, 0.0, m0 / (norm * norm))
+        gax += rays * ax - pull * (h0 * pu0 / s0 + h1 * pu1 / s1 + h2 * pu2 / s2)
+        gay += rays * ay - pull * (h0 * pv0 / s0 + h1 * pv1 / s1 + h2 * pv2 / s2)
         ahead = tl.where(seen, depth, 1.0)
-        # Ju = per (e_u - a e_d) with per ~ 1 / depth and a = across / depth; Jv alike; n = t / |t|, |t| = depth norm.
-        inverse = per / ahead
-        along_u, along_v = gux * dx + guy * dy + guz * dz, gvx * dx + gvy * dy + gvz * dz
-        eu = -inverse * along_u
-        ev2 = -inverse * along_v
-        ed = -inverse * (gux * ux + guy * uy + guz * uz + gvx * vx + gvy * vy + gvz * vz)
-        ed += 2.0 * inverse * (a * along_u + b * along_v)
-        gx, gy, gz = (
-            gx + eu * ux + ev2 * vx + ed * dx,
-            gy + eu * uy + ev2 * vy + ed * dy,
-            gz + eu * uz + ev2 * vz + ed * dz,
-        )
-        on = gnx * nx + gny * ny + gnz * nz
-        per_length = 1.0 / (ahead * norm)
-        gx, gy, gz = (
-            gx + per_length * (gnx - on * nx),
-            gy + per_length * (gny - on * ny),
-            gz + per_length * (gnz - on * nz),
-        )
-    at = d_means + 3 * i
-    tl.store(at, tl.load(at, seen, 0.0) + gx, seen)
-    tl.store(at + 1, tl.load(at + 1, seen, 0.0) + gy, seen)
-    tl.store(at + 2, tl.load(at + 2, seen, 0.0) + gz, seen)
+        tu, tv = (focal * gu + w * gax) / ahead, (focal * gv + w * gay) / ahead
+        td = -(tu * ax + tv * ay + w * (k * mtt + kv * mvv) / ahead)
+    else:
+        tu, tv, td = focal * gu, focal * gv, tl.zeros_like(gu)
+    add_to(d_means + 3 * i, ux * tu + vx * tv + dx * td, seen)
+    add_to(d_means + 3 * i + 1, uy * tu + vy * tv + dy * td, seen)
+    add_to(d_means + 3 * i + 2, uz * tu + vz * tv + dz * td, seen)
 
 
 def beam_of(geometry: Geometry, view: int) -> tuple[list[float], float, float]:

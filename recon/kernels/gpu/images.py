@@ -1,9 +1,9 @@
 """Footprints to an image and an image's gradient to six moments a footprint (Triton).
 
-    pixel = Σ_i W_i G_i,   G = exp(-1/2 (k e² + δv² / Σvv)),   e = δu - r δv
-    moments of the gradient g:  Σ g G (1, e, δv, e², e δv, δv²)
+    pixel = Σ_i W_i G_i,   G = exp(-1/2 (k τ² + δv² / Σvv)),   τ = δu - r δv
+    moments of the gradient g:  Σ g G (1, τ, δv, τ², τ δv, δv²)
 
-The moments are taken in the sheared offset e, in which the quadratic form is diagonal: those of a long thin footprint
+The moments are taken in the sheared offset τ, in which the quadratic form is diagonal: those of a long thin footprint
 keep their digits. A footprint ends at its box, whatever the tiles.
 """
 
@@ -20,35 +20,40 @@ from recon.kernels.gpu.tiles import tile_lists
 
 _EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, larger tiles would evaluate more beside them
 _GROUP = 8  # Gaussians that a tile takes up at once
+_MANY = 64  # footprints in one sum: numbers added one by one to a large sum lose a part that grows with their number
 _BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
 _HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))  # exp(-q / 2) = 2^(q * this)
 
 
 @triton.jit
 def _render(  # type: ignore[no-untyped-def]
-    table, owners, starts, layers, rows, cols, tile_cols, shares, EDGE: tl.constexpr, GROUP: tl.constexpr
-):
+    table, owners, starts, layers, rows, cols, tile_cols, shares,
+    EDGE: tl.constexpr, GROUP: tl.constexpr, MANY: tl.constexpr,
+):  # fmt: skip
     tile, share = tl.program_id(0), tl.program_id(1)
     lane = tl.arange(0, EDGE * EDGE)
     row, col = (tile // tile_cols) * EDGE + lane // EDGE, (tile % tile_cols) * EDGE + lane % EDGE
     first, last = tl.load(starts + tile), tl.load(starts + tile + 1)
     member = tl.arange(0, GROUP)
-    # Each member of a group sums by itself, so that the loop holds no reduction.
-    sums = tl.zeros((GROUP, EDGE * EDGE), tl.float32)
-    for start in range(first + share * GROUP, last, shares * GROUP):
-        held = start + member < last
-        f = table + 8 * tl.load(owners + start + member, held, 0)
-        u, v = tl.load(f + U, held, 0.0), tl.load(f + V, held, 0.0)
-        k, kv = tl.load(f + K, held, 0.0) * _HALF_LOG2_E, tl.load(f + KV, held, 0.0) * _HALF_LOG2_E
-        shear, w = tl.load(f + SHEAR, held, 0.0), tl.load(f + W, held, 0.0)
-        hu, hv = tl.load(f + HU, held, -1.0), tl.load(f + HV, held, -1.0)
-        du, dv = col[None, :] - u[:, None], row[None, :] - v[:, None]
-        inside = (tl.abs(du) <= hu[:, None]) & (tl.abs(dv) <= hv[:, None])
-        e = du - shear[:, None] * dv
-        value = w[:, None] * tl.exp2(k[:, None] * e * e + kv[:, None] * dv * dv)
-        sums += tl.where(inside, value, 0.0)
+    sums = tl.zeros((EDGE * EDGE,), tl.float32)
+    for outer in range(first + share * GROUP, last, shares * GROUP * MANY):
+        # Each member of a group sums by itself, so that the inner loop holds no reduction.
+        part = tl.zeros((GROUP, EDGE * EDGE), tl.float32)
+        for start in range(outer, tl.minimum(last, outer + shares * GROUP * MANY), shares * GROUP):
+            held = start + member < last
+            f = table + 8 * tl.load(owners + start + member, held, 0)
+            u, v = tl.load(f + U, held, 0.0), tl.load(f + V, held, 0.0)
+            k, kv = tl.load(f + K, held, 0.0) * _HALF_LOG2_E, tl.load(f + KV, held, 0.0) * _HALF_LOG2_E
+            shear, w = tl.load(f + SHEAR, held, 0.0), tl.load(f + W, held, 0.0)
+            hu, hv = tl.load(f + HU, held, -1.0), tl.load(f + HV, held, -1.0)
+            du, dv = col[None, :] - u[:, None], row[None, :] - v[:, None]
+            inside = (tl.abs(du) <= hu[:, None]) & (tl.abs(dv) <= hv[:, None])
+            t = du - shear[:, None] * dv
+            value = w[:, None] * tl.exp2(k[:, None] * t * t + kv[:, None] * dv * dv)
+            part += tl.where(inside, value, 0.0)
+        sums += tl.sum(part, axis=0)
     pixel = (share.to(tl.int64) * rows + row) * cols + col
-    tl.store(layers + pixel, tl.sum(sums, axis=0), (row < rows) & (col < cols))
+    tl.store(layers + pixel, sums, (row < rows) & (col < cols))
 
 
 def render(found: Footprints, shape: tuple[int, int]) -> Tensor:
@@ -57,7 +62,7 @@ def render(found: Footprints, shape: tuple[int, int]) -> Tensor:
     layers = found.table.new_empty((lists.shares, *shape))
     _render[(lists.n_tiles, lists.shares)](
         found.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.shares,
-        EDGE=_EDGE, GROUP=_GROUP, num_warps=2,
+        EDGE=_EDGE, GROUP=_GROUP, MANY=_MANY, num_warps=2,
     )  # fmt: skip
     return layers.sum(0)
 
@@ -72,12 +77,8 @@ def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl
     row_low, row_high, col_low, col_high = tl.load(box), tl.load(box + 1), tl.load(box + 2), tl.load(box + 3)
     lane = tl.arange(0, HIGH * WIDE)
     down, over = lane // WIDE, lane % WIDE
-    m0, me, mv = (
-        tl.zeros_like(lane).to(tl.float32),
-        tl.zeros_like(lane).to(tl.float32),
-        tl.zeros_like(lane).to(tl.float32),
-    )
-    mee, mev, mvv = m0, m0, m0
+    m0 = tl.zeros((HIGH * WIDE,), tl.float32)
+    mt, mv, mtt, mtv, mvv = m0, m0, m0, m0, m0
     for row_start in range(row_low, row_high, HIGH):
         row = row_start + down
         dv = row - v
@@ -85,22 +86,22 @@ def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl
             col = col_start + over
             du = col - u
             inside = (row < row_high) & (col < col_high) & (tl.abs(du) <= hu) & (tl.abs(dv) <= hv)
-            e = du - shear * dv
-            g = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * tl.exp2(k * e * e + kv * dv * dv)
-            ge, gv = g * e, g * dv
-            m0, me, mv = m0 + g, me + ge, mv + gv
-            mee, mev, mvv = mee + ge * e, mev + ge * dv, mvv + gv * dv
+            t = du - shear * dv
+            g = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * tl.exp2(k * t * t + kv * dv * dv)
+            gt, gv = g * t, g * dv
+            m0, mt, mv = m0 + g, mt + gt, mv + gv
+            mtt, mtv, mvv = mtt + gt * t, mtv + gt * dv, mvv + gv * dv
     m = moments + 6 * i
     tl.store(m, tl.sum(m0))
-    tl.store(m + 1, tl.sum(me))
+    tl.store(m + 1, tl.sum(mt))
     tl.store(m + 2, tl.sum(mv))
-    tl.store(m + 3, tl.sum(mee))
-    tl.store(m + 4, tl.sum(mev))
+    tl.store(m + 3, tl.sum(mtt))
+    tl.store(m + 4, tl.sum(mtv))
     tl.store(m + 5, tl.sum(mvv))
 
 
 def moments(found: Footprints, gradient: Tensor) -> Tensor:
-    """Moments [n, 6] (1, e, v, ee, ev, vv) of an image gradient [row, col] under each footprint."""
+    """Moments [n, 6] (1, τ, v, ττ, τv, vv) of an image gradient [row, col] under each footprint."""
     n = found.table.shape[0]
     result = found.table.new_empty((n, 6))
     if n > 0:

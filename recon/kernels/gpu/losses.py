@@ -12,6 +12,7 @@ from recon.kernels.losses_cpu import ABSOLUTE, L1, L2, RADIUS, DataTerm, gaussia
 _BLOCK = 256
 _R = tl.constexpr(RADIUS)
 _L1, _L2 = tl.constexpr(L1), tl.constexpr(L2)
+_LARGEST = tl.constexpr(1.0e38)
 
 
 @triton.jit
@@ -72,16 +73,18 @@ def _ssim_terms(  # type: ignore[no-untyped-def]
         mxx += weight * tl.load(at + pixels, ok, 0.0)
         mxy += weight * tl.load(at + 2 * pixels, ok, 0.0)
     my, myy = tl.load(target_maps + i, live, 0.0), tl.load(target_maps + pixels + i, live, 0.0)
-    vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
-    top1, top2 = 2.0 * mx * my + c1, 2.0 * vxy + c2
+    # Differences of squares: what rounding makes of them must neither be negative nor break Cauchy-Schwarz.
+    vx = tl.minimum(tl.maximum(mxx - mx * mx, 0.0), _LARGEST)
+    vy, vxy = tl.minimum(tl.maximum(myy - my * my, 0.0), _LARGEST), mxy - mx * my
     low1, low2 = 1.0 / (mx * mx + my * my + c1), 1.0 / (vx + vy + c2)
-    low, weight = low1 * low2, 1.0
+    structure = 2.0 * tl.minimum(tl.maximum(vxy * low2, -0.5), 0.5) + c2 * low2
+    luminance, heavy, weight = (2.0 * mx * my + c1) * low1, low2, 1.0
     if WEIGHTED:
         weight = tl.load(weights + i, live, 0.0)
-        low = low * weight
-    value = top1 * top2 * low
-    d_vx, d_vxy = -value * low2, 2.0 * top1 * low
-    d_mx = 2.0 * my * top2 * low - 2.0 * mx * value * low1
+        structure, heavy = structure * weight, low2 * weight
+    value = luminance * structure
+    d_vx, d_vxy = -value * low2, 2.0 * luminance * heavy
+    d_mx = 2.0 * low1 * (my * structure - mx * value)
     tl.store(partials + i, d_mx - 2.0 * mx * d_vx - my * d_vxy, live)
     tl.store(partials + pixels + i, d_vx, live)
     tl.store(partials + 2 * pixels + i, d_vxy, live)
@@ -118,7 +121,9 @@ def _combine(  # type: ignore[no-untyped-def]
     slope = px + 2.0 * x * pxx + y * pxy
     if WEIGHTED:
         weight = tl.load(weights + i, live, 0.0)
-        pull, cost, slope = pull * weight, cost * weight, tl.where(weight > 0.0, slope, 0.0)
+        seen = weight > 0.0  # what stands in a pixel of no weight may be infinite when squared
+        pull, cost = tl.where(seen, pull * weight, 0.0), tl.where(seen, cost * weight, 0.0)
+        slope = tl.where(seen, slope, 0.0)
     tl.store(gradient + i, share * pull - ssim * slope, live)
     tl.store(sums + block, tl.sum(cost))
 

@@ -14,6 +14,24 @@ from recon.kernels.adam_cpu import BETA1, BETA2
 _BLOCK = 128
 _WIDEST = torch.finfo(torch.float32).max
 _SHORTEST = tl.constexpr(1e-12)  # a quaternion shorter than this acts as the identity
+_FARTHEST = tl.constexpr(87.0)  # e^x of more is no float32 number, of less than its negative no normal one
+
+
+@triton.jit
+def _softplus(r):  # type: ignore[no-untyped-def]
+    """log(1 + e^r), without overflow on one side or lost digits on the other, see `activation`."""
+    t = tl.exp(-tl.minimum(tl.abs(r), _FARTHEST))
+    z = t / (t + 2.0)
+    w = z * z
+    series = w * (w * (w * (w * (w * (1.0 / 13.0) + 1.0 / 11.0) + 1.0 / 9.0) + 1.0 / 7.0) + 1.0 / 5.0) + 1.0 / 3.0
+    return tl.maximum(r, 0.0) + 2.0 * z * (w * series + 1.0)
+
+
+@triton.jit
+def _sigmoid(r):  # type: ignore[no-untyped-def]
+    """Its slope, with all its digits far down too."""
+    t = tl.exp(-tl.minimum(tl.abs(r), _FARTHEST))
+    return tl.where(r >= 0.0, 1.0, t) / (1.0 + t)
 
 
 @triton.jit
@@ -38,13 +56,9 @@ def _activate(log_scales, quaternions, raw, scales, rotations, densities, unit, 
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     for k in tl.static_range(3):
-        tl.store(scales + 3 * i + k, tl.exp(tl.load(log_scales + 3 * i + k, live, 0.0)), live)
-    r = tl.load(raw + i, live, 0.0)
-    # log(1 + e) with all digits of a small e: the rounding of 1 + e is divided out again.
-    e = tl.exp(-tl.abs(r))
-    more = 1.0 + e
-    log1p = tl.where(more > 1.0, tl.log(more) * (e / tl.where(more > 1.0, more - 1.0, 1.0)), e)
-    tl.store(densities + i, unit * (tl.maximum(r, 0.0) + log1p), live)
+        log_scale = tl.minimum(tl.maximum(tl.load(log_scales + 3 * i + k, live, 0.0), -_FARTHEST), _FARTHEST)
+        tl.store(scales + 3 * i + k, tl.exp(log_scale), live)
+    tl.store(densities + i, unit * _softplus(tl.load(raw + i, live, 0.0)), live)
     w, x, y, z, _, _ = _unit_quaternion(quaternions, i, live)
     tl.store(rotations + 9 * i, 1.0 - 2.0 * (y * y + z * z), live)
     tl.store(rotations + 9 * i + 1, 2.0 * (x * y - w * z), live)
@@ -58,7 +72,7 @@ def _activate(log_scales, quaternions, raw, scales, rotations, densities, unit, 
 
 
 def activate(log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Scales [n, 3], rotations [n, 9] (row-major) and densities [n]."""
+    """Scales [n, 3], rotations [n, 9] (row-major) and densities [n]; logarithms are taken in +-87."""
     n = raw.shape[0]
     scales, rotations, densities = torch.empty_like(log_scales), raw.new_empty((n, 9)), torch.empty_like(raw)
     grid = (triton.cdiv(n, _BLOCK),)
@@ -73,10 +87,8 @@ def _activation_backward(  # type: ignore[no-untyped-def]
 ):
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
-    r = tl.load(raw + i, live, 0.0)
-    e = tl.exp(-tl.abs(r))
-    slope = tl.where(r >= 0.0, 1.0, e) / (1.0 + e)
-    tl.store(d_raw + i, tl.load(d_densities + i, live, 0.0) * unit * slope, live)
+    slope = unit * _sigmoid(tl.load(raw + i, live, 0.0))
+    tl.store(d_raw + i, tl.load(d_densities + i, live, 0.0) * slope, live)
     w, x, y, z, norm, turned = _unit_quaternion(quaternions, i, live)
     g = d_rotations + 9 * i
     g0, g1, g2 = tl.load(g, live, 0.0), tl.load(g + 1, live, 0.0), tl.load(g + 2, live, 0.0)

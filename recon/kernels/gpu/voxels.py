@@ -2,11 +2,11 @@
 
 With P = Σ⁻¹ and Σ_yz the covariance's block in y and z the exponent is a sum of three squares,
 
-    δᵀPδ = Pxx (δx + Pxy/Pxx δy + Pxz/Pxx δz)² + k (δy - r δz)² + δz² / Σzz
-    k = Σzz / det Σ_yz,   r = Σyz / Σzz,   det Σ_yz = Pxx (s₁ s₂ s₃)²
+    δᵀPδ = Pxx τ² + l δ'² + δz² / Σzz,   τ = δx + Pxy/Pxx δy + Pxz/Pxx δz,   δ' = δy - r δz
+    l = Σzz / det Σ_yz,   r = Σyz / Σzz,   det Σ_yz = Pxx (s₁ s₂ s₃)²
 
-all from inner products, so that it cannot cancel. Backward, with N = Σ g G (1, δ, δδᵀ) and H = S⁻¹Rᵀ:
-∂ρ = N₀,  ∂p = ρ HᵀH N₁,  ∂H = -ρ H N₂.
+all from inner products, so that it cannot cancel. Backward as in `voxelize_cpu`, from the moments of (τ, δ', δz): in
+moments of δ itself the thin sides of a needle would be small differences of large sums.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from recon.kernels.gpu.footprints import add_shape, add_to, shape_of
 from recon.kernels.gpu.tiles import tile_lists
 from recon.volume import Grid
 
@@ -27,7 +28,7 @@ _EDGE = 8  # voxels a brick edge
 _GROUP = 4  # Gaussians that a brick takes up at once
 _DEEP, _HIGH, _WIDE = 2, 8, 8  # voxels of a Gaussian at once
 _HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))
-_HUGE = tl.constexpr(3.0e38)
+_HUGE, _LEAST = tl.constexpr(3.0e38), tl.constexpr(1.0e-30)
 # Columns of the table: centre and half widths in voxels, the three squares' factors, the density.
 X, Y, Z, KX, SXY, SXZ, KY, SYZ, KZ, HX, HY, HZ, RHO = (tl.constexpr(column) for column in range(13))
 _WIDTH = tl.constexpr(16)
@@ -51,7 +52,7 @@ def _placed(  # type: ignore[no-untyped-def]
     live = i < n
     i = tl.minimum(i, n - 1)  # lanes past the end compute the last one again and store nothing
     zero = tl.zeros((BLOCK,), tl.float32)
-    xx, yy, zz, yz, pxx, pxy, pxz, product = zero, zero, zero, zero, zero, zero, zero, zero + 1.0
+    xx, yy, zz, yz, pxx, pxy, pxz = zero, zero, zero, zero, zero, zero, zero
     for k in tl.static_range(3):
         s = tl.load(scales + 3 * i + k)
         r0, r1 = tl.load(rotations + 9 * i + k), tl.load(rotations + 9 * i + 3 + k)
@@ -60,11 +61,11 @@ def _placed(  # type: ignore[no-untyped-def]
         xx, yy, zz, yz = xx + a * a, yy + b * b, zz + c * c, yz + b * c
         h0, h1, h2 = r0 / (s * per_x), r1 / (s * per_x), r2 / (s * per_z)
         pxx, pxy, pxz = pxx + h0 * h0, pxy + h0 * h1, pxz + h0 * h2
-        product *= s
-    product *= per_x * per_x * per_z
     kx, kz = pxx, 1.0 / zz
-    inverse = 1.0 / (product * tl.sqrt(pxx))
-    ky = zz * inverse * inverse
+    # sqrt(l), by quotients one after the other: a product of three small scales would leave float32's range.
+    steep = tl.sqrt(zz) / tl.sqrt(pxx) / (tl.load(scales + 3 * i) * per_x)
+    steep = steep / (tl.load(scales + 3 * i + 1) * per_x) / (tl.load(scales + 3 * i + 2) * per_z)
+    ky = steep * steep
     density = tl.load(densities + i)
     seen = live & (density > faint) & (density < _HUGE) & (kx < _HUGE) & (ky < _HUGE) & (kz < _HUGE)
     reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, density, 1.0) / faint), 0.0)))
@@ -176,7 +177,7 @@ def _moments(  # type: ignore[no-untyped-def]
     y_high, x_low, x_high = tl.load(box + 3), tl.load(box + 4), tl.load(box + 5)
     lane = tl.arange(0, DEEP * HIGH * WIDE)
     n0 = tl.zeros((DEEP * HIGH * WIDE,), tl.float32)
-    mx, my, mz, mxx, mxy, mxz, myy, myz, mzz = n0, n0, n0, n0, n0, n0, n0, n0, n0
+    nt, nv, nz, ntt, ntv, ntz, nvv, nvz, nzz = n0, n0, n0, n0, n0, n0, n0, n0, n0
     for z_start in range(z_low, z_high, DEEP):
         iz = z_start + lane // (HIGH * WIDE)
         dz = iz - z
@@ -188,64 +189,66 @@ def _moments(  # type: ignore[no-untyped-def]
                 dx = ix - x
                 inside = (iz < z_high) & (iy < y_high) & (ix < x_high)
                 inside = inside & (tl.abs(dx) <= hx) & (tl.abs(dy) <= hy) & (tl.abs(dz) <= hz)
-                a, b = dx + sxy * dy + sxz * dz, dy - syz * dz
-                weight = tl.exp2(kx * a * a + ky * b * b + kz * dz * dz)
+                t, v = dx + sxy * dy + sxz * dz, dy - syz * dz
+                weight = tl.exp2(kx * t * t + ky * v * v + kz * dz * dz)
                 g = tl.load(gradient + (iz.to(tl.int64) * ny + iy) * nx + ix, inside, 0.0) * weight
-                gx, gy, gz = g * dx, g * dy, g * dz
-                n0, mx, my, mz = n0 + g, mx + gx, my + gy, mz + gz
-                mxx, mxy, mxz = mxx + gx * dx, mxy + gx * dy, mxz + gx * dz
-                myy, myz, mzz = myy + gy * dy, myz + gy * dz, mzz + gz * dz
+                gt, gv, gz = g * t, g * v, g * dz
+                n0, nt, nv, nz = n0 + g, nt + gt, nv + gv, nz + gz
+                ntt, ntv, ntz = ntt + gt * t, ntv + gt * v, ntz + gt * dz
+                nvv, nvz, nzz = nvv + gv * v, nvz + gv * dz, nzz + gz * dz
     m = moments + 10 * i
     tl.store(m, tl.sum(n0))
-    tl.store(m + 1, tl.sum(mx))
-    tl.store(m + 2, tl.sum(my))
-    tl.store(m + 3, tl.sum(mz))
-    tl.store(m + 4, tl.sum(mxx))
-    tl.store(m + 5, tl.sum(mxy))
-    tl.store(m + 6, tl.sum(mxz))
-    tl.store(m + 7, tl.sum(myy))
-    tl.store(m + 8, tl.sum(myz))
-    tl.store(m + 9, tl.sum(mzz))
+    tl.store(m + 1, tl.sum(nt))
+    tl.store(m + 2, tl.sum(nv))
+    tl.store(m + 3, tl.sum(nz))
+    tl.store(m + 4, tl.sum(ntt))
+    tl.store(m + 5, tl.sum(ntv))
+    tl.store(m + 6, tl.sum(ntz))
+    tl.store(m + 7, tl.sum(nvv))
+    tl.store(m + 8, tl.sum(nvz))
+    tl.store(m + 9, tl.sum(nzz))
 
 
 @triton.jit(do_not_specialize=["n"])
 def _backward(  # type: ignore[no-untyped-def]
-    moments, boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations, d_densities, n, per_x, per_z,
-    MEANS: tl.constexpr, BLOCK: tl.constexpr,
+    table, moments, boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations, d_densities, n, per_x,
+    per_z, MEANS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     hit = live & (tl.load(boxes + 6 * i + 1, live, 0) > 0)
-    m = moments + 10 * i
-    mx, my, mz = tl.load(m + 1, hit, 0.0), tl.load(m + 2, hit, 0.0), tl.load(m + 3, hit, 0.0)
-    xx, xy, xz = tl.load(m + 4, hit, 0.0), tl.load(m + 5, hit, 0.0), tl.load(m + 6, hit, 0.0)
-    yy, yz, zz = tl.load(m + 7, hit, 0.0), tl.load(m + 8, hit, 0.0), tl.load(m + 9, hit, 0.0)
+    m, f = moments + 10 * i, table + _WIDTH * i
+    nt, nv, nz = tl.load(m + 1, hit, 0.0), tl.load(m + 2, hit, 0.0), tl.load(m + 3, hit, 0.0)
+    tt, tv, tz = tl.load(m + 4, hit, 0.0), tl.load(m + 5, hit, 0.0), tl.load(m + 6, hit, 0.0)
+    vv, vz, zz = tl.load(m + 7, hit, 0.0), tl.load(m + 8, hit, 0.0), tl.load(m + 9, hit, 0.0)
     rho = tl.load(densities + i, hit, 0.0)
-    tl.store(d_densities + i, tl.load(d_densities + i, hit, 0.0) + tl.load(m, hit, 0.0), hit)
-    px, py, pz = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
-    for k in tl.static_range(3):
-        s = tl.load(scales + 3 * i + k, hit, 1.0)
-        at = d_rotations + 9 * i + k
-        # H in voxel units, on the left of H N and Hᵀ H N.
-        in_x, in_z = 1.0 / (s * per_x), 1.0 / (s * per_z)
-        h0, h1 = tl.load(rotations + 9 * i + k, hit, 0.0) * in_x, tl.load(rotations + 9 * i + 3 + k, hit, 0.0) * in_x
-        h2 = tl.load(rotations + 9 * i + 6 + k, hit, 0.0) * in_z
-        if MEANS:
-            q = h0 * mx + h1 * my + h2 * mz
-            px, py, pz = px + h0 * q, py + h1 * q, pz + h2 * q
-        g0 = -rho * (h0 * xx + h1 * xy + h2 * xz)
-        g1 = -rho * (h0 * xy + h1 * yy + h2 * yz)
-        g2 = -rho * (h0 * xz + h1 * yz + h2 * zz)
-        scale = d_log_scales + 3 * i + k
-        tl.store(scale, tl.load(scale, hit, 0.0) - (g0 * h0 + g1 * h1 + g2 * h2), hit)
-        tl.store(at, tl.load(at, hit, 0.0) + g0 * in_x, hit)
-        tl.store(at + 3, tl.load(at + 3, hit, 0.0) + g1 * in_x, hit)
-        tl.store(at + 6, tl.load(at + 6, hit, 0.0) + g2 * in_z, hit)
+    add_to(d_densities + i, tl.load(m, hit, 0.0), hit)
+    s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8 = shape_of(scales, rotations, i, hit)
+    # A = H e_x and C = c / Σzz per voxel; B, along c x A, has the length sqrt(l), whatever the digits of its factors.
+    a0, a1, a2 = r0 / (s0 * per_x), r1 / (s1 * per_x), r2 / (s2 * per_x)
+    c0, c1, c2 = r6 * s0 * per_z, r7 * s1 * per_z, r8 * s2 * per_z
+    b0, b1, b2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
+    size = tl.sqrt(tl.load(f + KY, hit, 0.0) / tl.maximum(b0 * b0 + b1 * b1 + b2 * b2, _LEAST))
+    kz = tl.load(f + KZ, hit, 0.0)
+    b0, b1, b2, c0, c1, c2 = size * b0, size * b1, size * b2, kz * c0, kz * c1, kz * c2
     if MEANS:
-        at = d_means + 3 * i
-        tl.store(at, tl.load(at, hit, 0.0) + rho * per_x * px, hit)
-        tl.store(at + 1, tl.load(at + 1, hit, 0.0) + rho * per_x * py, hit)
-        tl.store(at + 2, tl.load(at + 2, hit, 0.0) + rho * per_z * pz, hit)
+        y0 = rho * (nt * a0 + nv * b0 + nz * c0) / s0
+        y1 = rho * (nt * a1 + nv * b1 + nz * c1) / s1
+        y2 = rho * (nt * a2 + nv * b2 + nz * c2) / s2
+        add_to(d_means + 3 * i, r0 * y0 + r1 * y1 + r2 * y2, hit)
+        add_to(d_means + 3 * i + 1, r3 * y0 + r4 * y1 + r5 * y2, hit)
+        add_to(d_means + 3 * i + 2, r6 * y0 + r7 * y1 + r8 * y2, hit)
+    # T / ρ = (τ A + δ' B + δz C)(...)ᵀ, as A fᵀ + B gᵀ + C hᵀ.
+    f0, f1, f2 = tt * a0 + tv * b0 + tz * c0, tt * a1 + tv * b1 + tz * c1, tt * a2 + tv * b2 + tz * c2
+    g0, g1, g2 = tv * a0 + vv * b0 + vz * c0, tv * a1 + vv * b1 + vz * c1, tv * a2 + vv * b2 + vz * c2
+    h0, h1, h2 = tz * a0 + vz * b0 + zz * c0, tz * a1 + vz * b1 + zz * c1, tz * a2 + vz * b2 + zz * c2
+    add_shape(
+        i, hit, s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8,
+        rho * (a0 * f0 + b0 * g0 + c0 * h0), rho * (a0 * f1 + b0 * g1 + c0 * h1),
+        rho * (a0 * f2 + b0 * g2 + c0 * h2), rho * (a1 * f1 + b1 * g1 + c1 * h1),
+        rho * (a1 * f2 + b1 * g2 + c1 * h2), rho * (a2 * f2 + b2 * g2 + c2 * h2),
+        d_log_scales, d_rotations,
+    )  # fmt: skip
 
 
 def fill_backward(
@@ -263,6 +266,6 @@ def fill_backward(
         placed.table, placed.boxes, gradient, moments, ny, nx, DEEP=_DEEP, HIGH=_HIGH, WIDE=_WIDE, num_warps=1
     )  # fmt: skip
     _backward[(triton.cdiv(n, _BLOCK),)](
-        moments, placed.boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations, d_densities, n,
-        1 / edge_x, 1 / edge_z, MEANS=means_too, BLOCK=_BLOCK,
+        placed.table, moments, placed.boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations,
+        d_densities, n, 1 / edge_x, 1 / edge_z, MEANS=means_too, BLOCK=_BLOCK,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
-from recon.splat import RayModel, Truncation, project, voxelize
+from recon.splat import Kernel, RayModel, Truncation, project, voxelize
 from recon.volume import Grid
 from tests.recon.helpers import as_leaves, gradients, in_double
 
@@ -43,21 +43,33 @@ class Found:
         return max(self.gradients.values())
 
 
-def compare(g: Gaussians, where: Geometry | Grid, *, model: RayModel | None = None, seed: int = 0) -> Found:
-    """Kernel against twin, on a picture or a volume weighed by random numbers; asserts that all of it is finite."""
-    fast, twin = as_leaves(g), in_double(g)
+def compare(
+    g: Gaussians,
+    where: Geometry | Grid,
+    *,
+    model: RayModel | None = None,
+    seed: int = 0,
+    device: torch.device | None = None,
+) -> Found:
+    """Kernel against twin, on a picture or a volume weighed by random numbers; asserts that all of it is finite.
+
+    The kernel is the GPU's where a `device` is given, else the CPU's.
+    """
+    fast, twin = as_leaves(g, device), in_double(g)
+    kernel: Kernel = "cpu" if device is None else "gpu"
     if isinstance(where, Grid):
-        found, expected = voxelize(fast, where, truncation=WHOLE), voxelize(twin, where)
+        found, expected = voxelize(fast, where, truncation=WHOLE, kernel=kernel), voxelize(twin, where)
         weight = float(g.densities.max())
     else:
-        found = project(fast, where, truncation=WHOLE, model=model)
+        found = project(fast, where, truncation=WHOLE, model=model, kernel=kernel)
         expected = project(twin, where, model=model)
         weight = float((g.densities * g.scales.amin(1)).max()) * math.sqrt(2 * math.pi)
     y = torch.from_numpy(np.random.default_rng(seed).normal(size=tuple(expected.shape)))
-    (found * y.float()).sum().backward()
+    (found * y.float().to(device)).sum().backward()
     (expected * y).sum().backward()
     slopes, exact = gradients(fast), gradients(twin)
-    for name, values in (("image", found.detach()), *slopes.items()):
+    found = found.detach().cpu()
+    for name, values in (("image", found), *slopes.items()):
         assert torch.isfinite(values).all(), name
     top = max(float(expected.detach().abs().max()), weight)
     off = float((found - expected).detach().abs().max()) / top
@@ -73,7 +85,7 @@ def compare(g: Gaussians, where: Geometry | Grid, *, model: RayModel | None = No
         name: float((slopes[name] - value).abs().max()) / max(float(value.abs().max()), size[name], 1e-300)
         for name, value in exact.items()
     }
-    return Found(found.detach(), off, worst, slopes)
+    return Found(found, off, worst, slopes)
 
 
 def bound(far: float, thin: float) -> float:

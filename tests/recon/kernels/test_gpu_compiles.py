@@ -23,7 +23,10 @@ _ARRAYS = (
     "weights terms sums volume p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
 )
 # Those that other kernels call.
-_PARTS = {"along_ray", "_at_pixels", "_slope", "_unit_quaternion", "_adam_one"}
+_PARTS = {
+    "along_ray", "turned", "shape_of", "add_to", "add_shape", "_at_pixels", "_slope", "_unit_quaternion", "_softplus",
+    "_sigmoid", "_adam_one",
+}  # fmt: skip
 
 
 def _load_without_triton() -> None:
@@ -52,7 +55,7 @@ def _compile_all() -> None:
         (footprints, "_footprints", 4, block | {"CONE": True}),
         (footprints, "_footprints_backward", 4, block | {"CONE": False}),
         (footprints, "_footprints_backward", 4, block | {"CONE": True}),
-        (images, "_render", 2, {"EDGE": images._EDGE, "GROUP": images._GROUP}),
+        (images, "_render", 2, {"EDGE": images._EDGE, "GROUP": images._GROUP, "MANY": images._MANY}),
         (images, "_moments", 1, {"HIGH": images._BLOCK[0], "WIDE": images._BLOCK[1]}),
         (rays, "_terms", 4, block),
         (rays, "_render", 2, {"EDGE": rays._EDGE, "GROUP": rays._GROUP}),

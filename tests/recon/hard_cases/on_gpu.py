@@ -1,0 +1,51 @@
+"""Where the hard cases run on the Triton kernels: on CUDA where there is one, else interpreted and small."""
+
+from __future__ import annotations
+
+import importlib
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.splat import RayModel
+from recon.volume import Grid
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when triton and the kernels are first imported, that is, here
+pytest.importorskip("triton", reason="the GPU kernels need triton (extra gpu, Linux)")
+
+DEVICE: torch.device = importlib.import_module("recon.kernels.gpu").require("cuda")
+SHAPE, PITCH = (17, 21), 0.5  # no multiple of a tile
+BEAMS = {
+    "parallel": Geometry.parallel([0.7], SHAPE, PITCH, 9.3),
+    "leaning": Geometry.parallel([2.5], SHAPE, PITCH, 9.3, axis_row=7.0, roll=0.2, tilt=-0.3),
+    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, 9.3),
+}
+GRID = Grid((5, 6, 9), 0.6, centre=(0.4, -0.8, 1.1))
+EXACT = RayModel(exact_above=0.0)
+FAR = 30.0  # px: no pixel is farther from the middle of the detector, or from a centre in it
+Shape = tuple[float, float, float]
+
+# The interpreter is numpy, which warns of an infinity that a GPU just makes.
+quiet = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+
+
+def some(shape: Shape, n: int = 8, extent: float = 3.0, seed: int = 1) -> Gaussians:
+    """n Gaussians of one shape, in any orientation."""
+    rng = np.random.default_rng(seed)
+    means = (rng.random((n, 3)) - 0.5) * extent
+    return Gaussians.from_physical(
+        means, np.tile(shape, (n, 1)), rng.uniform(0.2, 1, n), rng.normal(size=(n, 4)), density_unit=0.7
+    )
+
+
+def at(places: list[Shape], sigma: float, density: float = 0.8) -> Gaussians:
+    """Slightly different, slightly turned Gaussians at (x, y, z)."""
+    n = len(places)
+    rng = np.random.default_rng(5)
+    shapes = sigma * rng.uniform(0.7, 1.4, (n, 3))
+    return Gaussians.from_physical(places, shapes, np.full(n, density), rng.normal(size=(n, 4)))
