@@ -42,8 +42,8 @@ def test_far_outside_and_large_enough_to_be_seen() -> None:
     assert found.worst < gradient_bound(far, 0.3 * far), found.gradients
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.4])
-def test_on_the_borders_of_images_and_tiles(sigma: float) -> None:
+def test_on_the_borders_of_images_and_tiles() -> None:
+    sigma = 0.4
     cols, rows = (-1.0, -0.5, 0.0, 7.5, 8.0, 20.0, 20.5, 21.0), (-1.0, 0.0, 7.5, 8.0, 16.0, 17.0)
     view = Geometry.parallel([0.0], SHAPE, 1.0, 0.0, axis_row=0.0)  # x is the column, z the row
     found = compare(at([(u, 0.0, v) for u in cols for v in rows], sigma), view, device=DEVICE)
@@ -78,9 +78,9 @@ def test_at_the_source_and_behind_it_there_is_nothing(model: RayModel | None) ->
 @pytest.mark.parametrize("model", [None, EXACT], ids=["affine", "exact"])
 def test_anywhere_before_a_source_all_is_finite(model: RayModel | None) -> None:
     rng = np.random.default_rng(8)
-    places = np.stack((rng.uniform(-3, 3, 25), -10 + 10 ** rng.uniform(-3, 3, 25), np.full(25, 0.3)), 1)
-    sigma = 10 ** rng.uniform(-3, 2, 25)
-    one = Gaussians.from_physical(places, sigma[:, None] * rng.uniform(0.7, 1.4, (25, 3)), np.full(25, 0.8))
+    places = np.stack((rng.uniform(-3, 3, 15), -10 + 10 ** rng.uniform(-3, 3, 15), np.full(15, 0.3)), 1)
+    sigma = 10 ** rng.uniform(-3, 2, 15)
+    one = Gaussians.from_physical(places, sigma[:, None] * rng.uniform(0.7, 1.4, (15, 3)), np.full(15, 0.8))
     g = as_leaves(one, DEVICE)
     image = project(g, SOURCE, model=model, kernel="gpu")
     assert torch.isfinite(image).all() and float(image.detach().min()) >= 0
