@@ -16,9 +16,9 @@ Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 DIRECT = ("fbp",)
 SIGMAS = 3.5  # where the fit cuts Gaussians off when nobody says otherwise
 
-_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (125, 250, 500, 1000), "full": (250, 500, 1000, 2000, 4000)}
-_BASE_STEPS: Mapping[Depth, int] = {"quick": 500, "full": 2000}
-_BINNED_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (500,), "full": (250, 1000, 2000)}
+_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
+_BASE_STEPS: Mapping[Depth, int] = {"quick": 250, "full": 1000}
+_BINNED_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (250,), "full": (125, 500, 1000)}
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 _FACTORS: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.5, 2.0)}
 _SIGMAS: Mapping[Depth, tuple[float, ...]] = {"quick": (3.0,), "full": (2.5, 3.0, 4.5)}

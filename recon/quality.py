@@ -64,9 +64,9 @@ class Preset:
 
 
 PRESETS: dict[Quality, Preset] = {
-    "preview": Preset(250, 0.5),
-    "standard": Preset(2000, 1.0),
-    "best": Preset(4000, 2.0),
+    "preview": Preset(125, 0.5),
+    "standard": Preset(1000, 1.0),
+    "best": Preset(2000, 2.0),
 }
 
 

@@ -28,7 +28,7 @@ from recon.solvers import FistaTv, OsSirtTv
 from recon.volume import Grid, Volume
 
 Method = Literal["r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"]
-DEFAULT_STEPS = 2000
+DEFAULT_STEPS = 1000
 
 # The methods that take an option; one that is not listed is of the fit.
 _FIT: tuple[Method, ...] = ("r2",)
@@ -96,7 +96,7 @@ def reconstruct(
         grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
             small box holds what the whole volume holds there.
         method: "r2" (R²-Gaussian fit), "fbp" (FDK for a cone), or a classical iterative one, see `iterative.solve`.
-        steps: of the fit; 0 gives the starting point; None takes 2000, or as many as fit into `seconds`.
+        steps: of the fit; 0 gives the starting point; None takes 1000, or as many as fit into `seconds`.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         densify: the fit may clone, split and prune.
         seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.

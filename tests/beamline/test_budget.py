@@ -21,7 +21,7 @@ from drivers.clock import SystemClock
 from recon.geometry import Geometry
 from recon.metrics import psnr
 from recon.operators import Projector
-from recon.quality import Choice, Speeds
+from recon.quality import PRESETS, Choice, Speeds
 from recon.volume import Grid
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -167,7 +167,7 @@ def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     events: list[Event] = []
     run(options, events.append, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
-    assert record.parameters["steps"] == 250
+    assert record.parameters["steps"] == PRESETS["preview"].steps
     assert events[-1].data["chosen"].startswith("preview: 250 steps from 1000 Gaussians")
     assert "chosen" not in run_plain(options, tmp_path)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon.geometry import Geometry
 from recon.operators import Projector
-from recon.volume import Grid, Volume
+from recon.volume import Grid
 from simulators.battery import battery
 from simulators.phantom import Detector, Phantom
 
@@ -103,9 +103,6 @@ OBJECTS: dict[str, Callable[[Path], F32]] = {
         tifffile.imread(folder / "qim3d_shell_225x128x128.tif")
     ),
     "thorax": _thorax,
-    "walnut": lambda folder: (lambda v: _unit(v, float(np.percentile(v, 99.99))))(
-        _first(folder / "walnut_fdk_256.npz")
-    ),
 }  # fmt: skip
 
 
@@ -119,8 +116,3 @@ def _noisy(clean: F32, photons: float = 1e5, sigma: float = 10.0) -> F32:
     top = float(clean.max())
     counts = rng.poisson(photons * np.exp(-clean / top)) + rng.normal(0, sigma, clean.shape)
     return np.maximum(-np.log(np.maximum(counts, 1) / photons) * top, 0).astype(np.float32)
-
-
-def clipped(volume: Volume) -> F32:
-    """Attenuation is not negative: what a user would do with what is."""
-    return np.maximum(volume.data, 0)

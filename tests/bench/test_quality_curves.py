@@ -29,7 +29,7 @@ from simulators.battery import battery
 from simulators.phantom import Detector, Phantom
 
 F32 = NDArray[np.float32]
-STEPS = (60, 125, 250, 500, 1000, 2000)
+STEPS = (30, 60, 125, 250, 500, 1000)
 KINDS = ((1, 0.25), (1, 0.5), (1, 1.0), (1, 2.0), (2, 0.25))
 
 

@@ -21,7 +21,7 @@ from tests.recon.helpers import as_leaves, gradients, in_double
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (22, 26), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
-PLAIN = fit.FitSettings(policy=None, tv_weight=0.0)
+PLAIN = fit.FitSettings(policy=None, tv_weight=0.0, views_per_step=1, pace=3.0, decay=0.1)
 
 
 def _problem(truth: Gaussians, settings: fit.FitSettings) -> fit.Problem:
@@ -280,3 +280,23 @@ def test_views_of_nothing_leave_a_model_to_go_on_with(random_gaussians: Make) ->
 def replace_unit(g: Gaussians, factor: float) -> Gaussians:
     """The same shapes with all densities times `factor`."""
     return replace(g, density_unit=g.density_unit * factor)
+
+
+def test_quaternions_are_brought_to_length_one_without_a_turn(
+    random_gaussians: Make, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # After the step that does it the model is the same and the next gradient's measure is that of Adam's moments.
+    truth = random_gaussians(12, extent=7.0)
+    problem = _problem(truth, PLAIN)
+    start = _disturbed(truth, rng)
+    states = []
+    for every in (100, 3):
+        monkeypatch.setattr(fit, "_NORMALISE", every)
+        states.append(fit.run(fit.init(start, 0), problem, PLAIN, 3))
+    kept, brought = states
+    q, unit = kept.parameters["quaternions"], brought.parameters["quaternions"]
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    assert np.abs(length - 1).max() > 0.01
+    np.testing.assert_allclose(unit, q / length, rtol=1e-6)
+    np.testing.assert_allclose(brought.first["quaternions"], kept.first["quaternions"] * length, rtol=1e-5)
+    np.testing.assert_allclose(brought.second["quaternions"], kept.second["quaternions"] * length**2, rtol=1e-5)

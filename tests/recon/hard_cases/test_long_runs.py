@@ -57,9 +57,9 @@ def test_steps_without_drift(steps: int, residual: float) -> None:
     assert fit.misfit_of(state, problem, settings) < residual
     p = state.parameters
     assert all(np.isfinite(values).all() for arrays in (p, state.first, state.second) for values in arrays.values())
-    # A gradient is across its quaternion, so that every step makes it longer; Adam's rates keep that small.
-    before, lengths = (np.linalg.norm(q, axis=1) for q in (start.quaternions.numpy(), p["quaternions"]))
-    assert lengths.min() > 0.8 * before.min() and lengths.max() < 1.5 * before.max()
+    # A gradient is across its quaternion, so that every step makes it longer: they are brought back now and then.
+    lengths = np.linalg.norm(p["quaternions"], axis=1)
+    assert np.abs(lengths - 1).max() < 1e-6
     seen = np.abs(p["means"]).max(axis=1) < 800
     assert seen.sum() == N - 1
     assert np.abs(p["means"][seen]).max() < 12  # the field's half
