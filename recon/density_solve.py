@@ -6,6 +6,9 @@ A has a column for each Gaussian, its picture in all views at density one, and A
 
 is convex, and a few passes over the views solve it for all densities at once, where `initialise.scale_to_data` solves
 for one factor that they share.
+
+Of use where shapes are to stay. As the start of a fit it gains nothing that the same seconds in steps would not
+(docs/exploration.md), so no fit calls it.
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ class DensityOperator:
     """A, from densities [n] in density units to line integrals [view, row, col], and its transpose.
 
     Footprints end where those of density one do, whatever the densities are, since A would not be linear otherwise;
-    densities may be negative. Footprints are made anew in each pass (a fifth of its time): no memory grows with the
+    densities may be negative. Footprints are made anew in each pass (a quarter of its time): no memory grows with the
     number of views.
     """
 

@@ -231,7 +231,7 @@ def test_the_residual_never_rises_and_is_that_of_what_comes_back(
     )
     a = DensityOperator(g, views, rays=model)
     data = noisy(scale * a.forward(rng.uniform(0, 1, n)).astype(np.float64), noise, rng)
-    weights = rng.choice(np.float32([0, 0.5, 3]), data.shape) if weighed else np.ones_like(data)
+    weights = rng.choice(np.array([0, 0.5, 3], np.float32), data.shape) if weighed else np.ones_like(data)
 
     def residual(x: F64) -> float:
         off = np.sqrt(weights) * (a.forward(x).astype(np.float64) - data)
