@@ -168,7 +168,12 @@ def test_a_fit_takes_angles_in_any_order_and_range(clean: F32, truth: F32) -> No
     rng = np.random.default_rng(4)
     order = rng.permutation(32)
     odd = Geometry.parallel(VIEWS.angles[order] + 2 * math.pi * rng.integers(-9, 10, 32), SHAPE)
-    plain, mixed = (psnr(truth, f.volume.data) for f in (fitted(clean), fitted(clean[order], odd)))
+    # The views that a step draws differ, too: over seeds a fit's PSNR scatters by 0.17 dB, a difference of two means of
+    # three by 0.14.
+    plain, mixed = (
+        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(3)])
+        for data, views in ((clean, VIEWS), (clean[order], odd))
+    )
     assert abs(plain - mixed) < 0.5
 
 
