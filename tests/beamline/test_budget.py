@@ -167,8 +167,10 @@ def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     events: list[Event] = []
     run(options, events.append, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
-    assert record.parameters["steps"] == PRESETS["preview"].steps
-    assert events[-1].data["chosen"].startswith("preview: 250 steps from 1000 Gaussians")
+    preview = PRESETS["preview"]
+    assert record.parameters["steps"] == preview.steps
+    count = round(preview.share * 2000)  # a small volume: the least that a fit starts from by itself
+    assert events[-1].data["chosen"].startswith(f"preview: {preview.steps} steps from {count} Gaussians")
     assert "chosen" not in run_plain(options, tmp_path)
 
 
