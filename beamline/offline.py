@@ -72,6 +72,7 @@ class ReconOptions:
         gaussians: how many to start from; None derives it from the volume.
         start, loss, device: of the fit.
         early_stop: end the fit when views held out no longer gain; some are kept back where all were chosen.
+        polish: sweeps on voxels after the fit.
         keeper: of the fit's state.
         iterations, tv_weight: of an iterative method; None takes its own.
         filter: of the FBP.
@@ -94,6 +95,7 @@ class ReconOptions:
     loss: Loss = "l1"
     device: str = "cpu"
     early_stop: bool = False
+    polish: int = 0
     keeper: Keeper = field(default_factory=Keeper)
     iterations: int | None = None
     tv_weight: float | None = None
@@ -234,12 +236,13 @@ def _fit(
     warn: Warnings,
 ) -> Made:
     """Fit Gaussians, by steps, by seconds or by a preset; keeping its state and taking it up where that is wanted."""
-    steps, gaussians, said = options.steps, options.gaussians, ""
+    steps, gaussians, polish, said = options.steps, options.gaussians, options.polish, ""
     if options.quality is not None:
         preset = PRESETS[options.quality]
-        steps = preset.steps
+        steps, polish = preset.steps, preset.polish
         gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
         said = f"{options.quality}: {steps} steps from {gaussians} Gaussians"
+        said += f", {polish} sweeps on voxels" if polish else ""
     if steps is None and options.seconds is None:
         steps = DEFAULT_STEPS
     settings, keeper = FitSettings(loss=options.loss), options.keeper
@@ -266,6 +269,7 @@ def _fit(
             early_stop=options.early_stop,
             resume=resume,
             device=options.device,
+            polish=polish,
             on_progress=progress_events(sink, clock, options.seconds),
             should_stop=stopped,
             on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, warn),

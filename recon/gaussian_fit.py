@@ -18,6 +18,7 @@ from recon.geometry import Geometry
 from recon.initialise import Start, place
 from recon.kernels.activation import F32
 from recon.masks import masked
+from recon.polish import polish
 from recon.problem import Problem, coarser
 from recon.volume import Grid, Volume
 
@@ -39,6 +40,7 @@ class FitRequest:
     early_stop: bool
     resume: Mapping[str, NDArray[Any]] | None
     device: str
+    polish: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +150,19 @@ def run_fit(
     last = state
     if watch.kept:
         state = state_from(watch.kept, backend)
-    volume = fit.volume_of(state, grid, settings, backend)
+    volume, model = fit.volume_of(state, grid, settings, backend), fit.gaussians_of(state, backend)
+    if request.polish:
+        volume = polish(
+            volume, model, data[used], seen, request.polish,
+            weights=known, rays=settings.rays, truncation=settings.truncation, should_stop=should_stop,
+            seed=request.seed,
+        )  # fmt: skip
     record = {
         **asdict(settings), "steps": state.step, "seed": request.seed, "start": request.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": request.held_out, "device": request.device,
+        "polish": request.polish,
     }  # fmt: skip
-    return Fitted(volume, tuple(history), fit.gaussians_of(state, backend), record, arrays_of(last, backend))
+    return Fitted(volume, tuple(history), model, record, arrays_of(last, backend))
 
 
 def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -57,16 +57,18 @@ class Preset:
     Attributes:
         steps: of the fit.
         share: Gaussians at the start over those that the volume would get by itself.
+        polish: sweeps on voxels after it.
     """
 
     steps: int
     share: float
+    polish: int = 0
 
 
 PRESETS: dict[Quality, Preset] = {
     "preview": Preset(125, 0.5),
     "standard": Preset(1000, 1.0),
-    "best": Preset(2000, 2.0),
+    "best": Preset(2000, 2.0, 3),
 }
 
 

@@ -78,6 +78,7 @@ def reconstruct(
     early_stop: bool = False,
     resume: Mapping[str, NDArray[Any]] | None = None,
     device: str = "cpu",
+    polish: int = 0,
     iterations: int | None = None,
     tv_weight: float | None = None,
     weights: NDArray[np.float32] | None = None,
@@ -108,6 +109,8 @@ def reconstruct(
         early_stop: end the fit when that residual has not fallen for a while, and return the model that had it lowest.
         resume: the checkpoint of a fit with the same data and settings, to be taken up where it was left.
         device: that the fit computes on, "cpu" or "cuda" (the current CUDA device).
+        polish: sweeps over the views after the fit that add on voxels what Gaussians could not say, see
+            `polish.polish`; `gaussians` stays the model as it was fitted.
         iterations, tv_weight: of a classical method; None: its defaults. The weight is in density units.
         weights: of each ray [view, row, col], 0 or more. "fbp" fills rays of weight 0 from their neighbours, and to it
             all others are alike.
@@ -125,13 +128,13 @@ def reconstruct(
         "filter": (filter, get_args(Filter)),
         "start": (start, get_args(Start)),
     }
-    _check(options, geometry, steps, seconds)
+    _check(options, geometry, steps, seconds, polish)
     said = {
         "steps": steps is not None, "seconds": seconds is not None, "gaussians": gaussians is not None,
         "densify": not densify, "settings": settings is not None, "start": start != "fbp",
         "held_out": len(held_out) > 0, "early_stop": early_stop, "resume": resume is not None,
-        "device": device != "cpu", "on_checkpoint": on_checkpoint is not None, "filter": filter != "hann",
-        "iterations": iterations is not None, "tv_weight": tv_weight is not None,
+        "device": device != "cpu", "polish": polish != 0, "on_checkpoint": on_checkpoint is not None,
+        "filter": filter != "hann", "iterations": iterations is not None, "tv_weight": tv_weight is not None,
     }  # fmt: skip
     _refuse_foreign(method, [name for name, given in said.items() if given])
     data = _line_integrals(projections, geometry)
@@ -144,8 +147,9 @@ def reconstruct(
         if settings is None and not densify:
             chosen = replace(chosen, policy=None)
         request = FitRequest(
-            chosen, steps, seconds, gaussians, seed, start, tuple(held_out), early_stop, resume, device
-        )
+            chosen, steps, seconds, gaussians, seed, start, tuple(held_out), early_stop, resume, device,
+            operator.index(polish),
+        )  # fmt: skip
         fitted = run_fit(
             data, weights, geometry, target, request, on_progress, should_stop, now, on_checkpoint, checkpoint_every
         )
@@ -180,7 +184,11 @@ def reconstruct(
 
 
 def _check(
-    options: Mapping[str, tuple[str, Sequence[str]]], geometry: Geometry, steps: int | None, seconds: float | None
+    options: Mapping[str, tuple[str, Sequence[str]]],
+    geometry: Geometry,
+    steps: int | None,
+    seconds: float | None,
+    polish: int,
 ) -> None:
     for name, (value, legal) in options.items():
         if value not in legal:
@@ -194,6 +202,12 @@ def _check(
         )
     if steps is not None and operator.index(steps) < 0:
         raise ValueError(f"steps must be 0 or more, got {steps}")
+    if polish and not geometry.is_straight:
+        raise ValueError(
+            "polish works on voxels, whose projector takes straight views only: these are rolled or tilted"
+        )
+    if operator.index(polish) < 0:
+        raise ValueError(f"polish must be 0 sweeps or more, got {polish}")
     if seconds is not None and not (math.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"seconds must be a time of 0 or more, got {seconds}")
 

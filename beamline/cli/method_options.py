@@ -13,17 +13,28 @@ from recon.initialise import Start
 from recon.problem import Loss
 from recon.quality import PRESETS, parse_budget
 
-SETTINGS = ("steps", "seconds", "gaussians", "start", "loss", "device", "early_stop", "iterations", "tv_weight")
+SETTINGS = (
+    "steps",
+    "seconds",
+    "gaussians",
+    "start",
+    "loss",
+    "device",
+    "early_stop",
+    "polish",
+    "iterations",
+    "tv_weight",
+)
 """Options that are handed to the reconstructor as they are."""
 
-_FIT = ("steps", "seconds", "gaussians", "start", "loss", "device", "early_stop", "checkpoint", "resume")
+_FIT = ("steps", "seconds", "gaussians", "start", "loss", "device", "early_stop", "polish", "checkpoint", "resume")
 _PLANS = ("budget", "quality")
 # What each of the options that choose a plan leaves no room for.
 _CHOSEN = {
     "budget": ("quality", *_FIT),
-    "quality": ("budget", "steps", "seconds", "gaussians"),
+    "quality": ("budget", "steps", "seconds", "gaussians", "polish"),
 }
-_WITHOUT_END = ("start", "loss", "device", "early_stop", "checkpoint", "resume")
+_WITHOUT_END = ("start", "loss", "device", "early_stop", "polish", "checkpoint", "resume")
 _DIRECT, _SMOOTHED = ("r2", "fbp"), ("fista-tv", "os-sirt-tv")
 
 
@@ -88,7 +99,7 @@ def _option(name: str) -> str:
 
 
 _OPTIONS = (
-    click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2). Default: 2000."),
+    click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2). Default: 1000."),
     click.option(
         "--seconds",
         type=click.FloatRange(min=0, min_open=True),
@@ -125,6 +136,13 @@ _OPTIONS = (
         "--early-stop",
         is_flag=True,
         help="End the fit (r2) when views held out no longer gain; every tenth is held out where --views leaves none.",
+    ),
+    click.option(
+        "--polish",
+        type=click.IntRange(min=0),
+        default=0,
+        show_default=True,
+        help="Sweeps on voxels after the fit (r2) for what Gaussians could not say; 3 gain 0.3 to 2 dB of sharp edges.",
     ),
     click.option(
         "--checkpoint",

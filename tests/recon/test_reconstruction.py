@@ -158,7 +158,7 @@ def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], mess
 
 OF_THE_FIT: dict[str, object] = {
     "steps": 3, "seconds": 1.0, "gaussians": 100, "densify": False, "settings": fit.FitSettings(), "start": "tv",
-    "held_out": (3,), "early_stop": True, "resume": {}, "device": "cuda", "on_checkpoint": print,
+    "held_out": (3,), "early_stop": True, "resume": {}, "device": "cuda", "polish": 3, "on_checkpoint": print,
 }  # fmt: skip
 OF_ITERATIONS: dict[str, object] = {"iterations": 3}
 OF_TV: dict[str, object] = {"tv_weight": 0.1}
