@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -66,12 +67,22 @@ class FitSettings:
     rays: RayModel = field(default_factory=RayModel)
 
     def __post_init__(self) -> None:
-        for name, value in (("views_per_step", self.views_per_step), ("coarse", self.coarse)):
-            if value < 1:
-                raise ValueError(f"{name} must be 1 or more, got {value}")
-        for name, weight in (("ssim_weight", self.ssim_weight), ("tv_weight", self.tv_weight)):
-            if not weight >= 0:
-                raise ValueError(f"{name} must be 0 or more, got {weight}")
+        for name in ("views_per_step", "coarse", "tv_size"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}")
+        for name in ("ssim_weight", "tv_weight"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and 0 or more, got {getattr(self, name)}")
+        for name in ("pace", "decay", "smallest"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
+        if not 0 <= self.coarse_until <= 1:
+            raise ValueError(f"coarse_until is a fraction of the steps, 0 to 1, got {self.coarse_until}")
+        if len(self.rates) != len(NAMES) or not all(0 <= rate < math.inf for rate in self.rates):
+            raise ValueError(
+                f"rates must be {len(NAMES)} finite numbers of 0 or more ({', '.join(NAMES)}), got {self.rates}"
+            )
 
 
 @dataclass(frozen=True)

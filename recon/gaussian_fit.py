@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -19,10 +20,11 @@ from recon.initialise import Start, place
 from recon.kernels.activation import F32
 from recon.masks import masked
 from recon.polish import polish
-from recon.problem import Problem, coarser
+from recon.problem import Problem, coarser, joined
 from recon.volume import Grid, Volume
 
 _LOOK = 50  # steps between two looks at the views held out
+_BEST = "best."  # names of the best model's arrays in a checkpoint begin so
 _PATIENCE = 0.2  # of the steps planned, and at least six looks, may pass without a better one
 
 
@@ -65,6 +67,24 @@ class _Watch:
     best_step: int = 0
     kept: dict[str, NDArray[Any]] = field(default_factory=dict)
 
+    @classmethod
+    def over(
+        cls, problem: Problem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
+    ) -> _Watch:
+        """At `step`, or as a checkpoint has left it."""
+        if problem is None or "watch" not in resume:
+            return cls(problem, settings, best_step=step)
+        best, best_step = resume["watch"]
+        kept = {name.removeprefix(_BEST): values for name, values in resume.items() if name.startswith(_BEST)}
+        return cls(problem, settings, best=float(best), best_step=int(best_step), kept=kept)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What a checkpoint holds of it."""
+        if self.problem is None:
+            return {}
+        best = {_BEST + name: values for name, values in self.kept.items()}
+        return {"watch": np.array([self.best, self.best_step]), **best}
+
     def look(self, state: FitState, keep: bool) -> None:
         if self.problem is None:
             return
@@ -96,8 +116,14 @@ def run_fit(
     backend = backend_for(request.device)
     used, kept_back = _split(geometry.n_views, request.held_out, request.early_stop)
     data, weights = masked(data, weights)
+    if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
+        weights = weights / np.float32(np.mean(weights[weights > 0], dtype=np.float64))
+    blank = kept_back[~data[kept_back].any(axis=(1, 2))]
+    if blank.size:
+        raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
     seen, known = geometry.select(used), None if weights is None else weights[used]
-    field_grid = Grid.of_field(geometry, max(geometry.sample_pitch, grid.voxel_size))
+    field_grid = Grid.for_fit(geometry, grid)
+    joined(seen, settings.coarse)  # what cannot be joined is told before anything is computed
     state, n_start, unit = _first_state(data[used], seen, field_grid, request, backend)
     problem = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
     rough = problem
@@ -109,7 +135,7 @@ def run_fit(
         unseen = fit.problem_of(
             data[kept_back], geometry.select(kept_back), field_grid, unit, settings, backend, others
         )  # fmt: skip
-    watch = _Watch(unseen, settings, best_step=state.step)  # a fit taken up again is given its patience anew
+    watch = _Watch.over(unseen, settings, state.step, request.resume or {})
 
     planned, history = request.steps or 0, []  # 0 in a history: no number of steps was planned
     steps, seconds = request.steps, request.seconds
@@ -139,7 +165,7 @@ def run_fit(
             said = now()
             tell(said)
         if on_checkpoint is not None and now() - handed >= checkpoint_every:
-            on_checkpoint(arrays_of(state, backend))
+            on_checkpoint(arrays_of(state, backend) | watch.arrays())
             handed = now()  # what keeping it takes must not crowd out the fit
         if should_stop is not None and should_stop():
             break
@@ -162,11 +188,13 @@ def run_fit(
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": request.held_out, "device": request.device,
         "polish": request.polish,
     }  # fmt: skip
-    return Fitted(volume, tuple(history), model, record, arrays_of(last, backend))
+    return Fitted(volume, tuple(history), model, record, arrays_of(last, backend) | watch.arrays())
 
 
 def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    kept_back = np.unique(np.asarray(held_out, np.intp))
+    if any(isinstance(view, bool | np.bool_) for view in held_out):
+        raise ValueError("held_out must be the numbers of views, got a mask of booleans: use numpy.flatnonzero of it")
+    kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
     if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
         raise ValueError(f"held_out must name views 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
     if kept_back.size >= n_views:
@@ -182,6 +210,11 @@ def _first_state(
     """The state to go on from, how many Gaussians it began with, and their density unit."""
     if request.resume is not None:
         state = state_from(request.resume, backend)
+        if max(state.drawn, default=0) >= geometry.n_views:
+            raise ValueError(
+                f"the checkpoint is of a fit with at least {max(state.drawn) + 1} views, these are {geometry.n_views}: "
+                "resume takes the same data and settings"
+            )
         return state, state.n, state.unit
     start = request.gaussians
     if not isinstance(start, Gaussians):

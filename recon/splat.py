@@ -41,6 +41,12 @@ class Truncation:
     sigmas: float = 3.5
     faint: float = 1e-5
 
+    def __post_init__(self) -> None:
+        if not self.sigmas > 0:
+            raise ValueError(f"sigmas must be above 0 (inf: never), got {self.sigmas}")
+        if not 0 <= self.faint < math.inf:
+            raise ValueError(f"faint must be finite and 0 or more, got {self.faint}")
+
 
 @dataclass(frozen=True)
 class RayModel:

@@ -243,10 +243,36 @@ def test_a_step_on_all_views_takes_the_mean_gradient(random_gaussians: Make) -> 
     assert together.seen == VIEWS.n_views
 
 
+def test_the_statistic_of_a_step_on_all_views_is_the_sum_over_them(random_gaussians: Make) -> None:
+    # Each view counts with its own gradient, not with its share of the step: the threshold is for a mean over views.
+    g = random_gaussians(12, extent=6.0)
+    problem = fit.problem_of(project(replace(g, means=g.means + 0.2), VIEWS).numpy(), VIEWS, GRID, 1.0, PLAIN)
+    singles = [fit.step(fit.init(g, 0), problem, PLAIN, 0.0, view=v).statistic for v in range(VIEWS.n_views)]
+    together = fit.step(fit.init(g, 0), problem, replace(PLAIN, views_per_step=VIEWS.n_views), 0.0)
+    np.testing.assert_allclose(together.statistic, np.sum(singles, axis=0), rtol=1e-4)
+
+
+def test_the_misfit_of_all_views_is_the_root_mean_square_of_theirs(random_gaussians: Make) -> None:
+    g = random_gaussians(12, extent=6.0)
+    moved = replace(g, means=g.means + 0.2)
+    model, data = (project(one, VIEWS).numpy().astype(np.float64) for one in (moved, g))
+    each = np.linalg.norm((model - data).reshape(24, -1), axis=1) / np.linalg.norm(data.reshape(24, -1), axis=1)
+    assert each.min() > 0.01 and each.max() < 0.9  # far from 0 and 1, which are their own squares
+    found = fit.misfit_of(fit.init(moved, 0), _problem(g, PLAIN), PLAIN)
+    assert found == pytest.approx(np.sqrt((each**2).mean()), rel=2e-3)
+
+
 def test_settings_out_of_range_are_refused() -> None:
-    for bad in ({"views_per_step": 0}, {"coarse": 0}, {"tv_weight": -1.0}, {"ssim_weight": float("nan")}):
+    for bad in (
+        {"views_per_step": 0}, {"coarse": 0}, {"coarse": 2.5}, {"tv_size": 0}, {"tv_weight": -1.0},
+        {"tv_weight": float("inf")}, {"ssim_weight": float("nan")}, {"pace": float("nan")}, {"pace": -1.0},
+        {"decay": -1.0}, {"smallest": 0.0}, {"coarse_until": 2.0}, {"rates": (1e-3, 1e-3, 1e-3)},
+    ):  # fmt: skip
         with pytest.raises(ValueError, match=next(iter(bad))):
-            fit.FitSettings(**bad)
+            fit.FitSettings(**bad)  # type: ignore[arg-type]
+    for wrong in ({"sigmas": -1.0}, {"sigmas": float("nan")}, {"faint": -1.0}, {"faint": float("inf")}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            Truncation(**wrong)
 
 
 def test_a_model_without_gaussians_or_with_bad_ones_is_refused(random_gaussians: Make) -> None:
