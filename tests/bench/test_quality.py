@@ -3,8 +3,8 @@
 Run with  pytest -m bench -s tests/bench/test_quality.py -k "teapot-50"  (some minutes a case). One line a method: PSNR
 and SSIM as Zha et al. 2024 take them (volumes clipped at 0, SSIM the mean over the slices of three directions), wall
 and processor seconds. FISTA-TV stands at the best of the weights tried for each case and by the time of that one run;
-R²-Gaussian has its default settings everywhere; steps and Gaussians at the start stand in the rows. A row with sweeps is
-the row before, polished (`recon.polish`), and holds the time of both.
+R²-Gaussian has its default settings everywhere; steps and Gaussians at the start stand in the rows. A row with sweeps
+is the row before, polished (`recon.polish`), and holds the time of both.
 """
 
 from __future__ import annotations
