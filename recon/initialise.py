@@ -131,7 +131,7 @@ def sample_gaussians(
     keys = rng.exponential(size=candidates.size) / weight
     chosen = candidates if candidates.size <= n else candidates[np.argpartition(keys, n)[:n]]
     k, j, i = np.unravel_index(chosen, data.shape)
-    jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.voxel_size
+    jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.spacing[::-1]
     means = np.stack((x[i], y[j], z[k]), 1) + jitter
     scales = _SPREAD * neighbour_distance(means)
     scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))

@@ -38,7 +38,7 @@ def data_term(image: Tensor, target: Tensor, term: DataTerm) -> Tensor:
     difference = image - target
     if term.kind == L1:
         return difference.abs()
-    through = torch.ones_like(target) if term.kind == L2 else torch.exp(-term.depth * target)
+    through = torch.ones_like(target) if term.kind == L2 else torch.exp(-term.depth * target.clamp(min=0))
     return through * difference**2 / (2 * term.delta)
 
 

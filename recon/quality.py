@@ -143,7 +143,7 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
             if math.isfinite(gain):
                 candidates.append(Choice("r2", binning, share, int(steps), gain))
     if not candidates:
-        return Choice("fbp", min(8, max(1, largest_binning)), 0.0, 0, -math.inf)
+        return Choice("fbp", max(n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)), 0.0, 0, -math.inf)
     # Of equal promises the finer volume, then the fewer Gaussians.
     return max(candidates, key=lambda c: (c.gain, -c.binning, -c.share))
 

@@ -193,8 +193,9 @@ def _check(
     for name, (value, legal) in options.items():
         if value not in legal:
             raise ValueError(f"{name} must be one of {tuple(legal)}, got {value!r}")
-    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
-    turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone else 1)
+    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ;
+    # a cone's, and those that look down on the rotation axis, differ up to the whole turn.
+    turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
     if np.abs(np.sin(turn)).max() < 1e-6:
         raise ValueError(
             f"{geometry.n_views} views from one side ({np.rad2deg(geometry.angles[0]):g} degrees): one view does not "

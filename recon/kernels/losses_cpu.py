@@ -23,7 +23,8 @@ class DataTerm(NamedTuple):
     """What a pixel x that should be y costs; δ makes the three alike in size where |x - y| is about δ.
 
     L1: |x - y|.   L2: (x - y)² / 2δ.   POISSON: e^(-depth y) (x - y)² / 2δ, the second-order expansion of the
-    likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534).
+    likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534). No
+    matter transmits more than all, so a y below 0 weighs as one of 0: a few such pixels would outweigh all others.
     """
 
     kind: int
@@ -159,7 +160,7 @@ def _combine(
                     pull = difference * soft
                     value = difference * pull * _f(0.5)
                 else:
-                    pull = difference * soft * lanes.exp(y * depth)
+                    pull = difference * soft * lanes.exp(lanes.clamp(y, _f(0), _LARGEST) * depth)
                     value = difference * pull * _f(0.5)
                 slope = _across(half, 0, first, window) + y * _across(half, 2, first, window)
                 slope = slope + _f(2) * x * _across(half, 1, first, window)

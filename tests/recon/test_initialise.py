@@ -41,6 +41,15 @@ def test_nothing_is_placed_outside_the_field(rng: np.random.Generator) -> None:
     assert np.hypot(*placed.means.numpy()[:, :2].T).max() < 2.0 + 0.5
 
 
+def test_places_scatter_over_their_voxel_whatever_its_shape(rng: np.random.Generator) -> None:
+    grid = Grid((9, 30, 30), 0.2, slice_pitch=1.5)
+    volume = Volume(np.ones(grid.shape, np.float32), grid)
+    means = sample_gaussians(volume, 3000, rng, field_radius=10.0, smooth=0).means.numpy()
+    for found, centres, edge in zip(means.T, grid.coordinates()[::-1], grid.spacing[::-1], strict=True):
+        off = np.abs(found[:, None] - centres).min(1)
+        assert off.mean() == pytest.approx(edge / 4, rel=0.05)  # of what is uniform over one voxel
+
+
 def test_fewer_voxels_give_fewer_gaussians(rng: np.random.Generator) -> None:
     assert sample_gaussians(_ball(2.0), 10**6, rng, field_radius=6.0, smooth=0).n < 40
 

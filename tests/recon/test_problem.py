@@ -37,6 +37,17 @@ def test_images_times_scale_are_the_projections(rng: np.random.Generator) -> Non
     assert later.geometry.n_views == 4 and later.images[0] is problem.images[0]
 
 
+def test_line_integrals_below_zero_weigh_as_air_does(rng: np.random.Generator) -> None:
+    data = rng.uniform(0.2, 1.5, (3, 12, 18)).astype(np.float32)
+    data[0, ::3, ::4] = -3
+    likely, squares = (make_problem(data, VIEWS, GRID, 0.1, Cpu(), loss=k, ssim_weight=0) for k in ("poisson", "l2"))
+    slopes = []
+    for problem in (likely, squares):
+        image = problem.images[0] + np.float32(0.4)
+        slopes.append(np.array(problem.loss(image, problem.images[0], problem.target_maps[0])[1]))
+    np.testing.assert_allclose(slopes[0], np.exp(-np.maximum(data[0], 0)) * slopes[1], rtol=1e-4)
+
+
 def test_weights_follow_their_pixels(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     data[1, 2:4, 4:6] = np.nan

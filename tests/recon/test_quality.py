@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from recon.quality import CURVES, PRESETS, Choice, Curve, Speeds, choose, next_decibel, parse_budget, parts_of
@@ -30,6 +30,7 @@ def _cost(choice: Choice, speeds: Speeds) -> float:
     return time
 
 
+@example(1.0, Speeds(fbp=100.0, start=1.0, step=1.0, fill=1.0), 3)
 @given(BUDGETS, SPEEDS, st.integers(1, 4000))
 def test_what_is_chosen_fits_the_budget_or_is_the_smallest_there_is(
     budget: float, speeds: Speeds, largest: int

@@ -116,7 +116,7 @@ def _combine(  # type: ignore[no-untyped-def]
     else:
         pull = off * soft
         if KIND != _L2:
-            pull = pull * tl.exp(-depth * y)
+            pull = pull * tl.exp(-depth * tl.maximum(y, 0.0))
         cost = 0.5 * off * pull
     slope = px + 2.0 * x * pxx + y * pxy
     if WEIGHTED:

@@ -76,6 +76,19 @@ def test_squares_and_the_poisson_likelihood_equal_the_twin(
     np.testing.assert_allclose(gradient, x.grad.numpy(), atol=2e-5 * float(x.grad.abs().max()))
 
 
+def test_no_transmission_is_above_one(rng: np.random.Generator) -> None:
+    image, target = _images(rng)
+    target[3:9] -= np.float32(3)  # line integrals below zero: noise, or a flat field that has changed
+    likely, squares = (ProjectionLoss(image.shape, 0.0, term=DataTerm(kind, 0.02, 4.0)) for kind in (POISSON, L2))
+    maps, gradient, expected = likely.target_maps(target), np.empty_like(image), np.empty_like(image)
+    value = likely(image, target, maps, gradient)
+    squares(image, target, maps, expected)
+    expected *= np.where(target < 0, 1, np.exp(-4 * target))
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-7 * np.abs(expected).max())
+    twin = projection_loss(torch.from_numpy(image), torch.from_numpy(target), 0.0, term=likely.term)
+    assert value == pytest.approx(twin.item(), rel=1e-5)
+
+
 def test_the_poisson_term_is_the_likelihood_of_counts_near_its_minimum() -> None:
     # -log L of N counts where I0 e^-x are expected is I0 (e^-x + e^-y x), y = -log(N / I0); delta = 1 takes I0 away.
     y, step, depth = np.array([[0.3, 1.1, 2.5]]), 1e-3, 1.7
