@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from beamline.cli.narrate import results
+from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan import stop_signals
 from beamline.cli.told import told_as_json
 from beamline.config import config_folder, load
@@ -20,9 +21,7 @@ from beamline.terminal import Terminal
 
 @click.command()
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), help="Where runs get their folders.")
-@click.option(
-    "--seconds", type=click.FloatRange(min=0, min_open=True), help="Of fitting after the scan; more is better."
-)
+@click.option("--seconds", type=POSITIVE, help="Of fitting after the scan; more is better.")
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
     """Scan a simulated battery, grow its volume while it turns, and judge the volume against the truth.

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.errors import DataError
@@ -91,8 +92,8 @@ def _count(n: int, word: str) -> str:
 @click.argument("source", type=_PATH, metavar="IN")
 @click.argument("output", type=_PATH, metavar="OUT.h5")
 @scan_options
-@click.option("--pixel-size-um", type=click.FloatRange(min=0, min_open=True), help="At the sample.")
-@click.option("--energy-kev", type=click.FloatRange(min=0, min_open=True))
+@click.option("--pixel-size-um", type=POSITIVE, help="At the sample.")
+@click.option("--energy-kev", type=POSITIVE)
 @click.option("--sample", help="Its name, for the record.")
 @click.option("--no-data", type=float, help="A pixel value that means: not measured.")
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")

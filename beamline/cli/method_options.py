@@ -9,9 +9,11 @@ from typing import Any, get_args
 import click
 from click.core import ParameterSource
 
+from beamline.cli.numbers import POSITIVE
 from recon.initialise import Start
 from recon.problem import Loss
 from recon.quality import PRESETS, parse_budget
+from recon.reconstruction import DEFAULT_STEPS
 
 SETTINGS = (
     "steps",
@@ -99,10 +101,10 @@ def _option(name: str) -> str:
 
 
 _OPTIONS = (
-    click.option("--steps", type=click.IntRange(min=1), help="Steps of the fit (r2). Default: 1000."),
+    click.option("--steps", type=click.IntRange(min=1), help=f"Steps of the fit (r2). Default: {DEFAULT_STEPS}."),
     click.option(
         "--seconds",
-        type=click.FloatRange(min=0, min_open=True),
+        type=POSITIVE,
         help="Time for the fit (r2), instead of --steps; with --follow, after the scan has ended.",
     ),
     click.option(
@@ -160,7 +162,7 @@ _OPTIONS = (
     ),
     click.option(
         "--tv-weight",
-        type=click.FloatRange(min=0, min_open=True),
+        type=POSITIVE,
         help="Of the total variation in fista-tv and os-sirt-tv, in units of the sample's density.",
     ),
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import shlex
 import sys
 from collections.abc import Mapping
@@ -13,6 +15,7 @@ import click
 from beamline.checkpoints import Keeper
 from beamline.cli.method_options import SETTINGS, method_options, refuse_contradictions
 from beamline.cli.narrate import results
+from beamline.cli.numbers import NOT_NEGATIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
 from beamline.deliver import Target
@@ -56,11 +59,11 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 )
 @click.option(
     "--max-residual",
-    type=click.FloatRange(min=0),
+    type=NOT_NEGATIVE,
     metavar="X",
     help="Exit with code 6 where the data residual (of views held out, if there are any) is larger.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Of everything random.")
 @click.option("--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5), slices A to B.")
 @click.option(
     "-o",
@@ -100,10 +103,12 @@ def recon(
     settings = {name: said.pop(name) for name in SETTINGS}
     refuse_contradictions(click.get_current_context(), method, follow)
     output = output or Path(f"{file.stem}_{method}.h5")
+    page = report_beside(output) if report else None
+    refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})
     source, selection = chosen(file, seed, said)
     options = ReconOptions(
         source=source,
-        target=Target(output, report_beside(output) if report else None),
+        target=Target(output, page),
         selection=selection,
         method=method,
         budget=budget,
@@ -127,6 +132,17 @@ def recon(
         raise ScanStopped(f"The fit was ended early; {output} holds the volume as it then was.")
     if max_residual is not None:
         require(metrics, max_residual)
+
+
+def refuse_shared(files: Mapping[str, Path | None]) -> None:
+    """Raises UsageError where two of `files`, by option, are the same one: the second would be written over the first.
+
+    Only a checkpoint may take the place of the one that a fit begins from.
+    """
+    named = {option: os.path.normcase(path.resolve()) for option, path in files.items() if path is not None}
+    for one, other in itertools.combinations(named, 2):
+        if named[one] == named[other] and {one, other} != {"--checkpoint", "--resume"}:
+            raise click.UsageError(f"{one} and {other} are the same file, {files[other]}: name two.")
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.offline import SourceOptions
 from beamline.pipeline import Selection
@@ -97,9 +98,7 @@ _BEFORE = (
     ),
 )
 _AFTER = (
-    click.option(
-        "--pixel-size-um", type=click.FloatRange(min=0, min_open=True), help="At the sample; else the file's."
-    ),
+    click.option("--pixel-size-um", type=POSITIVE, help="At the sample; else the file's."),
     click.option(
         "--air",
         callback=air_columns,

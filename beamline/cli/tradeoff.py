@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import click
 
+from beamline.cli.numbers import POSITIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.events import fan_out
@@ -46,10 +47,10 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
 @click.option(
     "--max-seconds",
-    type=click.FloatRange(min=0, min_open=True),
+    type=POSITIVE,
     help="Wall time for all trials; the table is finished with those done until then.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Of everything random.")
 @click.option(
     "-o",
     "--output",

@@ -21,6 +21,7 @@ from beamline.cli.recon import repeated, report_beside
 from beamline.storage.recon_file import read_reconstruction
 from recon import fit
 from recon.fit import Progress
+from recon.reconstruction import DEFAULT_STEPS
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -147,8 +148,22 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),
     "no such device": ({}, ["-m", "r2", "--device", "abacus"], 2, "--device abacus"),
     "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5"),
-    "not a checkpoint": ({}, ["-m", "r2", "--resume", "scan.h5"], 5, "no checkpoint"),
-    "a checkpoint in the way": ({}, ["-m", "r2", "--checkpoint", "scan.h5"], 5, "never overwritten"),
+    "not a checkpoint": ({}, ["-m", "r2", "--resume", "scan.npy"], 5, "no checkpoint"),
+    "a checkpoint in the way": ({}, ["-m", "r2", "--checkpoint", "scan.npy"], 5, "never overwritten"),
+    "the scan as checkpoint": ({}, ["-m", "r2", "--checkpoint", "scan.h5"], 2, "FILE and --checkpoint are the same"),
+    "the scan to resume": ({}, ["-m", "r2", "--resume", "./scan.h5"], 2, "FILE and --resume are the same"),
+    "the scan as output": ({}, ["-o", "scan.h5"], 2, "FILE and --output are the same"),
+    "output as checkpoint": ({}, ["-m", "r2", "-o", "a.h5", "--checkpoint", "./a.h5"], 2, "--output and --checkpoint"),
+    "default as checkpoint": ({}, ["-m", "r2", "--checkpoint", "scan_r2.h5"], 2, "--output and --checkpoint"),
+    "report as checkpoint": ({}, ["-m", "r2", "-o", "a.h5", "--checkpoint", "a.html"], 2, "report and --checkpoint"),
+    "output to resume": ({}, ["-m", "r2", "-o", "a.h5", "--resume", "a.h5"], 2, "--output and --resume"),
+    "endless smoothing": ({}, ["-m", "fista-tv", "--tv-weight", "inf"], 2, "finite"),
+    "no smoothing": ({}, ["-m", "fista-tv", "--tv-weight", "nan"], 2, "finite"),
+    "no residual": ({}, ["--max-residual", "nan"], 2, "finite"),
+    "no time": ({}, ["-m", "r2", "--seconds", "nan"], 2, "finite"),
+    "endless time": ({}, ["-m", "r2", "--seconds", "inf"], 2, "finite"),
+    "a pixel of no size": ({}, ["--pixel-size-um", "nan"], 2, "finite"),
+    "a seed below zero": ({}, ["--seed", "-1"], 2, "--seed"),
     "a nameless checkpoint": ({}, ["-m", "r2", "--checkpoint", ""], 2, "fit.checkpoint.h5"),
     "no file": ({}, ["-o", "."], 2, "directory"),
     "nameless": ({}, ["-o", ""], 2, "HDF5"),
@@ -291,6 +306,10 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     assert result.exit_code == 5
     assert "is of another fit: projections" in result.stderr and "detector_shape" in result.stderr
     assert "other.h5" not in _left(folder)
+
+
+def test_the_default_of_steps_is_told_as_it_is() -> None:
+    assert f"Default: {DEFAULT_STEPS}." in " ".join(_beamline("recon", "--help").stdout.split())
 
 
 def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:

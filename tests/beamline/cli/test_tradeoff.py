@@ -82,6 +82,8 @@ def test_ctrl_c_is_exit_code_4_with_a_table(folder: Path, monkeypatch: pytest.Mo
         (["--views", "fixed:31"], 2, "30"),
         (["--truth", "missing.npz"], 2, "missing.npz"),
         (["--max-seconds", "0"], 2, "0"),
+        (["--max-seconds", "nan"], 2, "finite"),
+        (["--seed", "-1"], 2, "--seed"),
         (["-o", "scan.h5"], 2, "scan.h5"),
         (["-o", "."], 5, "never overwritten"),
     ],
