@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 import recon
 from beamline.held_out import with_held_out
-from beamline.pipeline import Prepared
+from beamline.pipeline import Prepared, Warn
 from recon.binning import bin_views
 from recon.calibrate import calibrate
 from recon.fbp import Filter
@@ -67,11 +68,10 @@ class Budgeted:
 
     def said(self, budget: float) -> str:
         """What was chosen, in a line."""
-        how = "fbp"
+        fit = ""
         if self.choice.method == "r2":
-            how = f"r2, {self.result.history[-1].step} steps from {self.placed} Gaussians"
-        joined = f", pixels joined {self.choice.binning} x {self.choice.binning}" if self.choice.binning > 1 else ""
-        return f"{how}{joined}: {self.seconds:.1f} s of {parts_of(budget)}"
+            fit = f", {self.result.history[-1].step} steps from {self.placed} Gaussians"
+        return f"{_named(self.choice, fit)}: {parts_of(self.seconds)} of {parts_of(budget)}"
 
 
 def within(
@@ -82,11 +82,12 @@ def within(
     now: Now,
     on_progress: Callable[[Progress], None],
     stopped: Callable[[], bool],
+    warn: Warn,
 ) -> Budgeted:
     """Reconstruct within `budget` seconds by `now`, the measuring included.
 
     Placing is run and timed before the fit gets what is left, and filling is timed on a slab of what was placed: only
-    the choice rests on predictions.
+    the choice rests on predictions. Where even the cheapest choice will be late, `warn` is told so before the work.
 
     Raises:
         ValueError: the views cannot be reconstructed.
@@ -95,10 +96,18 @@ def within(
     data, geometry = prepared.projections.data, prepared.geometry
     speeds = calibrate(data, geometry, Grid.matching(geometry), now)
     unbinned = default_count(Grid.of_field(geometry, geometry.sample_pitch))  # the curves count in these
-    choice = choose(budget - (now() - begin), speeds, min(geometry.detector_shape))
+    spent = now() - begin
+    # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
+    choice = choose(max(budget - spent, sys.float_info.min), speeds, min(geometry.detector_shape))
     if choice.method == "fbp" and not has_direct_method(geometry):
         # There is only the volume that Gaussians are placed by; the fewest of them, and a step, are the next best.
         choice = replace(choice, method="r2", share=min(curve.share for curve in CURVES) / choice.binning**3)
+    late = spent + _least(choice, speeds) - budget
+    if late > 0:
+        warn(
+            f"{parts_of(budget)} are too few for this scan: measuring this machine took {parts_of(spent)}, and the "
+            f"cheapest choice, {_named(choice)}, will be about {parts_of(late)} late."
+        )
     prepared = joined(prepared, choice.binning)
     data, geometry = prepared.projections.data, prepared.geometry
     grid = Grid.matching(geometry)
@@ -118,6 +127,19 @@ def within(
         on_progress=on_progress, should_stop=lambda: stopped() or now() >= end, now=now,
     )  # fmt: skip
     return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
+
+
+def _named(choice: Choice, fit: str = "") -> str:
+    joined = f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else ""
+    return f"{choice.method}{fit}{joined}"
+
+
+def _least(choice: Choice, speeds: Speeds) -> float:
+    """Seconds that a choice takes at the least: for a fit placing, a step and filling; as `choose` counts them."""
+    first = speeds.fbp / choice.binning**3
+    if choice.method == "fbp":
+        return first
+    return first + (speeds.start + speeds.fill) * choice.share + speeds.step / choice.binning**2
 
 
 def joined(prepared: Prepared, factor: int) -> Prepared:

@@ -157,7 +157,7 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = 
         if options.budget is None:
             made = reconstruct(options, prepared, Grid.matching(prepared.geometry), sink, clock, stopped, warn)
         else:
-            made, prepared, factor = spend(options, options.budget, prepared, sink, clock, stopped)
+            made, prepared, factor = spend(options, options.budget, prepared, sink, clock, stopped, warn)
             selection = replace(selection, binning=selection.binning * factor)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
     context = Context(facts, selection, options.command, options.seed, warn.said, started)
@@ -293,13 +293,19 @@ def _fit(
 
 
 def spend(
-    options: ReconOptions, budget: float, prepared: Prepared, sink: Sink, clock: Clock, stopped: Callable[[], bool]
+    options: ReconOptions,
+    budget: float,
+    prepared: Prepared,
+    sink: Sink,
+    clock: Clock,
+    stopped: Callable[[], bool],
+    warn: Warnings,
 ) -> tuple[Made, Prepared, int]:
     """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
     warm_up(geometry=prepared.geometry)  # compilation happens once on a machine; no budget pays for it
     try:
         listen = progress_events(sink, clock, budget)
-        done = within(budget, prepared, options.seed, options.filter, clock.now, listen, stopped)
+        done = within(budget, prepared, options.seed, options.filter, clock.now, listen, stopped, warn)
     except ValueError as error:
         raise DataError(f"{options.source.path} cannot be reconstructed: {error}") from error
     early = {"ended_early": True} if stopped() and done.choice.method != "fbp" else {}

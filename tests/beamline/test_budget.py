@@ -49,8 +49,9 @@ def prepared(tmp_path: Path) -> Prepared:
         return prepare(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
 
 
-def _spend(prepared: Prepared, budget: float, now: Ticking) -> Budgeted:
-    return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False)
+def _spend(prepared: Prepared, budget: float, now: Ticking, warned: list[str] | None = None) -> Budgeted:
+    said = [] if warned is None else warned
+    return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False, said.append)
 
 
 @pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
@@ -72,6 +73,35 @@ def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypat
     assert (done.choice.method, done.choice.binning) == ("fbp", 2)
     assert done.result.volume.grid.shape == (3, 20, 20)
     assert "pixels joined 2 x 2" in done.said(5.0) and done.said(5.0).startswith("fbp")
+
+
+def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said_to_be_late(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Ticking(0.01)
+
+    def slow(*_: object) -> Speeds:
+        clock.time += 7.0
+        return Speeds(432.0, 50.0, 3.0, 10.0)
+
+    monkeypatch.setattr(module, "calibrate", slow)
+    warned: list[str] = []
+    done = _spend(prepared, 5.0, clock, warned)
+    joined_pixels = done.choice.binning
+    assert done.choice.method == "fbp" and joined_pixels >= 4  # about as many as six rows allow
+    assert done.seconds > 7 and f"of {5.0:.3g} s" in done.said(5.0)
+    assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
+    late = 7.01 + 432 / joined_pixels**3 - 5
+    assert warned[0].endswith(f"fbp, pixels joined {joined_pixels} x {joined_pixels}, will be about {late:.3g} s late.")
+    _spend(prepared, 20.0, clock, warned)
+    assert len(warned) == 1
+
+
+def test_the_shortest_fit_is_said_to_be_late_too(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    warned: list[str] = []
+    _spend(_cone(prepared, 3.6), 0.001, Ticking(0.01), warned)
+    assert len(warned) == 1 and "the cheapest choice, r2, pixels joined" in warned[0]
 
 
 def _cone(prepared: Prepared, turn: float, magnification: float = 10.0, tilt: float = 0.0) -> Prepared:
@@ -185,7 +215,7 @@ def test_a_real_budget_on_a_real_clock(prepared: Prepared) -> None:
     """Four seconds, and a tenth of grace; a machine busy with other work may stop this process for a while."""
     warm_up()
     begin = time.perf_counter()
-    done = within(4.0, prepared, 0, "hann", time.perf_counter, lambda p: None, lambda: False)
+    done = within(4.0, prepared, 0, "hann", time.perf_counter, lambda p: None, lambda: False, lambda w: None)
     took = time.perf_counter() - begin
     assert done.choice.method == "r2"
     assert 3.0 < took < 4.4
