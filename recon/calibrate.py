@@ -40,10 +40,10 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     Raises:
         ValueError: the scan holds no matter.
     """
-    field = Grid.of_field(geometry, max(geometry.sample_pitch, grid.voxel_size))
+    field = Grid.for_fit(geometry, grid)
     count = default_count(field)
     slab, part = _slab(projections, geometry)
-    slices = Grid.matching(part)
+    slices = Grid.of_field(part, part.sample_pitch)
     whole = field.shape[0] / slices.shape[0]
     views = geometry.n_views / part.n_views
     first_volume(slab, part, slices)  # threads wake up and pages come in
@@ -53,7 +53,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
 
     begin = now()
     placed = sample_gaussians(
-        first, max(1, round(count / whole)), np.random.default_rng(0), field_radius=_radius(geometry)
+        first, max(1, round(count / whole)), np.random.default_rng(0), field_radius=geometry.reach
     )
     start_seconds = (now() - begin) * whole
     voxelize(placed, slices)
@@ -86,7 +86,7 @@ def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
     factor = max(1, min(-(-geometry.detector_shape[1] // _COARSE_COLS), geometry.detector_shape[0]))
     views = _around(geometry, _COARSE_VIEWS)
     coarse = geometry.select(views).binned(factor)
-    grid = Grid.matching(coarse)
+    grid = Grid.of_field(coarse, coarse.sample_pitch)
     volume = first_volume(bin_views(projections[views], factor), coarse, grid)
     unit = density_unit(volume)
     cells = np.flatnonzero(volume.data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
@@ -120,8 +120,3 @@ def _around(geometry: Geometry, most: int) -> NDArray[np.int64]:
     n, turn = geometry.n_views, 2 * np.pi if geometry.is_cone else np.pi
     order = np.argsort(np.mod(geometry.angles, turn), kind="stable")
     return np.sort(order[np.arange(min(n, most)) * n // min(n, most)])
-
-
-def _radius(geometry: Geometry) -> float:
-    cols, axis = geometry.detector_shape[1], geometry.axis_col
-    return max(axis + 0.5, cols - axis - 0.5) * geometry.sample_pitch

@@ -29,6 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 
 F64 = NDArray[np.float64]
 
+_SHORT_OF_SOURCE = 0.7  # of sod: the corners of a box that reaches so far still lie before the source
+
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
@@ -129,6 +131,23 @@ class Geometry:
         """Detector pixel in mm at the rotation axis."""
         return self.pixel_pitch * self.sod / self.sdd if self.is_cone else self.pixel_pitch
 
+    @property
+    def reach(self) -> float:
+        """mm from the rotation axis to the farthest edge of the columns that any view has, measured at the axis.
+
+        Rolled views count as straight ones. A cone so wide that this comes near its source reaches 0.7 sod.
+        """
+        cols, axis = self.detector_shape[1], self.axis_col + self.shifts[:, 0]
+        reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
+        return float(min(reach, _SHORT_OF_SOURCE * self.sod))
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Lowest and highest z in mm, at the rotation axis, that any view sees; tilted views count as straight ones."""
+        rows, axis = self.detector_shape[0], self.axis_row + self.shifts[:, 1]
+        low, high = -0.5 - axis.max(), rows - 0.5 - axis.min()
+        return float(low * self.sample_pitch), float(high * self.sample_pitch)
+
     def axes(self, view: int) -> F64:
         """Unit vectors [3, 3] of one view in the object's frame: along the columns, along the rows, along the beam."""
         c, s = math.cos(self.angles[view]), math.sin(self.angles[view])
@@ -158,16 +177,22 @@ class Geometry:
         )  # fmt: skip
 
     def at(self, angles: ArrayLike) -> Geometry:
-        """The same set-up at other angles (radians), without the shifts of single views.
+        """The same set-up at other angles (radians), with the shift, roll and tilt that all views have.
 
         Raises:
-            ValueError: for bad angles, or where roll or tilt differ between views: which would the new ones have?
+            ValueError: for bad angles, or where these differ between views: which would the new ones have?
         """
-        if np.ptp(self.roll) > 0 or np.ptp(self.tilt) > 0:
-            raise ValueError("roll or tilt differ from view to view: say those of the new angles, too")
+        for name, own in (("shifts", self.shifts), ("roll", self.roll), ("tilt", self.tilt)):
+            widest = float(np.ptp(own, axis=0).max())
+            if widest > 0:
+                raise ValueError(
+                    f"{name} differ from view to view (by up to {widest:.3g}), so that those of views at other angles "
+                    "are not known: give a geometry whose views have the same, or make one of all views"
+                )
+        n = np.size(angles)
         return _checked(
             angles, self.detector_shape, self.pixel_pitch, self.axis_col, self.axis_row, self.sod, self.sdd,
-            None, self.roll[0], self.tilt[0],
+            np.broadcast_to(self.shifts[0], (n, 2)), self.roll[0], self.tilt[0],
         )  # fmt: skip
 
     def straightened(self) -> Geometry:

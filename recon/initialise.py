@@ -69,9 +69,7 @@ def place(
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
     volume = first_volume(projections, geometry, grid, start)
-    cols, axis = geometry.detector_shape[1], geometry.axis_col
-    radius = max(axis + 0.5, cols - axis - 0.5) * geometry.sample_pitch
-    placed = sample_gaussians(volume, wanted, rng, field_radius=radius)
+    placed = sample_gaussians(volume, wanted, rng, field_radius=geometry.reach)
     return scale_to_data(placed, projections, geometry, rays=rays)
 
 

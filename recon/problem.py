@@ -105,9 +105,29 @@ def extend(problem: Problem, projections: F32, angles: NDArray[np.float64], weig
     """The problem with more views [view, row, col]; those it has are not copied.
 
     The size of new values is not judged: where the first views showed nothing, it is the density unit that is wrong.
+
+    Raises:
+        ValueError: where the problem's views differ in shift, roll or tilt, see `Geometry.at`.
     """
     geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
     return replace(_with_views(problem, *masked(projections, weights)), geometry=geometry)
+
+
+def joined(geometry: Geometry, factor: int) -> Geometry:
+    """The geometry of factor x factor joined pixels, each in the middle of its own, while the sample stays in place.
+
+    `Geometry.binned` counts a parallel beam's heights from the middle of the rows that are left: a sample of its own.
+
+    Raises:
+        ValueError: where the detector has fewer rows or columns than are to be joined.
+    """
+    if factor > min(geometry.detector_shape):
+        rows, cols = geometry.detector_shape
+        raise ValueError(
+            f"coarse={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set `coarse` to "
+            f"{min(rows, cols)} or less (1: the fit begins on single pixels)"
+        )
+    return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
 
 
 def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Problem:
@@ -115,7 +135,11 @@ def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Pr
 
     A joined pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
     have no part in it.
+
+    Raises:
+        ValueError: as `joined`.
     """
+    geometry = joined(problem.geometry, factor)
     data, weights = problem.projections, None
     if any(w is not None for w in problem.weights):
         ones = np.ones(problem.geometry.detector_shape, np.float32)
@@ -126,7 +150,7 @@ def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Pr
     else:
         data = bin_views(data, factor)
     return make_problem(
-        data, problem.geometry.binned(factor), problem.grid, problem.unit, problem.backend,
+        data, geometry, problem.grid, problem.unit, problem.backend,
         weights=weights, loss=loss, ssim_weight=ssim_weight,
     )  # fmt: skip
 

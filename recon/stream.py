@@ -35,13 +35,17 @@ class StreamingFit:
     """An R²-Gaussian fit whose views arrive in time.
 
     Args:
-        template: geometry of the views to come; its angles are ignored.
+        template: geometry of the views to come; its angles are ignored, the shift, roll and tilt of its views are
+            those of all views to come.
         grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
         seed: of every random choice.
         gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
         settings: of the fit.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
         now: a clock in s.
+
+    Raises:
+        ValueError: for no Gaussians, or a template whose views differ in shift, roll or tilt.
     """
 
     def __init__(
@@ -56,7 +60,7 @@ class StreamingFit:
         first_span: float = np.pi / 6,
         now: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._template, self._grid = template, grid or Grid.matching(template)
+        self._template, self._grid = template.at([0.0]), grid or Grid.matching(template)
         self._rng = np.random.default_rng(seed)
         if gaussians is not None and gaussians < 1:
             raise ValueError(f"a model needs at least one Gaussian, got {gaussians}")
@@ -208,7 +212,7 @@ class StreamingFit:
     def _place_first(self) -> None:
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        field = Grid.of_field(self._template, max(geometry.sample_pitch, self._grid.voxel_size))
+        field = Grid.for_fit(self._template, self._grid)
         placed = place(data, geometry, field, self._count, self._rng)
         self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
         self._state = fit.init(placed, self._rng)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from recon.geometry import Geometry
 
+_COARSEST = 4.0  # pixels: voxels of a fit's box, however coarse the volume that is wanted
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -48,17 +50,28 @@ class Grid:
 
     @classmethod
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
-        """A box around the rotation axis that holds all that any view sees, however far from the middle the axis is.
+        """A box around the rotation axis that holds all that any view sees, wherever the axis falls in it.
 
-        An axis off the detector counts as one at its edge. A cone's field is measured at the rotation axis, as its
-        makers do: what lies nearer the source is seen larger, and by few views only.
+        It spans what shifted views see, and is as wide as needed for an axis off the detector; rolled and tilted views
+        count as straight ones. A cone's field is measured at the rotation axis, as its makers do: what lies nearer the
+        source is seen larger, and by few views only. The box of a wide cone ends before its source.
         """
-        rows, cols = geometry.detector_shape
-        axis = min(max(geometry.axis_col, -0.5), cols - 0.5)
-        per_voxel = geometry.sample_pitch / voxel_size
-        across, along = 2 * max(axis + 0.5, cols - axis - 0.5) * per_voxel, rows * per_voxel
+        low, high = geometry.heights
+        across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
         nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error is no voxel
-        return cls((nz, nx, nx), voxel_size, (geometry.middle_height, 0.0, 0.0))
+        if geometry.is_cone and nx * voxel_size >= math.sqrt(2) * geometry.sod:
+            nx = max(1, math.floor(across))  # the corners of the last voxel would reach the source
+        return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
+
+    @classmethod
+    def for_fit(cls, geometry: Geometry, wanted: Grid) -> Grid:
+        """The box that a fit covers whatever volume is wanted of it: the field, in voxels like those wanted.
+
+        They are no finer than a pixel, which the views do not resolve, and no coarser than four, from which no fit
+        could start.
+        """
+        pixel = geometry.sample_pitch
+        return cls.of_field(geometry, min(max(wanted.voxel_size, pixel), _COARSEST * pixel))
 
     @property
     def spacing(self) -> tuple[float, float, float]:

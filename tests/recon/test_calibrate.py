@@ -81,6 +81,17 @@ def test_some_views_stand_all_around_in_any_order(beam: str, order: np.ndarray) 
     assert module._around(geometry, 99).tolist() == list(range(40))
 
 
+def test_shifted_views_are_measured_on_all_that_they_see() -> None:
+    # Moved by as much as the detector is high or nearly as wide, with an axis that makes up for it: the same scan.
+    plain, ticks = BEAMS["parallel"], iter(range(100_000))
+    shifts = np.tile([50.0, 24.0], (40, 1))
+    moved = Geometry.parallel(TURN / 2, SHAPE, 0.1, 29.5 - 50, axis_row=11.5 - 24, shifts=shifts)
+    grid = Grid.matching(plain)
+    assert Grid.for_fit(moved, grid) == Grid.for_fit(plain, grid)
+    speeds = calibrate(_views(plain), moved, grid, lambda: float(next(ticks)))
+    assert min(speeds.fbp, speeds.start, speeds.step, speeds.fill) > 0
+
+
 def test_views_of_nothing_are_refused() -> None:
     geometry = BEAMS["cone"]
     with pytest.raises(ValueError, match="no matter"):

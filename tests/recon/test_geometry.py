@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.geometry import Geometry
+from recon.problem import joined
 from recon.volume import Grid, Volume
 
 
@@ -82,20 +83,6 @@ def test_the_edges_are_half_a_voxel_beyond_the_centres() -> None:
         assert (low[axis], high[axis]) == pytest.approx((centres[0] - 0.25, centres[-1] + 0.25))
 
 
-@given(
-    rows=st.integers(1, 9), cols=st.integers(1, 40), axis=st.floats(-60, 60), pitch=st.floats(1e-3, 1e3),
-    coarser=st.floats(1, 5),
-)  # fmt: skip
-def test_the_field_holds_every_ray_and_no_more(rows: int, cols: int, axis: float, pitch: float, coarser: float) -> None:
-    views = Geometry.parallel([0.0], (rows, cols), pitch, axis)
-    field = Grid.of_field(views, pitch * coarser)
-    (_, _, low), (x, y, high) = field.edges
-    on = min(max(axis, -0.5), cols - 0.5)
-    reach = max(on + 0.5, cols - on - 0.5) * pitch
-    assert x == y and reach * (1 - 1e-5) <= x < reach + pitch * coarser
-    assert -low == high and rows * pitch / 2 * (1 - 1e-5) <= high < rows * pitch / 2 + pitch * coarser
-
-
 def test_the_field_of_a_centred_axis_is_the_matching_grid() -> None:
     for cols, pitch in ((7, 0.1), (160, 0.0046), (2048, 1.0)):
         views = Geometry.parallel([0.0], (5, cols), pitch)
@@ -137,6 +124,84 @@ def _pixel(geometry: Geometry, view: int, point: np.ndarray) -> np.ndarray:
 finite = st.floats(-2, 2)
 
 
+def _edges(geometry: Geometry, view: int) -> np.ndarray:
+    """u and z in mm [2, 2] at which the first and last edge of a view's columns and rows see the plane of the axis.
+
+    From where three points of that plane fall, so from nothing but trigonometry: pixels are linear in u and z there.
+    """
+    c, s = np.cos(geometry.angles[view]), np.sin(geometry.angles[view])
+    middle, right, up = (_pixel(geometry, view, np.array(p)) for p in ((0.0, 0.0, 0.0), (c, s, 0.0), (0.0, 0.0, 1.0)))
+    rows, cols = geometry.detector_shape
+    u = (np.array([-0.5, cols - 0.5]) - middle[0]) / (right - middle)[0]
+    z = (np.array([-0.5, rows - 0.5]) - middle[1]) / (up - middle)[1]
+    return np.stack((u, z))
+
+
+moves = st.lists(st.tuples(st.floats(-30, 30), st.floats(-30, 30)), min_size=1, max_size=4)
+
+
+@given(
+    rows=st.integers(1, 9), cols=st.integers(1, 40), axis=st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
+    pitch=st.floats(1e-3, 1e3), coarser=st.floats(1, 5), shifts=moves, cone=st.booleans(),
+)  # fmt: skip
+def test_the_field_holds_every_ray_and_no_more(
+    rows: int, cols: int, axis: tuple[float, float], pitch: float, coarser: float,
+    shifts: list[tuple[float, float]], cone: bool,
+) -> None:  # fmt: skip
+    angles, how = 0.7 * np.arange(len(shifts)), {"axis_row": axis[1], "shifts": shifts}
+    if cone:
+        views = Geometry.cone(angles, (rows, cols), 2 * pitch, 1000 * pitch, 2000 * pitch, axis[0], **how)
+    else:
+        views = Geometry.parallel(angles, (rows, cols), pitch, axis[0], **how)
+    voxel = pitch * coarser
+    (*_, bottom), (x, y, top) = Grid.of_field(views, voxel).edges
+    u, z = np.stack([_edges(views, view) for view in range(views.n_views)], axis=1)
+    slack = 1e-5 * voxel
+    # The plane of the axis turns: what is seen at u is somewhere on the circle of that radius.
+    assert x == y and np.abs(u).max() - slack <= x < np.abs(u).max() + voxel / 2 + slack
+    assert bottom <= z.min() + slack and z.max() - slack <= top
+    assert top - bottom < np.ptp(z) + voxel + slack and top + bottom == pytest.approx(z.min() + z.max(), abs=slack)
+
+
+def test_shifts_that_all_views_share_are_an_axis_elsewhere() -> None:
+    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    moved = Geometry.parallel(angles, (10, 32), axis_col=29.5, axis_row=14.5)
+    shifted = Geometry.parallel(angles, (10, 32), shifts=np.tile([14.0, 10.0], (48, 1)))
+    assert Grid.of_field(moved, 1.0) == Grid.of_field(shifted, 1.0) == Grid((10, 60, 60), centre=(-10.0, 0, 0))
+    beyond = Geometry.parallel(angles, (10, 48), axis_col=-20)
+    assert Grid.of_field(beyond, 1.0).shape == (10, 135, 135)  # to 67.5 pixels from the axis
+
+
+@given(sod=st.floats(3, 60), voxel=st.floats(1, 9), axis=st.floats(0, 40))
+def test_the_field_of_a_wide_cone_ends_before_its_source(sod: float, voxel: float, axis: float) -> None:
+    views = Geometry.cone([0.0, 2.0], (5, 40), 2.0, sod, 2 * sod, axis)
+    field = Grid.of_field(views, min(voxel, sod))
+    assert np.hypot(*field.edges[1, :2]) < sod
+    assert field.edges[1, 0] >= min(views.reach, 0.7 * sod - field.voxel_size / 2) * (1 - 1e-9)
+
+
+def test_a_fit_takes_voxels_like_those_wanted_from_one_to_four_pixels() -> None:
+    views = Geometry.cone([0.0], (8, 32), 1.0, 100.0, 200.0)  # pixels of 0.5 mm
+    for wanted, edge in ((0.1, 0.5), (0.5, 0.5), (1.2, 1.2), (2.0, 2.0), (32.0, 2.0)):
+        assert Grid.for_fit(views, Grid((1, 1, 1), wanted)) == Grid.of_field(views, edge)
+
+
+@given(factor=st.integers(1, 4), axis=st.floats(0, 30), row=st.floats(-3, 20), cone=st.booleans())
+def test_joined_pixels_stay_before_the_sample_where_they_were(
+    factor: int, axis: float, row: float, cone: bool
+) -> None:  # fmt: skip
+    how = {"axis_row": row, "shifts": [[1.0, -2.0]]}
+    fine = (
+        Geometry.cone([0.3], (11, 31), 0.3, 50.0, 70.0, axis, **how)
+        if cone else Geometry.parallel([0.3], (11, 31), 0.3, axis, **how)
+    )  # fmt: skip
+    coarse = joined(fine, factor)
+    for point in ((0.0, 0.0, 0.0), (0.7, -0.4, 1.1)):
+        # A bin's middle is the middle of its pixels: pixel p of the fine detector is (p - (factor - 1) / 2) / factor.
+        expected = (_pixel(fine, 0, np.array(point)) - (factor - 1) / 2) / factor
+        np.testing.assert_allclose(_pixel(coarse, 0, np.array(point)), expected, atol=1e-9)
+
+
 @given(angle=st.floats(-9, 9), roll=finite, tilt=finite, point=st.tuples(finite, finite, finite), cone=st.booleans())
 def test_axes_are_a_right_handed_frame_that_puts_points_where_trigonometry_does(
     angle: float, roll: float, tilt: float, point: tuple[float, float, float], cone: bool
@@ -176,8 +241,11 @@ def test_views_keep_their_own_shifts_roll_and_tilt() -> None:
     second = g.select([1])
     assert second.shifts.tolist() == [[2, 3]] and second.roll.tolist() == [0.4] and second.tilt.tolist() == [0.2]
     assert not second.is_straight and Geometry.parallel([0.0], (2, 2), shifts=[[1, 1]]).is_straight
-    with pytest.raises(ValueError, match="differ from view to view"):
-        g.at([0.5])
+    for name in ("shifts", "roll", "tilt"):
+        with pytest.raises(ValueError, match=f"{name} differ from view to view"):
+            Geometry.parallel([0.1, 0.2], (2, 2), **{name: getattr(g, name)}).at([0.5])
+    same = Geometry.parallel([0.1, 0.2], (2, 2), shifts=[[1, 2], [1, 2]], roll=0.3, tilt=0.1).at([0.5, 0.6, 0.7])
+    assert same.shifts.tolist() == [[1, 2]] * 3 and same.roll.tolist() == [0.3] * 3 and same.tilt.tolist() == [0.1] * 3
     for bad in ({"shifts": [[0, 1]]}, {"roll": [0.1]}, {"tilt": np.nan}):
         with pytest.raises(ValueError, match="must be finite"):
             Geometry.parallel([0.1, 0.2], (2, 2), **bad)

@@ -12,6 +12,7 @@ from recon.backend import Cpu
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.problem import coarser, extend, make_problem, noise_level
+from recon.splat import Truncation, project
 from recon.volume import Grid
 
 VIEWS = Geometry.parallel([0.0, 0.9, 2.0], (12, 18), 0.5)
@@ -134,6 +135,46 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
         assert (1.0 if kept is None else kept[row, col]) == pytest.approx(w.mean(), rel=1e-5)
         if w.any():
             assert joined.projections[view, row, col] == pytest.approx((w * p).sum() / w.sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("beam", ["parallel", "cone"])
+@pytest.mark.parametrize("factor", [2, 3, 4, 8])
+def test_the_sample_stays_in_place_behind_joined_pixels(beam: str, factor: int) -> None:
+    # 23 rows and 37 columns are a multiple of no factor, and the axis is in the middle of neither.
+    width, cut = 9.0, Truncation(9.0, 1e-12)  # of the Gaussians, in pixels
+    how = {"axis_col": 15.3, "axis_row": 9.6, "shifts": [[0, 0], [1.5, -0.7], [0, 0]]}
+    views = (
+        Geometry.parallel(VIEWS.angles, (23, 37), 0.5, **how)
+        if beam == "parallel" else Geometry.cone(VIEWS.angles, (23, 37), 1.0, 200.0, 400.0, **how)
+    )  # fmt: skip
+    means = np.array([[1.0, -2.0, 3.0], [-2.0, 1.0, -4.0], [3.0, 2.0, 1.0]])
+    model = Gaussians.from_physical(means, np.full((3, 3), 0.5 * width), np.full(3, 0.2))
+    fine = project(model, views, truncation=cut).numpy()
+    rough = coarser(make_problem(fine, views, Grid.matching(views), 0.2, Cpu()), factor, "l1", 0.25)
+    seen = project(model, rough.geometry, truncation=cut).numpy()
+    off = np.abs(seen - rough.projections).max() / fine.max()
+    # A mean over a pixel differs from the value in its middle by factor² / 24 times the second derivatives, of which
+    # there are two, each at most 1 / width². Half a pixel off would be 0.6 * 0.5 / width, for factor 2 five times that.
+    assert off < factor**2 / 12 / width**2 * 1.1
+
+
+def test_a_detector_too_small_to_be_joined_is_told_by_name() -> None:
+    one = Geometry.parallel(VIEWS.angles, (1, 18), 0.5)
+    problem = make_problem(np.ones((3, 1, 18), np.float32), one, Grid.matching(one), 1.0, Cpu())
+    with pytest.raises(ValueError, match=r"coarse=2 joins 2 x 2 pixels, and the detector has 1 x 18: .* 1 or less"):
+        coarser(problem, 2, "l1", 0.25)
+
+
+def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    same = {"shifts": [[1.0, 2.0]] * 3, "roll": 0.1, "tilt": 0.2}
+    leaning = Geometry.parallel(VIEWS.angles, (12, 18), 0.5, **same)  # type: ignore[arg-type]
+    later = extend(make_problem(data, leaning, GRID, 0.3, Cpu()), data[:1], np.array([1.3])).geometry
+    assert later.shifts.tolist() == [[1.0, 2.0]] * 4
+    assert later.roll.tolist() == [0.1] * 4 and later.tilt.tolist() == [0.2] * 4
+    shifted = Geometry.parallel(VIEWS.angles, (12, 18), 0.5, shifts=[[0, 0], [1, 0], [0, 0]])
+    with pytest.raises(ValueError, match="shifts differ from view to view"):
+        extend(make_problem(data, shifted, GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
 
 
 def test_joined_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:

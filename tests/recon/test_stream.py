@@ -158,6 +158,23 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
         model.finish(0.1)
 
 
+def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np.ndarray) -> None:
+    for name, own in (("shifts", [[0, 0], [3, 0]]), ("roll", [0, 0.1]), ("tilt", [0, 0.1])):
+        with pytest.raises(ValueError, match=f"{name} differ from view to view"):
+            StreamingFit(Geometry.parallel([0, 1], SHAPE, PITCH, **{name: own}), GRID)  # type: ignore[arg-type]
+    # An axis elsewhere and the same shift of all views are one thing.
+    told = Geometry.parallel([0.0], SHAPE, PITCH, axis_col=VIEWS.axis_col - 5, shifts=[[5, 0]])
+    found = []
+    for template in (VIEWS, told):
+        model = StreamingFit(template, GRID, gaussians=500, now=StepClock())
+        model.add_views(data[:20], ANGLES[:20])
+        model.advance(0.1)
+        model.add_views(data[20:], ANGLES[20:])
+        model.advance(0.3)
+        found.append(model.snapshot().data)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-3 * float(found[0].max()))
+
+
 def test_the_count_follows_the_grid() -> None:
     assert default_count(Grid((4, 4, 4))) == 2000
     assert default_count(Grid((100, 200, 200))) == pytest.approx(np.pi / 4 * 4e6 / 60, rel=0.01)

@@ -18,7 +18,7 @@ from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.metrics import psnr
 from recon.reconstruction import Reconstruction, reconstruct
-from recon.splat import project
+from recon.splat import Truncation, project
 from recon.volume import Grid
 from tests.recon.hard_cases import spheres
 
@@ -200,6 +200,21 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     seen = fit.volume_of(state, flat, SHORT).data
     cubes = fit.volume_of(state, Grid((9, 48, 48)), SHORT).data
     np.testing.assert_allclose(seen[1], cubes[4], atol=1e-4 * float(cubes.max()))
+    # What the loss counts is the variation of these flat voxels, here of all of them: the box is as large as the grid.
+    whole = replace(SHORT, tv_size=48, truncation=Truncation(9.0, 1e-12), views_per_step=1)
+    losses = []
+    for weight in (0.0, 20.0):
+        state = fit.init(a_few(), 0)
+        volume = fit.volume_of(state, flat, whole).data / state.unit
+        losses.append(fit.step(state, problem, replace(whole, tv_weight=weight), 0.0, view=3).loss)
+    steps = np.concatenate([np.abs(np.diff(volume, axis=axis)).ravel() for axis in range(3)])
+    assert losses[1] - losses[0] == pytest.approx(20.0 * steps.mean(), rel=1e-3)
+    # And the fit follows it: more weight, less variation.
+    varied = []
+    for weight in (0.0, 20.0):
+        state = fit.run(fit.init(a_few(), 0), problem, replace(SHORT, tv_size=48, tv_weight=weight), 60)
+        varied.append(np.abs(np.diff(fit.volume_of(state, flat, SHORT).data, axis=2)).mean())
+    assert varied[1] < 0.7 * varied[0]
 
 
 def test_a_tenth_of_a_pixel_of_the_axis_costs_little(clean: F32, truth: F32) -> None:
