@@ -215,13 +215,15 @@ def _decibels(
     if not further.measurable:
         axes.text(0.97, 0.05, "next dB: none measurable", ha="right", fontsize=8, transform=axes.transAxes)
         return
+    said = f"next dB of the {further.of}: about {parts_of(further.seconds)} more"
+    axes.text(0.97, 0.05, said, ha="right", fontsize=8, transform=axes.transAxes)
+    if further.of == "volume":
+        return  # of which this curve is not
     end, top = float(seconds[-1]), float(quality[-1])
     axes.plot([end, end + further.seconds], [top, top + 1], color="tab:green", lw=1, ls=":")
     high = further.high if math.isfinite(further.high) else 3 * further.seconds
     axes.plot([end + further.low, end + high], [top + 1, top + 1], color="0.4", lw=1)
     axes.plot([end + further.seconds], [top + 1], color="0.4", marker="|", ms=8)
-    axes.text(0.97, 0.05, f"next dB: about {parts_of(further.seconds)} more", ha="right", fontsize=8,
-              transform=axes.transAxes)  # fmt: skip
 
 
 def _bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:

@@ -19,7 +19,7 @@ from beamline.storage.source import ScanSource
 from drivers.frame import FrameKind
 from recon.fbp import Filter
 from recon.fit import Progress
-from recon.quality import NextDecibel, next_decibel, parts_of
+from recon.quality import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
 from recon.volume import Volume
 
 METHOD_NAMES: Mapping[str, str] = {
@@ -73,9 +73,16 @@ class Made:
 
     @property
     def next_decibel(self) -> NextDecibel | None:
-        """What another dB would cost by its own record; None for a direct method, and while views still came."""
+        """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
+
+        None for a direct method, and while views still came.
+        """
         judged = judged_by(history_arrays(self.history))
-        return None if judged is None or _grew(self) else next_decibel(judged.seconds, judged.residuals)
+        if judged is None or _grew(self):
+            return None
+        if self.method == "r2":
+            return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)
+        return next_decibel(judged.seconds, judged.residuals)
 
     @property
     def next_decibel_said(self) -> str:
@@ -83,11 +90,16 @@ class Made:
         found, judged = self.next_decibel, judged_by(history_arrays(self.history))
         if found is None or judged is None:
             return ""
+        by_others = found.of == "volume"
         if not found.measurable:
-            return f"none measurable in the residual of {judged.views}"
+            of_what = "reach of what was measured" if by_others else f"the residual of {judged.views}"
+            return f"none {'in' if by_others else 'measurable in'} {of_what}"
         high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
         span = f"{parts_of(found.low)} {high}"
-        return f"about {parts_of(found.seconds)} more ({span}), from the residual of {judged.views} as it fell"
+        source = "as longer fits gained on two other scans"
+        if not by_others:
+            source = f"from the residual of {judged.views} as it fell"
+        return f"about {parts_of(found.seconds)} more ({span}), {source}"
 
 
 @dataclass(frozen=True)

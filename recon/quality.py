@@ -150,17 +150,18 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
 
 @dataclass(frozen=True)
 class NextDecibel:
-    """How long a fit would have to go on to gain another dB, from its own record.
+    """How much longer a reconstruction would have to be to gain another dB.
 
     Attributes:
-        seconds: more; infinite where the record shows no gain that could be told from its scatter, or where it lies
-            beyond ten times the time so far.
-        low, high: two standard errors of the slope to either side.
+        seconds: more; infinite where no gain could be told, or where it lies beyond ten times the time so far.
+        low, high: what it may be as well.
+        of: what gains it.
     """
 
     seconds: float
     low: float
     high: float
+    of: Literal["residual", "volume"] = "residual"
 
     @property
     def measurable(self) -> bool:
@@ -200,6 +201,34 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
     end = float(t[-1])
     middle, low, high = (_time_of(end, s) for s in (slope, slope + 2 * error, slope - 2 * error))
     return NextDecibel(middle, low, high) if math.isfinite(middle) else none
+
+
+def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
+    """What a fit of a dB more would take, from how fits of other lengths did (`CURVES`).
+
+    A fit's own record cannot tell: much of what it gains towards its end comes from its falling rates, and a longer fit
+    collects that once, too. The curves are means over two scans; `low` and `high` are the best and the worst of those
+    for different numbers of Gaussians. Beyond its last point a curve goes on along its last slope, to four times its
+    steps and no further.
+
+    Args:
+        seconds: that the fit took.
+        steps: that it made, its rates falling along them.
+    """
+    found = sorted(_further(curve, steps) for curve in CURVES if curve.binning == 1)
+    low, middle, high = (seconds * (factor - 1) for factor in (found[0], found[len(found) // 2], found[-1]))
+    return NextDecibel(middle, low, high, "volume")
+
+
+def _further(curve: Curve, steps: int) -> float:
+    """How many times the steps give a dB more; inf where that is not within reach."""
+    steps = max(steps, curve.points[0][0])
+    (before, gain), (last, most) = curve.points[-2:]
+    slope = max(0.0, (most - gain) / math.log(last / before))
+    at = np.geomspace(steps, max(4 * last, steps), 400)
+    gains = np.array([curve.gain(k) for k in at]) + slope * np.log(np.maximum(at / last, 1))
+    enough = np.flatnonzero(gains >= gains[0] + 1)
+    return float(at[enough[0]] / steps) if enough.size and at[enough[0]] <= _REACH * steps else math.inf
 
 
 def _time_of(end: float, slope: float) -> float:

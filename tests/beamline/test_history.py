@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from beamline.figures import quality_against_time
 from beamline.history import history_arrays, history_of, judged_by
 from beamline.recon_report import Made
 from recon.fit import Progress
-from recon.quality import next_decibel
+from recon.quality import next_decibel, next_decibel_of_fit
 from recon.volume import Grid, Volume
 
 GRID = Grid((1, 1, 1))
@@ -25,8 +26,8 @@ def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
     return tuple(Progress(k + 1, n, t, r / 2, r, 100, views) for k, (t, r) in enumerate(pairs))
 
 
-def _made(history: tuple[Progress, ...]) -> Made:
-    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), "r2", 1.0, history, {})
+def _made(history: tuple[Progress, ...], method: str = "sirt") -> Made:
+    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, {})
 
 
 def test_there_and_back() -> None:
@@ -65,7 +66,15 @@ def test_each_look_at_views_held_out_counts_once() -> None:
     np.testing.assert_array_equal(judged.residuals, [0.5, 0.4, 0.3])
 
 
-def test_a_fit_says_what_another_decibel_would_cost() -> None:
+def test_a_fit_says_what_longer_fits_gained() -> None:
+    made = _made(_record(3.0), "r2")
+    assert made.next_decibel == next_decibel_of_fit(30.0, 60)
+    assert "as longer fits gained on two other scans" in made.next_decibel_said
+    late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
+    assert _made(late, "r2").next_decibel_said == "none in reach of what was measured"
+
+
+def test_iterations_say_what_another_decibel_would_cost() -> None:
     made = _made(_record(3.0))
     assert made.next_decibel is not None
     assert made.next_decibel.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)

@@ -10,7 +10,21 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from recon.quality import CURVES, PRESETS, Choice, Curve, Speeds, choose, next_decibel, parse_budget, parts_of
+from recon.bench import spheres
+from recon.metrics import psnr
+from recon.quality import (
+    CURVES,
+    PRESETS,
+    Choice,
+    Curve,
+    Speeds,
+    choose,
+    next_decibel,
+    next_decibel_of_fit,
+    parse_budget,
+    parts_of,
+)  # fmt: skip
+from recon.reconstruction import reconstruct
 
 SPEEDS = st.builds(
     Speeds, fbp=st.floats(0.01, 100), start=st.floats(0.01, 100), step=st.floats(1e-4, 10), fill=st.floats(0.01, 50)
@@ -96,6 +110,36 @@ def test_of_a_flat_record_nothing_is_claimed(seed: int, n: int) -> None:
     assert not next_decibel(t, 10 ** (-(30 + rng.normal(0, 0.02, n)) / 20)).measurable
     falling = next_decibel(t, 10 ** (-(30 - 0.5 * np.log(t)) / 20))
     assert falling.seconds == math.inf
+
+
+@given(st.integers(1, 3000), st.floats(0.1, 1e4))
+def test_a_fit_is_told_what_fits_of_other_lengths_gained(steps: int, seconds: float) -> None:
+    found = next_decibel_of_fit(seconds, steps)
+    assert found.of == "volume" and 0 < found.low <= found.seconds <= found.high
+    longer = next_decibel_of_fit(2 * seconds, steps)
+    assert longer.seconds == pytest.approx(2 * found.seconds) or not found.measurable
+    if found.measurable:
+        most = max(found.seconds / seconds, 0) + 1
+        assert most <= 10 + 1e-9
+        # A curve of the middle does what was said of it: a dB more after so many times the steps.
+        curves = [c for c in CURVES if c.binning == 1]
+        inside = [c for c in curves if c.points[0][0] <= steps and steps * most <= c.points[-1][0]]
+        gains = [c.gain(steps * most) - c.gain(steps) for c in inside]
+        if len(inside) == len(curves):
+            assert min(gains) <= 1.05 and max(gains) >= 0.95
+
+
+@pytest.mark.slow
+def test_the_next_decibel_of_a_fit_is_about_what_it_takes() -> None:
+    """The forecast of the shorter fit's volume against longer fits of a third sample."""
+    data, geometry, truth = spheres(side=64, rows=32, views=40)
+    found = {
+        steps: psnr(truth, reconstruct(data, geometry, steps=steps).volume.data) for steps in (125, 150, 180, 250, 350)
+    }
+    at, gains = np.log(list(found)), np.array(list(found.values()))
+    forecast = next_decibel_of_fit(1.0, 125)
+    needed = float(np.exp(np.interp(gains[0] + 1, gains, at)) / 125 - 1)
+    assert forecast.seconds / 2.5 < needed < 2.5 * forecast.seconds
 
 
 @pytest.mark.parametrize(
