@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.errors import DataError
+from beamline.errors import ConfigError, DataError
 from beamline.pipeline import Prepared, Warn
 from beamline.storage.checkpoint_file import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.recon_file import Value, refuse_existing
-from recon.fit import FitSettings
+from recon.checkpoint import state_from
+from recon.fit import FitSettings, FitState
 from recon.geometry import Geometry
 
 _SHOWN = 40  # characters of a value that is told
@@ -86,7 +87,7 @@ class Keeper:
         The checkpoint may take the place of the one it begins from.
         """
         if self.resume is not None:
-            read_checkpoint(self.resume)
+            _whole(self.resume)
         if self.path is not None and not (self.resume is not None and self.path.resolve() == self.resume.resolve()):
             refuse_existing(self.path)
 
@@ -99,16 +100,22 @@ class Keeper:
             warn: is told where the plan is another, so that the volume is not that of a fit without a break.
 
         Raises:
+            ConfigError: the fit has more steps behind it than planned.
             DataError: the checkpoint was made from something else.
         """
         if self.resume is None:
             return None
-        kept = read_checkpoint(self.resume)
+        kept, reached = _whole(self.resume)
         others = differences(origin, kept.made_from)
         if others:
             raise DataError(
                 f"{self.resume} is of another fit: {_listed(others)}. Give the options that it was made with, or start "
                 "anew without --resume."
+            )
+        if 0 < steps < reached.step:
+            raise ConfigError(
+                f"--resume {self.resume} has {reached.step} steps behind it, more than the {steps} wanted: give at "
+                f"least {reached.step} with --steps, or start anew without --resume."
             )
         if steps != kept.steps or steps == 0:
             was = f"{kept.steps} steps" if kept.steps else "a time"
@@ -126,6 +133,26 @@ class Keeper:
             write_checkpoint(self.path, Checkpoint(state, origin, steps))
         except DataError as error:
             warn(f"A checkpoint was left out: {error}")
+
+
+def _whole(path: Path) -> tuple[Checkpoint, FitState]:
+    """The checkpoint, and the state in it.
+
+    Raises:
+        DataError: there is none, or it holds no state to go on from.
+    """
+    kept = read_checkpoint(path)
+    try:
+        reached = state_from(kept.state)
+        for name, values in kept.state.items():
+            # The last loss may be none yet, and so may the best of views held out.
+            if name not in ("scalars", "watch") and not np.isfinite(values).all():
+                raise ValueError(f"{name} of the checkpoint holds values that are not finite")
+        if not (np.isfinite(reached.unit) and reached.unit > 0):
+            raise ValueError(f"the density unit of the checkpoint is {reached.unit}")
+    except ValueError as error:
+        raise DataError(f"The checkpoint {path} is damaged: {error}. Resume from another, or start anew.") from error
+    return kept, reached
 
 
 def _listed(differences: Sequence[str]) -> str:

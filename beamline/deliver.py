@@ -92,6 +92,7 @@ def deliver(
         "elapsed": clock.now() - context.started,
         **own,
     }
+    summary |= {name: made.settings[name] for name in ("ended_early", "resumed_from") if name in made.settings}
     if made.chosen:
         summary["chosen"] = made.chosen
     if (further := made.next_decibel) is not None:

@@ -25,7 +25,7 @@ from beamline.pipeline import (
     refuse,
 )
 from beamline.recon_report import Context, Made, facts_of
-from beamline.stop import Stoppable, never_stopped
+from beamline.stop import Heeded, Stoppable, never_stopped
 from beamline.storage.recon_file import ReconRecord, write_reconstruction
 from beamline.storage.source import NotReadyError, ScanSource
 from beamline.storage.validate import reconstruction_blockers
@@ -301,7 +301,7 @@ class _Growing:
             )
         )
 
-        last = self._clock.now()
+        last, heeded = self._clock.now(), Heeded(stopped)
 
         def listen(progress: Progress) -> bool:
             nonlocal last
@@ -309,7 +309,7 @@ class _Growing:
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return stopped()
+            return heeded()
 
         try:
             self._say(self._fit.finish(seconds, listen))
@@ -320,7 +320,7 @@ class _Growing:
             **asdict(self._fit.settings),
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
-            **({"ended_early": True} if stopped() else {}),
+            **({"ended_early": True} if heeded.told else {}),
         }
         return Made(volume, "r2", self._clock.now() - self._begin, self._history, settings, self._options.filter)
 

@@ -19,7 +19,7 @@ from beamline.held_out import keep_back, with_held_out
 from beamline.measure import fit_truth, read_truth
 from beamline.pipeline import Prepared, Selection, prepare
 from beamline.recon_report import Context, Made, facts_of
-from beamline.stop import Stoppable, never_stopped
+from beamline.stop import Heeded, Stoppable, never_stopped
 from beamline.storage.source import Quantity, ScanSource, open_scan
 from drivers.clock import Clock
 from recon.backend import backend_for
@@ -199,6 +199,7 @@ def reconstruct(
     if options.method == "r2":
         return _fit(options, prepared, grid, sink, clock, stopped, warn)
     own: dict[str, Any] = {"filter": options.filter} if options.method == "fbp" else {}
+    heeded = Heeded(stopped)
     try:
         result = recon.reconstruct(
             prepared.projections.data,
@@ -210,12 +211,13 @@ def reconstruct(
             iterations=options.iterations,
             tv_weight=options.tv_weight,
             on_progress=progress_events(sink, clock),
-            should_stop=stopped,
+            should_stop=heeded,
             now=clock.now,
         )
     except ValueError as error:
         raise DataError(f"{options.source.path} cannot be reconstructed by {options.method}: {error}") from error
-    early = {"ended_early": True} if stopped() and options.method != "fbp" else {}
+    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
+    early = {"ended_early": True} if heeded.cut(reached, planned) else {}
     return Made(
         volume=result.volume,
         method=options.method,
@@ -241,8 +243,6 @@ def _fit(
         preset = PRESETS[options.quality]
         steps, polish = preset.steps, preset.polish
         gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
-        said = f"{options.quality}: {steps} steps from {gaussians} Gaussians"
-        said += f", {polish} sweeps on voxels" if polish else ""
     if steps is None and options.seconds is None:
         steps = DEFAULT_STEPS
     settings, keeper = FitSettings(loss=options.loss), options.keeper
@@ -254,6 +254,7 @@ def _fit(
     # So that the fit's time, and the time it says is left, hold no compilation.
     warm_up(options.device, options.loss, prepared.geometry, rays=settings.rays, start=options.start)
     data, geometry, held_out = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
+    heeded = Heeded(stopped)
     try:
         result = recon.reconstruct(
             data,
@@ -271,7 +272,7 @@ def _fit(
             device=options.device,
             polish=polish,
             on_progress=progress_events(sink, clock, options.seconds),
-            should_stop=stopped,
+            should_stop=heeded,
             on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, warn),
             now=clock.now,
         )
@@ -279,14 +280,22 @@ def _fit(
         raise DataError(f"{options.source.path} cannot be reconstructed by r2: {error}") from error
     if result.checkpoint is not None:
         keeper.write(origin, steps or 0, warn, result.checkpoint)
+    begun = int(result.settings["gaussians_at_start"])
+    if options.quality is not None:
+        said = f"{options.quality}: {steps} steps from {begun} Gaussians"
+        said += f", {polish} sweeps on voxels" if polish else ""
+    if options.gaussians is not None and resume is None and begun < options.gaussians:
+        warn(f"The fit started from {begun} Gaussians, not from {options.gaussians}: there is no matter for more.")
     used = {name: value for name, value in result.settings.items() if name != "held_out"}
+    # Sweeps come after the last step, and end early as well.
+    early = heeded.told if polish else heeded.cut(result.history[-1].step, steps or 0)
     resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
     return Made(
         volume=result.volume,
         method="r2",
         seconds=result.seconds,
         history=result.history,
-        settings={**used, **resumed, **({"ended_early": True} if stopped() else {})},
+        settings={**used, **resumed, **({"ended_early": True} if early else {})},
         filter=options.filter,
         chosen=said,
     )
@@ -302,13 +311,14 @@ def spend(
     warn: Warnings,
 ) -> tuple[Made, Prepared, int]:
     """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
+    heeded = Heeded(stopped)
     warm_up(geometry=prepared.geometry)  # compilation happens once on a machine; no budget pays for it
     try:
         listen = progress_events(sink, clock, budget)
-        done = within(budget, prepared, options.seed, options.filter, clock.now, listen, stopped, warn)
+        done = within(budget, prepared, options.seed, options.filter, clock.now, listen, heeded, warn)
     except ValueError as error:
         raise DataError(f"{options.source.path} cannot be reconstructed: {error}") from error
-    early = {"ended_early": True} if stopped() and done.choice.method != "fbp" else {}
+    early = {"ended_early": True} if heeded.told else {}
     made = Made(
         volume=done.result.volume,
         method=done.choice.method,

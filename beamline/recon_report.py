@@ -171,6 +171,8 @@ def compose(
         footnotes.append(
             "Time of R²-Gaussian: from the first look at the growing file to the volume, the scan included."
         )
+    if "resumed_from" in made.settings:
+        footnotes.append(f"Time of {name}: since the fit was resumed; what went before is not in it.")
     if truth is not None:
         footnotes.append(
             "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."

@@ -17,6 +17,22 @@ def never_stopped() -> Iterator[Callable[[], bool]]:
     yield lambda: False
 
 
+class Heeded:
+    """Whether work shall end early, asked on its behalf; remembers that it was told so."""
+
+    def __init__(self, stopped: Callable[[], bool]) -> None:
+        self._stopped = stopped
+        self.told = False
+
+    def __call__(self) -> bool:
+        self.told = self.told or self._stopped()
+        return self.told
+
+    def cut(self, done: int, planned: int) -> bool:
+        """Whether that left work undone: `planned` steps or iterations; 0 where there was another plan."""
+        return self.told and not 0 < planned <= done
+
+
 class ScanAborted(ScanStopped):
     """Ended at once, or before anything was acquired; what was acquired is in the file."""
 

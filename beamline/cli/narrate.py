@@ -26,5 +26,8 @@ def results(data: Mapping[str, Any]) -> str:
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
-            lines.append(f"{metric.label:<30}" + "".join(f"{cell:>14}" for cell in cells))
+            label = metric.label
+            if name == "seconds" and "resumed_from" in data:
+                label += ", since resumed"
+            lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
     return "\n".join(lines)

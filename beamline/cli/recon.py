@@ -121,15 +121,16 @@ def recon(
         unfinished=unfinished,
         command=repeated(sys.argv[1:]),
     )
-    clock, end = SystemClock(), EndOfFit()
+    clock = SystemClock()
     last: list[Event] = []
     with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         sink = fan_out(last.append, *(json_sinks or [terminal]))
-        metrics = (follow_scan if follow else run)(options, sink, clock, stoppable=end)
+        metrics = (follow_scan if follow else run)(options, sink, clock, stoppable=EndOfFit())
     if not as_json:
         click.echo(results(last[-1].data))
-    if end.asked:
-        raise ScanStopped(f"The fit was ended early; {output} holds the volume as it then was.")
+    if last[-1].data.get("ended_early"):
+        what = "fit was" if last[-1].data["method"] == "r2" else "iterations were"
+        raise ScanStopped(f"The {what} ended early; {output} holds the volume as it then was.")
     if max_residual is not None:
         require(metrics, max_residual)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 
 import click
@@ -41,30 +41,38 @@ def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
 
 
 class EndOfFit:
-    """Ctrl-C or SIGTERM during a fit: the first asks it to end with what it has, the second throws it away."""
+    """Ctrl-C, SIGTERM or SIGHUP during the work: the first asks for a volume as soon as there is one, the second for
+    none."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self._asked = False
 
     @contextmanager
     def __call__(self) -> Iterator[Callable[[], bool]]:
         with ExitStack() as restore:
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, *_ending()):
                 restore.callback(signal.signal, number, signal.signal(number, self._ask))
-            yield lambda: self.asked
+            yield lambda: self._asked
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+        if self._asked:
             raise KeyboardInterrupt
-        self.asked = True
-        click.echo("Ending the fit with what it has; once more throws it away.", err=True)
+        self._asked = True
+        with suppress(OSError):  # a terminal that has hung up takes no words
+            click.echo("Ending as soon as there is a volume; once more throws it away.", err=True)
 
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM ends the command as Ctrl-C does, so that no half-written file stays behind."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    """SIGTERM, and SIGHUP of a terminal that closes, end the command as Ctrl-C does: nothing half-written stays."""
+    with ExitStack() as restore:
+        for number in _ending():
+            restore.callback(signal.signal, number, signal.signal(number, signal.default_int_handler))
         yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+
+
+def _ending() -> list[signal.Signals]:
+    """The signals that ask a process to end, as far as this system has them and `nohup` has not taken them away."""
+    if sys.platform == "win32" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        return [signal.SIGTERM]
+    return [signal.SIGTERM, signal.SIGHUP]

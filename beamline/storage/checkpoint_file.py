@@ -59,6 +59,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     Raises:
         DataError: there is none, or the file is something else.
     """
+    if not path.is_file():
+        raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
     try:
         with h5py.File(path, "r") as file:
             said = file.attrs.get("format")

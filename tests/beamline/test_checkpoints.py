@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 
 from beamline.checkpoints import Keeper, differences, made_from
-from beamline.errors import DataError
+from beamline.errors import ConfigError, DataError
 from beamline.offline import SourceOptions
 from beamline.pipeline import Prepared, Selection, prepare
+from beamline.storage.checkpoint_file import Checkpoint, write_checkpoint
+from recon import fit
+from recon.checkpoint import arrays_of
 from recon.fit import FitSettings
+from recon.gaussians import Gaussians
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
@@ -78,19 +82,59 @@ def test_views_held_out_do_not_matter(prepared: Prepared) -> None:
     assert not differences(made_from(spoilt, SETTINGS, OTHERS), made_from(prepared, SETTINGS, OTHERS))
 
 
+def _state(**changes: Any) -> dict[str, Any]:
+    """Of a fit of five Gaussians that has begun."""
+    model = Gaussians.from_physical(np.zeros((5, 3)), np.ones((5, 3)), np.ones(5), density_unit=1.0)
+    return {**arrays_of(fit.init(model, 0)), **changes}
+
+
 def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: Prepared) -> None:
     path, said = tmp_path / "fit.h5", list[str]()
     origin = made_from(prepared, SETTINGS, OTHERS)
-    Keeper(path).write(origin, 100, said.append, {"a": np.arange(3)})
+    Keeper(path).write(origin, 100, said.append, _state())
     again = Keeper(path, path)
     again.refuse_existing()  # the one that it begins from may be replaced
     state = again.begin(origin, 100, said.append)
     assert state is not None and not said
-    np.testing.assert_array_equal(state["a"], [0, 1, 2])
+    assert state.keys() == _state().keys()
+    np.testing.assert_array_equal(state["statistic"], np.zeros(5))
     again.begin(origin, 200, said.append)
     assert "100 steps, this one is over 200 steps" in said[0]
     with pytest.raises(DataError, match=r"loss \(l1, l2 in the checkpoint|loss \(l2, l1 in the checkpoint"):
         again.begin(made_from(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"statistic": np.full(5, np.nan, np.float32)}, "statistic"),
+        ({"best.raw": np.full(5, np.inf)}, "best.raw"),
+        ({"scalars": np.array([np.nan, 0.1, 0.1])}, "density unit"),
+        ({"first.means": np.full((5, 3), np.nan, np.float32)}, "first.means"),
+        ({"generator": np.zeros(3, np.uint64)}, "generator"),
+    ],
+)
+def test_a_damaged_checkpoint_is_to_blame_before_any_work(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(**changes), {}, 100))
+    with pytest.raises(DataError, match=rf"checkpoint .*fit\.h5 is damaged: .*{said}"):
+        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+
+
+def test_a_checkpoint_that_lacks_arrays_is_to_blame(tmp_path: Path) -> None:
+    state = _state()
+    del state["second.raw"]
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, {}, 100))
+    with pytest.raises(DataError, match=r"fit\.h5 is damaged: .*second\.raw"):
+        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+
+
+def test_a_plan_shorter_than_what_is_done_is_refused(tmp_path: Path) -> None:
+    counts = np.array([100, 120, 0], np.int64)  # limit, step, seen
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(counts=counts), {}, 200))
+    again, said = Keeper(None, tmp_path / "fit.h5"), list[str]()
+    with pytest.raises(ConfigError, match=r"120 steps behind it, more than the 20 wanted: .* 120 with --steps"):
+        again.begin({}, 20, said.append)
+    assert again.begin({}, 120, said.append) is not None and again.begin({}, 0, said.append) is not None
 
 
 def test_a_file_in_the_way_is_refused_before_the_work(tmp_path: Path) -> None:

@@ -254,12 +254,13 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     run(part, lambda e: None, SystemClock(), after_30_steps)
     assert read_reconstruction(tmp_path / "part.h5").parameters["ended_early"]
     assert read_checkpoint(kept).state["counts"][1] == len(asked) + 1 < 80
-    rest = replace(whole, target=Target(tmp_path / "rest.h5", None), keeper=Keeper(None, kept))
+    rest = replace(whole, target=Target(tmp_path / "rest.h5", tmp_path / "rest.html"), keeper=Keeper(None, kept))
     run(rest, lambda e: None, SystemClock())
     np.testing.assert_array_equal(_volume(tmp_path / "rest.h5"), _volume(tmp_path / "out.h5"))
     assert np.abs(_volume(tmp_path / "part.h5") - _volume(tmp_path / "out.h5")).max() > 0
     parameters = read_reconstruction(tmp_path / "rest.h5").parameters
     assert parameters["resumed_from"] == str(kept) and parameters["steps"] == 80
+    assert "since the fit was resumed" in (tmp_path / "rest.html").read_text(encoding="utf-8")
 
 
 def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline import offline
+from beamline import budget, offline
 from beamline.cli.main import main
 from beamline.cli.recon import repeated, report_beside
 from beamline.storage.recon_file import read_reconstruction
-from recon import fit
+from recon import fit, reconstruction
+from recon.fbp import fbp
 from recon.fit import Progress
+from recon.quality import Speeds
 from recon.reconstruction import DEFAULT_STEPS
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
@@ -147,7 +149,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "following with a start": ({}, ["-m", "r2", "--follow", "--start", "tv"], 2, "finished scan"),
     "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),
     "no such device": ({}, ["-m", "r2", "--device", "abacus"], 2, "--device abacus"),
-    "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5"),
+    "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5 is not there"),
     "not a checkpoint": ({}, ["-m", "r2", "--resume", "scan.npy"], 5, "no checkpoint"),
     "a checkpoint in the way": ({}, ["-m", "r2", "--checkpoint", "scan.npy"], 5, "never overwritten"),
     "the scan as checkpoint": ({}, ["-m", "r2", "--checkpoint", "scan.h5"], 2, "FILE and --checkpoint are the same"),
@@ -249,14 +251,17 @@ def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPat
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+HANGUP = [] if sys.platform == "win32" else [signal.SIGHUP]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, *HANGUP])
 def test_a_fit_that_is_interrupted_delivers_what_it_has(
     folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     steps = _signal_at_step(monkeypatch, number, {20})
     result = _beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
     assert result.exit_code == 4, result.output
-    assert "ended early" in result.stderr
+    assert "The fit was ended early" in result.stderr
     assert steps[-1] == 20
     parameters = read_reconstruction(folder / "scan_r2.h5").parameters
     assert parameters["ended_early"] and parameters["steps"] == 20
@@ -285,9 +290,53 @@ def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, mo
     monkeypatch.setattr(offline, "progress_events", watched)
     result = _beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "100000", "--no-report")
     assert result.exit_code == 4, result.output
-    assert "ended early" in result.stderr
+    assert "The iterations were ended early" in result.stderr
     record = read_reconstruction(folder / "scan_sirt.h5")
     assert record.parameters["ended_early"] and record.history["step"][-1] == 5
+
+
+@pytest.mark.parametrize("options", [["-m", "fbp"], ["--budget", "20s"]])
+def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    def interrupted(*arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return fbp(*arguments)
+
+    monkeypatch.setattr(reconstruction, "fbp", interrupted)
+    monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1))
+    result = _beamline("recon", "scan.h5", *options, "-o", "out.h5", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "as soon as there is a volume" in result.stderr and "ended early" not in result.output
+    parameters = read_reconstruction(folder / "out.h5").parameters
+    assert parameters["method"] == "fbp" and "ended_early" not in parameters
+
+
+def test_a_fit_that_is_interrupted_in_its_last_step_is_complete(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _signal_at_step(monkeypatch, signal.SIGINT, {20})
+    result = _beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "ended_early" not in read_reconstruction(folder / "scan_r2.h5").parameters
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
+def test_a_terminal_that_closes_does_not_end_what_nohup_keeps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _signal_at_step(monkeypatch, signal.SIGHUP, {5})
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        result = _beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--no-report")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert result.exit_code == 0, result.output
+
+
+def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
+    result = _beamline("recon", "scan.h5", "--steps", "2", "--gaussians", "99999999", "--no-report")
+    assert result.exit_code == 0, result.output
+    start = int(read_reconstruction(folder / "scan_r2.h5").parameters["gaussians_at_start"])
+    assert f"Warning: The fit started from {start} Gaussians, not from 99999999" in result.stderr
+    result = _beamline("recon", "scan.h5", "--steps", "2", "--gaussians", "50", "--no-report", "-o", "few.h5")
+    assert result.exit_code == 0 and "Warning" not in result.stderr
 
 
 def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,6 +348,7 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     assert result.exit_code == 4, result.output
     result = _beamline("recon", "scan.h5", *options, "-o", "rest.h5", "--checkpoint", "fit.h5", "--resume", "fit.h5")
     assert result.exit_code == 0, result.output
+    assert "Time, since resumed" in result.stdout
     whole, rest = (read_reconstruction(folder / name) for name in ("whole.h5", "rest.h5"))
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
     assert _left(folder) == {"scan.h5", "whole.h5", "part.h5", "rest.h5", "fit.h5"}
@@ -306,6 +356,10 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     assert result.exit_code == 5
     assert "is of another fit: projections" in result.stderr and "detector_shape" in result.stderr
     assert "other.h5" not in _left(folder)
+    fewer = [*options[2:], "--steps", "20", "-o", "other.h5", "--resume", "fit.h5"]
+    result = _beamline("recon", "scan.h5", *fewer)
+    assert result.exit_code == 2
+    assert "60 steps behind it" in result.stderr and "--steps" in result.stderr and "other.h5" not in _left(folder)
 
 
 def test_the_default_of_steps_is_told_as_it_is() -> None:
