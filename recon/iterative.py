@@ -3,14 +3,16 @@
     volume = solve("fista-tv", Projector(geometry, grid), projections)
 
 All work in float32. TV weights are fractions of the density unit (the 99.5th percentile of the positive voxels), so
-they hold for any unit of attenuation.
+they hold for any unit of attenuation. Inside, lengths, line integrals and weights are about one, whatever their units:
+sums of their squares would leave float32's range.
 """
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,10 +20,11 @@ from numpy.typing import NDArray
 
 from recon import solvers
 from recon.fbp import fbp
-from recon.fdk import fdk
-from recon.operators import Projector, data_residual, projection_images, projection_lines, volume_lines, volume_slices
+from recon.fdk import fdk, has_direct_method
+from recon.masks import masked
+from recon.operators import Projector, projection_images, projection_lines, volume_lines, volume_slices
 from recon.solvers import AsdPocs, Cgls, FistaTv, OsSirtTv, Problem, Sart, Sirt
-from recon.volume import Volume
+from recon.volume import Grid, Volume
 
 Method = Literal["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"]
 Settings = Sirt | Sart | Cgls | AsdPocs | FistaTv | OsSirtTv
@@ -73,7 +76,7 @@ def solve(
         projections: [view, row, col], line integrals, finite where they weigh anything.
         iterations: None: as the settings say.
         weight: of each ray, [view, row, col], 0 or more: 0 for pixels that are not to be trusted, or the inverse
-            variance; None: all alike.
+            variance; only their ratios count. None: all alike.
         start: the volume to begin with; None: zero.
         nonnegative: voxels below zero are clipped in every step ("cgls": at the end).
         on_iteration: told each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point where
@@ -91,20 +94,73 @@ def solve(
         raise ValueError(f"at least one iteration is needed, got {count}")
     data, rays = _checked(projector, projections, weight)
     lines = _start(projector, start)
+    units = _Units.of(projector, data, rays)
+    inside = units.enter(projector, data, rays, lines)
 
     def go_on(iteration: int, residual: float) -> bool:
         if on_iteration is not None:
             on_iteration(iteration, residual)
         return not (should_stop is not None and should_stop())
 
-    def baseline() -> float:
-        images = projection_images(data)
-        direct = fdk if projector.geometry.is_cone else fbp
-        volume = direct(images, projector.geometry, projector.grid)
-        return data_residual(Volume(volume, projector.grid), images, projector.geometry)
+    problem = Problem(
+        inside, data, rays, nonnegative, np.random.default_rng(seed), go_on, lambda: _direct(inside, data, rays)
+    )
+    found = _run(problem, replace(settings, iterations=count), lines)
+    return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
 
-    problem = Problem(projector, data, rays, nonnegative, np.random.default_rng(seed), go_on, baseline)
-    return Volume(volume_slices(_run(problem, replace(settings, iterations=count), lines)), projector.grid)
+
+@dataclass(frozen=True)
+class _Units:
+    """Powers of two near the lengths, line integrals and weights at hand: to change to them rounds nothing."""
+
+    length: int
+    integral: int
+    weight: int
+
+    @classmethod
+    def of(cls, projector: Projector, data: F32, rays: F32 | None) -> _Units:
+        largest = max(float(data.max()), -float(data.min()))
+        weight = 1.0 if rays is None else float(rays.max())
+        return cls(*(math.frexp(size)[1] for size in (projector.grid.voxel_size, largest, weight)))
+
+    @property
+    def density(self) -> int:
+        return self.integral - self.length
+
+    def enter(self, projector: Projector, data: F32, rays: F32 | None, lines: F32) -> Projector:
+        """The projector in these units; the arrays change to them in place."""
+        _times_power(data, -self.integral)
+        _times_power(lines, -self.density)
+        if rays is not None:
+            _times_power(rays, -self.weight)
+        views, box = projector.geometry, projector.grid
+        pitch, sod, sdd = (math.ldexp(n, -self.length) for n in (views.pixel_pitch, views.sod, views.sdd))
+        edge, slices = (math.ldexp(n, -self.length) for n in (box.voxel_size, box.spacing[0]))
+        z, y, x = (math.ldexp(n, -self.length) for n in box.centre)
+        return Projector(
+            replace(views, pixel_pitch=pitch, sod=sod, sdd=sdd), Grid(box.shape, edge, (z, y, x), slices)
+        )  # fmt: skip
+
+
+def _times_power(array: F32, power: int) -> F32:
+    """array *= 2^power, in steps that float32 holds."""
+    while power:
+        step = min(max(power, -100), 100)
+        array *= np.float32(2.0**step)
+        power -= step
+    return array
+
+
+def _direct(projector: Projector, data: F32, rays: F32 | None) -> F32 | None:
+    """FBP or FDK [y, x, z] of the views that weigh anything, the rays that weigh nothing filled; None: neither can."""
+    images, geometry = projection_images(data), projector.geometry
+    if rays is not None:
+        seen = np.flatnonzero(rays.any(axis=(1, 2)))
+        geometry = geometry.select(seen)
+        images = masked(images[seen], projection_images(rays[seen]))[0]
+    if not has_direct_method(geometry):
+        return None
+    return volume_lines((fdk if geometry.is_cone else fbp)(images, geometry, projector.grid))
 
 
 def _run(problem: Problem, settings: Settings, x: F32) -> F32:

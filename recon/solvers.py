@@ -58,7 +58,9 @@ class AsdPocs:
     `goal`. Memory: 5 volumes, 3 x the projections.
 
     Attributes:
-        goal: ||A x - p|| / ||p|| to be reached; None: 0.15 of that of filtered back-projection (FBP or FDK).
+        goal: ||A x - p|| / ||p|| to be reached; None: 0.15 of that of filtered back-projection (FBP or FDK), or, for
+            views that it does not take (a cone's short scan), of a sweep of ordered-subset SIRT, which has about
+            the same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
     """
 
     iterations: int = 10
@@ -114,7 +116,7 @@ class Problem:
         data: [view, col, row], finite.
         weight: of each ray, [view, col, row], or None.
         go_on: told (iteration, relative residual) after each iteration; False: end with what there is.
-        baseline: relative residual of filtered back-projection, computed when asked for.
+        direct: the volume [y, x, z] of filtered back-projection, computed when asked for; None where it cannot be.
     """
 
     projector: Projector
@@ -123,7 +125,7 @@ class Problem:
     nonnegative: bool
     rng: np.random.Generator
     go_on: Callable[[int, float], bool]
-    baseline: Callable[[], float]
+    direct: Callable[[], F32 | None]
 
     @property
     def scale(self) -> float:
@@ -210,7 +212,7 @@ def asd_pocs(problem: Problem, settings: AsdPocs, x: F32) -> F32:
     sweeps = _single_views(problem)
     weights = difference_weights(projector.grid)
     scale = problem.scale
-    goal = settings.goal if settings.goal is not None else 0.15 * problem.baseline()
+    goal = settings.goal if settings.goal is not None else 0.15 * _baseline(problem)
     before, slope = np.empty_like(x), np.empty_like(x)
     step = 0.0
     for k in range(settings.iterations):
@@ -235,6 +237,18 @@ def asd_pocs(problem: Problem, settings: AsdPocs, x: F32) -> F32:
         if math.sqrt(dot(before, before)) > settings.ratio * swept and error > goal:
             step *= settings.alpha_decay
     return x
+
+
+def _baseline(problem: Problem) -> float:
+    """Relative residual of filtered back-projection, or of a sweep where there is none."""
+    projector, volume = problem.projector, problem.direct()
+    if volume is None:
+        nz, ny, nx = projector.grid.shape
+        volume = np.zeros((ny, nx, nz), np.float32)
+        Sweeps(projector, problem.data, problem.weight, interleaved(projector, 9)).run(
+            volume, 1.0, problem.nonnegative, None
+        )
+    return math.sqrt(misfit(problem.data, projector.forward_lines(volume), problem.weight)) / problem.scale
 
 
 def fista_tv(problem: Problem, settings: FistaTv, x: F32) -> F32:
