@@ -30,9 +30,13 @@ def machine_line(found: dict[str, str | int] | None = None) -> str:
     """`machine()` as people read it."""
     m = found or machine()
     return (
-        f"{m['processor']}, {m['cores']} cores, {m['threads']} threads, {m['system']}, "
+        f"{m['processor']}, {_counted(m['cores'], 'core')}, {_counted(m['threads'], 'thread')}, {m['system']}, "
         f"Python {m['python']}, torch {m['torch']}, numba {m['numba']}"
     )
+
+
+def _counted(n: str | int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 def usable_cores() -> int:

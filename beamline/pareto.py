@@ -8,6 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 
+def rounded(cost: float) -> float:
+    """The cost to about 1 % (half a step of 1 % to either side): what differs by less costs the same."""
+    if not cost > 0 or math.isinf(cost):
+        return cost
+    step = math.log(1.01)
+    return math.exp(round(math.log(cost) / step) * step)
+
+
 def front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
     """Positions of the points that no other point beats, by rising cost (and so by rising quality).
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -49,7 +51,8 @@ class Terminal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        with _hung_up_is_no_failure():
+            self._bar.stop()
 
     def ask(self, request: str, put: Ask) -> None:
         """Put a request to the operator, with the bar out of the way."""
@@ -62,7 +65,7 @@ class Terminal:
             self._asking = False
 
     def __call__(self, event: Event) -> None:
-        with self._lock:
+        with self._lock, _hung_up_is_no_failure():
             self._take(event)
 
     def _take(self, event: Event) -> None:
@@ -96,6 +99,16 @@ class Terminal:
         if now - last >= PLAIN_EVERY or done == total:
             self._said[what] = now, done
             self._console.print(f"{what}: {note}")
+
+
+@contextmanager
+def _hung_up_is_no_failure() -> Iterator[None]:
+    """A terminal that has closed takes no words; the work goes on without it."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
 
 
 def rates(data: Mapping[str, Any]) -> str:

@@ -11,22 +11,23 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from beamline.errors import ConfigError, DataError, ScanStopped
+from beamline.errors import ConfigError, DataError
 from beamline.events import Event, Sink
 from beamline.machine import machine
 from beamline.measure import fit_truth, read_truth
 from beamline.offline import SourceOptions, Warnings
 from beamline.pipeline import Prepared, Selection, prepare
 from beamline.recon_report import facts_of
+from beamline.storage.recon_file import named_on_failure
 from beamline.tradeoff_report import Table, write_figures, write_table
 from beamline.trial_process import Data
-from beamline.trials import Depth, Outcome, Status, Trial, plan, seconds_left
+from beamline.trials import Depth, Outcome, Status, Timed, Trial, plan, seconds_left
 from drivers.clock import Clock
 from recon.initialise import default_count
 from recon.volume import Grid
@@ -64,11 +65,12 @@ class TradeoffOptions:
 def run(options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> Table:
     """Make all trials, and leave table, pictures and page in the folder. The event `done` says where.
 
-    The table in the folder is complete after every trial, so that whatever ends this leaves what was measured.
+    The table in the folder is complete after every trial, so that whatever ends this leaves what was measured. Where
+    Ctrl-C did, the table is `stopped`; the folder goes where there is nothing in it to keep.
 
     Raises:
-        ConfigError, DataError: with nothing written.
-        ScanStopped: Ctrl-C ended it; the results hold the trials done until then.
+        ConfigError, DataError: with nothing written, or with the table of the trials that could be written.
+        KeyboardInterrupt: before the first trial was done, with nothing written.
     """
     folder, started = options.folder, clock.now()
     if folder.exists():
@@ -101,24 +103,27 @@ def run(options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], fl
     folder.mkdir()
     work = folder / "work"
     work.mkdir()
-    stopped = False
     try:
-        data.save(work / "data.npz")
+        with named_on_failure(work / "data.npz"):
+            data.save(work / "data.npz")
         said = {"state": "compiling", "message": "Compiling what is not in the cache yet"}
         sink(Event("state", clock.now(), said))
         compile_kernels(trials, work)
         for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each is the one before and a trial more
             write_table(folder, table)
     except KeyboardInterrupt:
-        stopped = True
+        if table.n_done == 0:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        table = replace(table, stopped=True)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+        if folder.is_dir() and not any(folder.iterdir()):  # it would be in the way of the next try
+            folder.rmdir()
     write_table(folder, table)
     write_figures(folder, table)
-    summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": stopped}
+    summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
     sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))
-    if stopped:
-        raise ScanStopped(f"The trade-off was ended after {table.n_done} of {len(trials)} trials; {folder} holds them.")
     return table
 
 
@@ -144,9 +149,9 @@ def split(prepared: Prepared, truth: Any) -> Data:
 def _each(
     table: Table, work: Path, options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float]
 ) -> Iterator[Table]:
-    """The table after each trial."""
+    """The table after each trial, and after one that Ctrl-C cut off."""
     begin = now()
-    timed: list[tuple[Trial, float]] = []
+    timed: list[Timed] = []
     for index, outcome in enumerate(table.outcomes):
         trial = outcome.trial
         left = None if options.max_seconds is None else options.max_seconds - (now() - begin)
@@ -156,8 +161,12 @@ def _each(
         progress = {"stage": "tradeoff", "n": index, "of": len(table.outcomes), "label": trial.label, "eta_s": eta}
         sink(Event("progress", clock.now(), {**progress, "per_min": 60 * index / max(now() - begin, 1e-9)}))
         started = now()
-        result = run_trial(trial, work, options.seed, left)
-        timed.append((trial, now() - started))
+        try:
+            result = run_trial(trial, work, options.seed, left)
+        except KeyboardInterrupt:
+            yield table.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
+            raise
+        timed.append(Timed.of(result, now() - started))
         table = table.with_outcome(index, result)
         yield table
         sink(Event("trial", clock.now(), {"n": index + 1, "of": len(table.outcomes), **table.told(result)}))
@@ -202,12 +211,13 @@ class _Ended:
 
 def _process(job: Mapping[str, Any], work: Path, max_seconds: float | None = None) -> _Ended:
     path, words = work / "job.json", work / "stderr.txt"
-    path.write_text(json.dumps(job), encoding="utf-8")
+    with named_on_failure(path):
+        path.write_text(json.dumps(job), encoding="utf-8")
     late = threading.Event()
     with words.open("w", encoding="utf-8") as stderr:
         process = subprocess.Popen(
             command(path),
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,  # by whose end it knows that this process is gone
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,
@@ -236,8 +246,9 @@ def _process(job: Mapping[str, Any], work: Path, max_seconds: float | None = Non
                 alarm.cancel()
             process.kill()
             process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
     return _Ended(last, process.returncode, words.read_text(encoding="utf-8", errors="replace"), late.is_set())
 
 

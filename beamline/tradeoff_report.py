@@ -7,7 +7,7 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from html import escape
 from pathlib import Path
 from textwrap import fill
@@ -16,10 +16,11 @@ from typing import Any
 from beamline import pareto
 from beamline.machine import machine_line
 from beamline.report import METRICS, Picture, page, picture_html, table_html
-from beamline.storage.recon_file import whole_file
+from beamline.storage.recon_file import named_on_failure, whole_file
 from beamline.tradeoff_figures import cost_curves, pareto_plot
 from beamline.trials import Outcome
 from beamline.version import version
+from recon.quality import parts_of
 
 _FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
 
@@ -45,6 +46,7 @@ class Table:
         machine: of `beamline.machine.machine`.
         scan: facts for people, by name.
         command: that repeats it.
+        stopped: somebody ended it before all trials were done.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -53,6 +55,7 @@ class Table:
     machine: Mapping[str, str | int]
     scan: Mapping[str, str]
     command: str
+    stopped: bool = False
 
     def with_outcome(self, index: int, outcome: Outcome) -> Table:
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
@@ -76,8 +79,11 @@ class Table:
         return "PSNR" if self.by == "psnr" else "−20 log₁₀ of the held-out residual"
 
     def front(self, cost: str) -> list[int]:
-        """Positions in `compared` that are on the front of `cost`: "seconds" or "memory"."""
-        return pareto.front(self.costs(cost), self.qualities)
+        """Positions in `compared` that are on the front of `cost`: "seconds" or "memory".
+
+        Costs to 1 %: below that it is chance which of two trials was the cheaper one.
+        """
+        return pareto.front([pareto.rounded(value) for value in self.costs(cost)], self.qualities)
 
     def costs(self, cost: str) -> list[float]:
         if cost == "seconds":
@@ -85,11 +91,14 @@ class Table:
         return [math.nan if o.peak_bytes is None else float(o.peak_bytes) for o in self.compared]
 
     def told(self, outcome: Outcome) -> dict[str, Any]:
-        """One trial, for an event."""
+        """One trial, for an event; `gaussians` are those at its start, as in its settings."""
         return {
+            **asdict(outcome.trial),
             "label": outcome.trial.label,
             "status": outcome.status,
             "seconds": outcome.seconds,
+            "cpu_seconds": outcome.cpu_seconds,
+            "gaussians_end": outcome.gaussians,
             "peak_bytes": outcome.peak_bytes,
             "quality_db": outcome.quality(self.by),
             "message": outcome.message,
@@ -118,27 +127,40 @@ def text(table: Table) -> str:
             row += f"  {outcome.status}" + (f": {outcome.message}" if outcome.message else "")
         lines.append(row)
     legend = "; ".join(f"{_SHORT[n]}: {_LONG[n].format(table.length_unit)}" for n in names)
-    said = [*([f"{legend}."] if legend else []), *conclusions(table)]
+    said = [*([f"{legend}."] if legend else []), "*: on the front of time and quality.", *conclusions(table)]
     return "\n".join([*lines, "", *(fill(line, _COLUMNS, subsequent_indent="  ") for line in said)])
 
 
 def _time(seconds: float) -> str:
-    """s in at most seven characters; hours of a large scan need no hundredths."""
-    return f"{seconds:.2f}" if not seconds >= 1000 else f"{seconds:.0f}"
+    """s to three significant digits in at most seven characters; whole ones from a hundred on."""
+    if not math.isfinite(seconds):
+        return "n/a"
+    if 0 < seconds < 1e-3:
+        return f"{seconds:.2e}".replace("e-0", "e-")
+    digits = 2 - math.floor(math.log10(seconds)) if seconds > 0 else 0
+    return f"{seconds:.{max(0, digits)}f}"
+
+
+def _said(seconds: float) -> str:
+    """A time to three significant digits, in the unit that suits it."""
+    for unit, name in ((1e-3, "µs"), (1.0, "ms")):
+        if 0 < seconds < unit:
+            return f"{seconds / unit * 1e3:.3g} {name}"
+    return parts_of(seconds)
 
 
 def conclusions(table: Table) -> list[str]:
     """Sentences: what each further dB costs along the front, and what float32 costs."""
     compared, qualities, seconds = table.compared, table.qualities, table.costs("seconds")
     kept = table.front("seconds")
-    out = [f"Quality: {table.quality_name}, dB. * on the front of time and quality."]
+    out = [f"Quality: {table.quality_name}, dB."]
     if not kept:
         return [*out, "No trial has both a time and a quality."]
     first = compared[kept[0]]
-    out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {first.seconds:.2f} s.")
+    out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_said(first.seconds)}.")
     for stretch in pareto.steps(kept, seconds, qualities):
         out.append(
-            f"+{stretch.gain:.2f} dB for {stretch.cost:.2f} s more ({stretch.per_decibel:.3g} s a dB): "
+            f"+{stretch.gain:.2f} dB for {_said(stretch.cost)} more ({_said(stretch.per_decibel)} a dB): "
             f"{compared[stretch.end].trial.label}."
         )
     out += [_precision(o.details) for o in table.outcomes if o.trial.group == "precision" and o.details]
@@ -149,8 +171,8 @@ def _precision(details: Mapping[str, float]) -> str:
     return (
         "The same small fit in float32 and in the float64 twin: residual "
         f"{details['residual_float32']:.5f} and {details['residual_float64']:.5f}, volumes "
-        f"{details['difference']:.2g} apart (relative RMS), {details['seconds_float32']:.2f} s and "
-        f"{details['seconds_float64']:.2f} s."
+        f"{details['difference']:.2g} apart (relative RMS), {_said(details['seconds_float32'])} and "
+        f"{_said(details['seconds_float64'])}."
     )
 
 
@@ -206,7 +228,7 @@ def write_figures(folder: Path, table: Table) -> None:
         )
         pictures.append(("curves.png", Picture("Each method's own curve", caption, cost_curves(curves))))
     for name, picture in pictures:
-        with whole_file(folder / name, replace=True) as partial:
+        with named_on_failure(folder / name), whole_file(folder / name, replace=True) as partial:
             partial.write_bytes(picture.png)
     _write(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]))
 
@@ -237,7 +259,7 @@ def to_html(table: Table, pictures: Sequence[Picture]) -> str:
         if o.status == "done":
             cells = "".join(
                 f"<td>{escape(c)}</td>"
-                for c in (f"{o.seconds:.2f}", f"{o.cpu_seconds:.2f}", _megabytes(o), *(_cell(n, o) for n in names))
+                for c in (_time(o.seconds), _time(o.cpu_seconds), _megabytes(o), *(_cell(n, o) for n in names))
             )
         else:
             why = escape(f"{o.status}: {o.message}".rstrip(": "))
@@ -291,5 +313,5 @@ def finite(value: Any) -> Any:
 
 
 def _write(path: Path, content: str) -> None:
-    with whole_file(path, replace=True) as partial:
+    with named_on_failure(path), whole_file(path, replace=True) as partial:
         partial.write_text(content, encoding="utf-8")

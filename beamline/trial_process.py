@@ -1,14 +1,17 @@
 """One trial in a process of its own, so that its peak memory is its own: `python -m beamline.trial_process JOB.json`.
 
 Reads the job and its arrays, says progress and the result as lines of JSON on stdout. A job may also be to compile what
-trials will need, once for all of them: compiling takes memory that would otherwise count as the first trial's.
+trials will need, once for all of them: compiling takes memory that would otherwise count as the first trial's. Its
+stdin is a pipe that nothing is written to: once that ends, whoever wanted the result is gone, and so is this process.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -233,6 +236,20 @@ def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], 
     return listen
 
 
+def end_with(pipe: int) -> None:
+    """End this process when the file descriptor `pipe` does, that is when the process at its other end has ended.
+
+    Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
+    """
+
+    def wait() -> None:
+        while os.read(pipe, 1024):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()
+
+
 def main(job: Path) -> int:
     """Run the job in the file `job`.
 
@@ -260,4 +277,5 @@ def main(job: Path) -> int:
 
 
 if __name__ == "__main__":
+    end_with(sys.stdin.fileno())
     sys.exit(main(Path(sys.argv[1])))

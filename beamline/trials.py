@@ -14,6 +14,7 @@ Depth = Literal["quick", "full"]
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
 DIRECT = ("fbp",)
+_WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
 SIGMAS = 3.5  # where the fit cuts Gaussians off when nobody says otherwise
 
 _STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
@@ -178,20 +179,42 @@ def work(trial: Trial) -> float:
     if trial.steps is not None:
         per_step = 1 + (trial.gaussians or 0) / 2e4 * (trial.sigmas / SIGMAS) ** 2
         amount = trial.steps * per_step
-    return amount * (3 if trial.halves else 1)
+    return amount * (_WITH_HALVES if trial.halves else 1)
 
 
-def seconds_left(done: Sequence[tuple[Trial, float]], left: Sequence[Trial]) -> float | None:
-    """How long the trials that are left will take, from wall seconds of those done; None before the first.
+@dataclass(frozen=True)
+class Timed:
+    """A trial that is done, and where its time went.
 
-    Work is compared within a method; a method not yet seen is taken to cost what the others did on average.
+    Attributes:
+        wall: s, from before its process began to after its end.
+        working: s of these that it reconstructed, which grow with the work; the rest is the same for all.
+    """
+
+    trial: Trial
+    wall: float
+    working: float
+
+    @classmethod
+    def of(cls, outcome: Outcome, wall: float) -> Timed:
+        """What is known of a trial that has ended; one without figures has told nothing of its work."""
+        made = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
+        return cls(outcome.trial, wall, min(wall, made) if math.isfinite(made) else 0.0)
+
+
+def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:
+    """How long the trials that are left will take, from those done; None before the first.
+
+    Each takes the same time to start and measure, and more in proportion to its work. Work is compared within a method;
+    a method not yet seen is taken to cost what the others did on average.
     """
     if not done:
         return None
-    typical = sum(seconds for _, seconds in done) / len(done)
+    fixed = sum(one.wall - one.working for one in done) / len(done)
+    typical = sum(one.working for one in done) / len(done)
     total = 0.0
     for trial in left:
-        same = [(work(other), seconds) for other, seconds in done if other.method == trial.method]
-        amount = sum(w for w, _ in same)
-        total += work(trial) * sum(s for _, s in same) / amount if amount > 0 else typical
+        same = [one for one in done if one.trial.method == trial.method and one.working > 0]
+        amount = sum(work(one.trial) for one in same)
+        total += fixed + (work(trial) * sum(one.working for one in same) / amount if amount > 0 else typical)
     return total

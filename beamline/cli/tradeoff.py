@@ -12,6 +12,7 @@ import click
 from beamline.cli.numbers import POSITIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.told import terminated_like_interrupted, told_as_json
+from beamline.errors import ScanStopped
 from beamline.events import fan_out
 from beamline.terminal import Terminal
 from beamline.tradeoff import TradeoffOptions, run
@@ -73,7 +74,7 @@ def tradeoff(
 
     Quality is PSNR and SSIM against --truth, or else how well views that no trial has seen are explained, and to which
     detail two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and a page. Ctrl-C
-    ends it with the trials done so far (exit code 4).
+    ends it with the trials done so far (exit code 4; 130 and no folder where there are none).
     """
     source, selection = chosen(file, seed, said)
     options = TradeoffOptions(
@@ -91,3 +92,6 @@ def tradeoff(
         table = run(options, fan_out(*(json_sinks or [terminal])), SystemClock())
     if not as_json:
         click.echo(text(table))
+    if table.stopped:
+        counts = f"{table.n_done} of {len(table.outcomes)}"
+        raise ScanStopped(f"The trade-off was ended after {counts} trials; {options.folder} holds them.")

@@ -59,6 +59,19 @@ def refuse_existing(path: Path) -> None:
 
 
 @contextmanager
+def named_on_failure(path: Path) -> Iterator[None]:
+    """What the disk refuses while the block writes `path` is told with its name, which a full disk leaves out.
+
+    Raises:
+        DataError: instead of OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
+
+
+@contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """A temporary sibling to write to; it becomes `path` when the block ends well and vanishes when it does not.
 

@@ -16,4 +16,6 @@ def test_what_a_time_means_nothing_without() -> None:
     assert str(found["processor"]).strip()
     json.dumps(found)
     line = machine_line(found)
+    assert "1 core, 1 thread," in machine_line({**found, "cores": 1, "threads": 1})
+    assert "2 cores, 3 threads," in machine_line({**found, "cores": 2, "threads": 3})
     assert "\n" not in line and all(str(value) in line for value in found.values())

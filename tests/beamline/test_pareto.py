@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.pareto import front, steps
+from beamline.pareto import front, rounded, steps
 
 # Few distinct values, so that ties happen.
 VALUES = st.one_of(st.integers(-5, 5).map(float), st.floats(-1e6, 1e6), st.just(math.nan), st.just(math.inf))
@@ -66,3 +66,14 @@ def test_what_the_next_decibel_costs() -> None:
     assert kept == [0, 1, 3]
     assert [s.per_decibel for s in steps(kept, costs, qualities)] == pytest.approx([9 / 4, 60.0])
     assert steps([2], costs, qualities) == []
+
+
+@given(st.floats(1e-9, 1e12), st.floats(1e-9, 1e12))
+def test_rounding_moves_a_cost_by_half_a_percent_and_keeps_the_order(one: float, other: float) -> None:
+    assert rounded(one) == pytest.approx(one, rel=0.0051)
+    assert rounded(min(one, other)) <= rounded(max(one, other))
+    assert rounded(rounded(one)) == pytest.approx(rounded(one), rel=1e-9)
+
+
+def test_what_is_no_cost_stays_as_it_is() -> None:
+    assert rounded(0.0) == 0 and rounded(math.inf) == math.inf and math.isnan(rounded(math.nan))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import math
 import re
@@ -43,6 +44,24 @@ def shown(stream: io.StringIO, *events: tuple[str, dict[str, Any]]) -> str:
         for event, data in events:
             terminal(Event(event, 0.0, data))
     return stream.getvalue()
+
+
+class HungUp(io.StringIO):
+    """A stream whose terminal has closed, or whose disk is full."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+    def write(self, text: str) -> int:
+        raise OSError(self.number, "no")
+
+
+def test_a_terminal_that_closes_does_not_end_the_work() -> None:
+    said = ("state", {"state": "acquiring", "message": "Acquiring"})
+    shown(HungUp(errno.EIO), said, ("frame", FRAME), said)
+    with pytest.raises(OSError, match="no"):
+        shown(HungUp(errno.ENOSPC), said)
 
 
 def test_the_figures_an_operator_watches() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
 import sys
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from beamline import tradeoff
-from beamline.errors import ConfigError, DataError, ScanStopped
+from beamline.errors import ConfigError, DataError
 from beamline.events import Event
 from beamline.machine import machine
 from beamline.offline import SourceOptions
@@ -150,13 +151,96 @@ def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> N
 
     made_up(interrupted)
     events: list[Event] = []
-    with pytest.raises(ScanStopped, match="3 of"):
-        run(_options(tmp_path), events.append, SystemClock())
+    table = run(_options(tmp_path), events.append, SystemClock())
+    assert table.stopped and table.n_done == 3
     rows = _rows(tmp_path / "out")
-    assert [row["status"] for row in rows] == ["done"] * 3 + ["not run"] * (len(rows) - 3)
+    assert [row["status"] for row in rows] == ["done"] * 3 + ["interrupted"] + ["not run"] * (len(rows) - 4)
+    assert "interrupted: ended before it was done" in text(table)
     assert _left(tmp_path / "out") >= TABLES | FIGURES
     assert "work" not in _left(tmp_path / "out")
     assert events[-1].event == "done" and events[-1].data["stopped"]
+
+
+@pytest.mark.parametrize("where", ["run_trial", "compile_kernels"])
+def test_ctrl_c_before_the_first_trial_is_done_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def interrupted(*_: object) -> Outcome:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tradeoff, where, interrupted)
+    events: list[Event] = []
+    with pytest.raises(KeyboardInterrupt):
+        run(_options(tmp_path), events.append, SystemClock())
+    assert _left(tmp_path) == {"scan.h5"}
+    assert events[-1].event != "done"
+
+
+def _full(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")  # as a write tells it: without a name
+
+
+@pytest.mark.parametrize(("where", "name"), [((np, "savez"), "data.npz"), ((Path, "write_text"), "tradeoff.json")])
+def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: object, where: tuple[object, str], name: str
+) -> None:
+    options = _options(tmp_path)
+    with monkeypatch.context() as full:
+        full.setattr(*where, _full)
+        with pytest.raises(DataError, match=rf"{name} could not be written \(No space left on device\)"):
+            run(options, lambda e: None, SystemClock())
+    assert _left(tmp_path) == {"scan.h5"}
+    assert run(options, lambda e: None, SystemClock()).n_done
+
+
+def test_a_disk_that_is_full_later_keeps_the_trials_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: Any
+) -> None:
+    def filling(trial: Trial, *_: object) -> Outcome:
+        if trial.views != 27:
+            monkeypatch.setattr(Path, "write_text", _full)
+        return _made_up(trial)
+
+    made_up(filling)
+    with pytest.raises(DataError, match=r"tradeoff\.json could not be written"):
+        run(_options(tmp_path), lambda e: None, SystemClock())
+    assert [row["status"] for row in _rows(tmp_path / "out")][:2] == ["done", "done"]
+    assert _left(tmp_path / "out") == {"tradeoff.json", "tradeoff.csv"}
+
+
+def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_up: Any) -> None:
+    def short(trial: Trial, *_: object) -> Outcome:
+        made = _made_up(trial)
+        return replace(made, seconds=made.seconds * 1e-4, cpu_seconds=made.seconds * 1e-4)
+
+    made_up(short)
+    events: list[Event] = []
+    table = run(_options(tmp_path), events.append, SystemClock())
+    told = next(e.data for e in events if e.event == "trial")
+    first = table.outcomes[0]
+    assert (told["steps"], told["views"], told["loss"], told["gaussians"]) == (
+        first.trial.steps, first.trial.views, first.trial.loss, first.trial.gaussians
+    )  # fmt: skip
+    assert told["cpu_seconds"] == first.cpu_seconds
+    page = (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
+    said = text(table)
+    assert "* on" not in page and "Bold: on the front" in page
+    assert "*: on the front" in said
+    for words in (said, page):
+        assert "0.00 s" not in words and " µs" in words and ">0.00<" not in words
+    fbp = next(o for o in table.compared if o.trial.method == "fbp")
+    assert f"{fbp.seconds:.2e}".replace("e-0", "e-") in said  # 5.40e-05 s: three digits where two decimals say 0.00
+
+
+def test_noise_in_a_cost_puts_no_trial_on_the_front(tmp_path: Path) -> None:
+    trial = Trial("method", "fbp", 10)
+    outcomes = [
+        Outcome(replace(trial, views=views), "done", seconds, memory, {"psnr": psnr})
+        for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
+    ]
+    table = Table(tuple(outcomes), "psnr", "mm", machine(), {}, "")
+    assert table.front("seconds") == [0, 1]
+    assert table.front("memory") == [1]
 
 
 def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.trials import Outcome, Trial, decibels, plan, seconds_left, work
+from beamline.trials import Outcome, Timed, Trial, decibels, plan, seconds_left, work
 
 METHODS = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
@@ -56,16 +56,27 @@ def test_labels_say_what_is_not_the_default() -> None:
     assert replace(trial, start="tv").label == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
 
 
-@given(st.floats(0.1, 1e4), st.integers(1, 20))
-def test_the_time_left_scales_with_the_work_and_with_the_machine(speed: float, n: int) -> None:
+@given(st.floats(0.1, 1e4), st.integers(1, 20), st.floats(0, 10))
+def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start: float) -> None:
     base = Trial("method", "r2", 60, steps=100, gaussians=1000)
     left = [replace(base, steps=100 * k) for k in range(1, n + 1)]
-    expected = speed * sum(map(work, left))
-    assert seconds_left([(base, speed * work(base))], left) == pytest.approx(expected)
-    assert seconds_left([(base, 1.0)], []) == 0
+    expected = n * start + speed * sum(map(work, left))
+    one = Timed(base, start + speed * work(base), speed * work(base))
+    assert seconds_left([one], left) == pytest.approx(expected)
+    assert seconds_left([one], []) == 0
     assert seconds_left([], left) is None
     # Of a method never tried nothing better is known than the mean of what was.
-    assert seconds_left([(base, 4.0), (base, 8.0)], [Trial("method", "fbp", 60)]) == pytest.approx(6)
+    done = [Timed(base, 7.0, 4.0), Timed(base, 11.0, 8.0)]
+    assert seconds_left(done, [Trial("method", "fbp", 60)]) == pytest.approx(3 + 6)
+
+
+def test_where_the_time_of_a_trial_went() -> None:
+    trial = Trial("steps", "r2", 60, steps=100, gaussians=1000)
+    assert Timed.of(Outcome(trial, "done", 4.0), 7.0) == Timed(trial, 7.0, 4.0)
+    base = replace(trial, group="method", halves=True)
+    assert Timed.of(Outcome(base, "done", 4.0), 15.0).working == 12.0
+    assert Timed.of(Outcome(base, "done", 4.0), 10.0).working == 10.0
+    assert Timed.of(Outcome(trial, "failed"), 3.0) == Timed(trial, 3.0, 0.0)
 
 
 def test_quality_is_decibels_either_way_and_a_record_is_plain() -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,15 +67,37 @@ def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> No
     assert {"r2", "fbp"} <= {trial.method for trial in quick_trials}
 
 
-def test_ctrl_c_is_exit_code_4_with_a_table(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> Outcome:
-        raise KeyboardInterrupt
+SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else [signal.SIGHUP])
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_ctrl_c_is_exit_code_4_with_a_table(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial], number: signal.Signals
+) -> None:
+    trial = tradeoff.run_trial
+
+    def interrupted(*arguments: Any) -> Outcome:
+        if len(quick_trials) == 2:
+            signal.raise_signal(number)
+        return trial(*arguments)
 
     monkeypatch.setattr(tradeoff, "run_trial", interrupted)
     result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 4, result.output
-    assert "after 0 of" in result.stderr
-    assert {p.name for p in (folder / "out").iterdir()} == {"tradeoff.json", "tradeoff.csv", "tradeoff.html"}
+    assert "after 2 of" in result.stderr
+    assert "fbp, 27 views" in result.stdout and "interrupted" in result.stdout and "not run" in result.stdout
+    assert {"tradeoff.json", "tradeoff.csv", "tradeoff.html"} < {p.name for p in (folder / "out").iterdir()}
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    monkeypatch.setattr(tradeoff, "run_trial", lambda *_: signal.raise_signal(number))
+    result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
+    assert result.exit_code == 130, result.output
+    assert result.stderr.endswith("beamline: interrupted\n") and result.stdout == ""
+    assert {p.name for p in folder.iterdir()} == {"scan.h5"}
 
 
 @pytest.mark.parametrize(
