@@ -12,58 +12,17 @@ from typing import Literal, get_args
 
 import numpy as np
 from numba import get_num_threads, njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import fft
 
 from recon import threads  # noqa: F401 - torch before the first numba thread
 from recon.geometry import Geometry
+from recon.view_weights import ray_weights
 from recon.volume import Grid
 
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
-_GAP_LIMIT = 8.0  # an angular gap this many times the median may be missing data, not coarse sampling
-_SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
-
-
-def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
-    """Quadrature weight of each view: its Voronoi cell on the half circle, in radians.
-
-    Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
-    where the half circle is covered. A gap of more than 8 median steps, and wider than random angles leave by chance,
-    is a missing wedge: the views beside it weigh as if the sampling went on, and the sum is the angle measured.
-
-    Args:
-        angles: [view], radians, any order and range.
-
-    Raises:
-        ValueError: for no angles, or some that are not finite.
-    """
-    theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
-    if theta.size == 0 or not np.isfinite(theta).all():
-        raise ValueError(f"weights need at least one angle, all finite, got {theta.size}")
-    if theta.size == 1:
-        return np.full(1, np.pi)
-    order = np.argsort(theta, kind="stable")
-    ordered = theta[order]
-    # Group equal angles; the circle closes, so a last group just below π may be the first one.
-    tolerance = _SAME_ANGLE * np.pi / theta.size
-    group = np.concatenate([[0], np.cumsum(np.diff(ordered) > tolerance)])
-    starts = ordered[np.concatenate([[True], np.diff(group) > 0])]
-    if group[-1] > 0 and starts[0] + np.pi - ordered[-1] <= tolerance:
-        group[group == group[-1]] = 0
-        starts = starts[:-1]
-    if starts.size == 1:
-        return np.full(theta.size, np.pi / theta.size)
-    gaps = np.diff(starts, append=starts[0] + np.pi)
-    typical = float(np.median(gaps))
-    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
-    by_chance = np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
-    gaps = np.where(gaps > max(_GAP_LIMIT * typical, by_chance), typical, gaps)
-    cells = (gaps + np.roll(gaps, 1)) / 2
-    weights = np.empty_like(theta)
-    weights[order] = (cells / np.bincount(group))[group]
-    return weights
 
 
 def _transfer(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
@@ -170,7 +129,8 @@ def fbp(
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
     Voxels take the filtered views by linear interpolation at their centres: for voxels larger than a pixel bin the
-    projections first. A voxel that a view does not see gets nothing from that view.
+    projections first. A voxel that a view does not see gets nothing from that view, unless its opposite does: a full
+    turn with the axis off the middle of the detector, or beside it, reaches as far as its far columns.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
@@ -198,15 +158,18 @@ def fbp(
     pitch = geometry.pixel_pitch
     z, y, x = (axis / pitch for axis in grid.coordinates())
     rows = z + geometry.axis_row
-    axis_cols = geometry.axis_col + geometry.shifts[:, 0]
-    weights = angular_weights(geometry.angles).astype(np.float32)
+    weights, zeros = ray_weights(geometry)
+    axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
+    share = weights.astype(np.float32)[:, None]
     out = np.empty(grid.shape, np.float32)
-    views, cols = geometry.n_views, geometry.detector_shape[1]
+    views, cols = geometry.n_views, geometry.detector_shape[1] + sum(zeros)
     slab = int(np.clip(_SLAB_BYTES // (4 * views * cols), 8, 64))
     for start in range(0, rows.size, slab):
         part = slice(start, start + slab)
-        filtered = filter_projections(_slab(projections, geometry, rows[part]), pitch, filter)
-        filtered *= weights[:, None, None]
+        weighed = _slab(projections, geometry, rows[part]) * share
+        if any(zeros):
+            weighed = np.pad(weighed, ((0, 0), (0, 0), zeros))
+        filtered = filter_projections(weighed, pitch, filter)
         if not np.isfinite(filtered).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         columns = np.ascontiguousarray(filtered.transpose(0, 2, 1))

@@ -6,69 +6,25 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from recon import threads  # noqa: F401 - torch before the first numba thread
 from recon.fbp import Filter, filter_projections
 from recon.geometry import Geometry
 from recon.kernels.activation import F32, OPTIONS
 from recon.operators import volume_slices
+from recon.view_weights import circle_weights, covers_the_circle
 from recon.volume import Grid
 
 F64 = NDArray[np.float64]
 
 _f = np.float32
-_GAP_LIMIT = 8.0  # a gap this many times the median may be a missing arc; one of an eighth of the circle is
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
-
-
-def covers_the_circle(angles: ArrayLike) -> bool:
-    """Whether views stand all around, without a missing arc."""
-    gaps = _gaps(np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi))[1]
-    return gaps.size > 1 and not _leave_an_arc(gaps)
 
 
 def has_direct_method(geometry: Geometry) -> bool:
     """Whether FBP or FDK takes these views: they must be straight, and a cone's must stand all around."""
     return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))
-
-
-def circle_weights(angles: ArrayLike) -> F64:
-    """Quadrature weight of each view: its Voronoi cell on the full circle, in radians; they sum to 2π.
-
-    Args:
-        angles: [view], radians, any order and range; equal ones share their cell.
-
-    Raises:
-        ValueError: for no angles, some that are not finite, or a missing arc (short scans need other weights:
-            Parker 1982).
-    """
-    theta = np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi)
-    if theta.size < 2 or not np.isfinite(theta).all():
-        raise ValueError(f"FDK needs at least two angles, all finite, got {theta.size}")
-    order, gaps = _gaps(theta)
-    if _leave_an_arc(gaps):
-        raise ValueError(
-            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; FDK needs the full circle: use an "
-            "iterative method (os-sirt-tv, sirt) for a short scan"
-        )
-    weights = np.empty_like(theta)
-    weights[order] = (gaps + np.roll(gaps, 1)) / 2
-    return weights
-
-
-def _gaps(theta: F64) -> tuple[NDArray[np.intp], F64]:
-    """The order of angles on the circle, and the gap behind each."""
-    order = np.argsort(theta, kind="stable")
-    return order, np.diff(theta[order], append=theta[order[0]] + 2 * np.pi)
-
-
-def _leave_an_arc(gaps: F64) -> bool:
-    widest, typical = float(gaps.max()), float(np.median(gaps))
-    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
-    by_chance = 2 * np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
-    arc = widest > np.pi / 4 and widest > 3 * typical
-    return arc or widest >= np.pi or widest > max(_GAP_LIMIT * typical, by_chance)
 
 
 @njit(**OPTIONS)

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
-from recon.fbp import angular_weights, fbp
-from recon.fdk import covers_the_circle, fdk
+from recon.fbp import fbp
+from recon.fdk import fdk
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.iterative import solve
 from recon.operators import Projector
 from recon.solvers import OsSirtTv
 from recon.splat import RayModel, project
+from recon.view_weights import angular_weights, covers_the_circle
 from recon.volume import Grid, Volume
 
 Start = Literal["fbp", "tv"]

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from recon.density_control import DensityPolicy
-from recon.fdk import covers_the_circle
 from recon.fit import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
@@ -17,6 +16,7 @@ from recon.kernels.activation import F32
 from recon.problem import Loss
 from recon.reconstruction import reconstruct
 from recon.splat import RayModel, project
+from recon.view_weights import covers_the_circle
 
 _SHAPE, _VIEWS = (12, 16), 4
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels

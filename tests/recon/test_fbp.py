@@ -6,11 +6,9 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.fbp import angular_weights, fbp, filter_projections
+from recon.fbp import fbp, filter_projections
 from recon.geometry import Geometry
 from recon.volume import Grid
 
@@ -151,60 +149,6 @@ def test_rows_between_the_slices_are_interpolated_and_beyond_the_detector_zero()
     # The detector ends at ±1; its outermost half pixel belongs to the nearest row.
     expected = [0, first, first, (first + second) / 2, second, second, 0]
     np.testing.assert_allclose(volume[:, 9:11, 9:11].mean((1, 2)), expected, rtol=0.05, atol=1e-6)
-
-
-@given(st.lists(st.floats(-20, 20, allow_nan=False), min_size=1, max_size=40))
-def test_weights_cover_the_measured_angle(angles: list[float]) -> None:
-    weights = angular_weights(angles)
-    assert weights.shape == (len(angles),)
-    assert (weights >= 0).all()
-    assert 0 < weights.sum() <= np.pi * (1 + 1e-12)
-
-
-@given(st.integers(2, 60), st.floats(-7, 7), st.integers(0, 2**31))
-@settings(max_examples=30)
-def test_equal_steps_in_any_order_weigh_the_same(n: int, start: float, seed: int) -> None:
-    angles = start + half_turn(n) + np.pi * np.random.default_rng(seed).integers(-2, 3, n)
-    np.testing.assert_allclose(angular_weights(angles), np.pi / n, rtol=1e-9)
-    np.testing.assert_allclose(angular_weights(np.random.default_rng(seed).permutation(angles)), np.pi / n, rtol=1e-9)
-
-
-def test_views_half_a_turn_apart_share_their_weight() -> None:
-    closed = np.linspace(0, np.pi, 91)  # holds both 0 and 180 degrees
-    weights = angular_weights(closed)
-    np.testing.assert_allclose(weights[1:-1], np.pi / 90, rtol=1e-9)
-    np.testing.assert_allclose(weights[[0, -1]], np.pi / 180, rtol=1e-9)
-    np.testing.assert_allclose(angular_weights(np.linspace(0, 2 * np.pi, 180, endpoint=False)), np.pi / 180, rtol=1e-9)
-    np.testing.assert_allclose(angular_weights([0.3, 0.3 + np.pi, 0.3 + 2 * np.pi]), np.pi / 3, rtol=1e-9)
-
-
-def test_uneven_steps_weigh_by_their_cells() -> None:
-    # Cells on the circle of length π: neighbours 0 | 1 | 1.5 and back to π.
-    np.testing.assert_allclose(angular_weights([0, 1.5, 1]), [(np.pi - 1.5 + 1) / 2, (0.5 + np.pi - 1.5) / 2, 0.75])
-
-
-def test_a_missing_wedge_does_not_load_the_views_beside_it() -> None:
-    sector = np.deg2rad(np.arange(30, 150, 2.0))
-    np.testing.assert_allclose(angular_weights(sector), np.deg2rad(2), rtol=1e-9)
-
-
-@pytest.mark.parametrize("n", [20, 45, 400])
-def test_random_angles_cover_the_half_circle(n: int) -> None:
-    # Their widest gap is chance, not a missing wedge: no density may be lost.
-    sums = [angular_weights(np.random.default_rng(seed).uniform(-np.pi, np.pi, n)).sum() for seed in range(40)]
-    assert np.isclose(sums, np.pi).mean() > 0.85
-
-
-@pytest.mark.parametrize(("span", "n"), [(3, 3), (4, 4), (30, 8), (90, 45), (120, 20), (150, 600), (170, 170)])
-def test_a_real_wedge_is_missed_however_dense_the_views(span: float, n: int) -> None:
-    angles = np.deg2rad(np.arange(n) * span / n)
-    np.testing.assert_allclose(angular_weights(angles), np.deg2rad(span / n), rtol=1e-9)
-
-
-@pytest.mark.parametrize("angles", [[], [0.0, np.nan]])
-def test_weights_of_no_angle_are_refused(angles: list[float]) -> None:
-    with pytest.raises(ValueError, match="at least one angle"):
-        angular_weights(angles)
 
 
 def test_bad_input_is_refused() -> None:

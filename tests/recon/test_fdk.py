@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.fbp import fbp
-from recon.fdk import circle_weights, fdk
+from recon.fdk import fdk
 from recon.geometry import Geometry
 from recon.volume import Grid
 
@@ -85,26 +83,6 @@ def test_a_voxel_off_the_detector_gets_nothing() -> None:
     volume = fdk(ball_views(geometry, 1.0, (0, 0, 0)), geometry, Grid((21, 8, 8), 0.05))
     assert (volume[[0, -1]] == 0).all()
     assert (volume[10, 3:5, 3:5] > 0.9).all()
-
-
-@given(st.integers(8, 200), st.floats(-7, 7), st.integers(0, 2**31))
-@settings(max_examples=30)
-def test_equal_steps_in_any_order_weigh_the_same(n: int, start: float, seed: int) -> None:
-    angles = start + np.random.default_rng(seed).permutation(circle(n))
-    np.testing.assert_allclose(circle_weights(angles), 2 * np.pi / n, rtol=1e-9)
-
-
-def test_uneven_steps_weigh_by_their_cells_and_sum_to_a_turn(rng: np.random.Generator) -> None:
-    np.testing.assert_allclose(circle_weights([0, 2, 1, 3.5, 5]), [1.1415926536, 1.25, 1.0, 1.5, 1.3915926536])
-    np.testing.assert_allclose(circle_weights(rng.uniform(0, 50, 300)).sum(), 2 * np.pi)
-    closed = np.linspace(0, 2 * np.pi, 121)  # first and last view are the same
-    np.testing.assert_allclose(circle_weights(closed)[[0, -1]], np.pi / 120, rtol=1e-9)
-
-
-@pytest.mark.parametrize(("span", "n"), [(180, 90), (200, 25), (270, 100), (300, 40)])
-def test_a_short_scan_is_refused(span: float, n: int) -> None:
-    with pytest.raises(ValueError, match=r"gap of .* degrees.*short scan"):
-        circle_weights(np.deg2rad(np.linspace(0, span, n)))
 
 
 def test_misfits_are_named() -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.fdk import covers_the_circle
 from recon.geometry import Geometry
+from recon.view_weights import covers_the_circle
 from recon.warm_up import toy_of
 
 # In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
