@@ -75,10 +75,10 @@ class Made:
     def next_decibel(self) -> NextDecibel | None:
         """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
 
-        None for a direct method, and while views still came.
+        None for a direct method, while views still came, and for a resumed fit, whose whole time is not known.
         """
         judged = judged_by(history_arrays(self.history))
-        if judged is None or _grew(self):
+        if judged is None or _grew(self) or "resumed_from" in self.settings:
             return None
         if self.method == "r2":
             return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)

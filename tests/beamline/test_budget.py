@@ -183,7 +183,7 @@ def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     assert metrics["psnr"] > 15
     done = events[-1].data
     assert "pixels joined 2 x 2" in done["chosen"]
-    assert {"seconds", "low", "high"} == set(done["next_db"])
+    assert {"seconds", "low", "high", "of"} == set(done["next_db"])
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
     assert done["chosen"] in page and "The next dB" in page
 
