@@ -266,11 +266,46 @@ def test_checkpoints_are_handed_out_as_the_fit_goes_on(noisy: np.ndarray) -> Non
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
-def test_early_stopping_gives_a_fit_taken_up_again_its_patience_anew(noisy: np.ndarray) -> None:
-    options = {"gaussians": 300, "held_out": (3, 15), "early_stop": True}
-    first = recon.reconstruct(noisy, VIEWS, steps=400, **options)
-    rest = recon.reconstruct(noisy, VIEWS, steps=600, resume=first.checkpoint, **options)
-    assert rest.history[-1].step >= min(600, first.history[-1].step + 200)
+def test_early_stopping_goes_on_where_a_fit_was_left(noisy: np.ndarray) -> None:
+    # The best model so far was the first one; a fit that was interrupted later must still give it back.
+    loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)
+    options = {"steps": 600, "held_out": (3, 15), "early_stop": True}
+    whole = recon.reconstruct(loud, VIEWS, gaussians=2000, **options)
+    asked: list[int] = []
+    part = recon.reconstruct(
+        loud, VIEWS, gaussians=2000, should_stop=lambda: asked.append(0) or len(asked) >= 220, **options
+    )
+    rest = recon.reconstruct(loud, VIEWS, resume=part.checkpoint, **options)
+    assert rest.history[-1].step == whole.history[-1].step > 220
+    np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
+
+
+@pytest.mark.parametrize("weight", [1e-20, 1e-3, 1e20])
+def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
+    alone, weighed = (
+        recon.reconstruct(noisy, VIEWS, steps=30, gaussians=400, weights=w).volume.data
+        for w in (None, np.full(noisy.shape, weight, np.float32))
+    )
+    np.testing.assert_allclose(weighed, alone, atol=1e-3 * float(alone.max()))
+
+
+@pytest.mark.parametrize(
+    ("held_out", "message"),
+    [((False,) * 20 + (True,) * 4, "flatnonzero"), ((7,), r"views \[7\] are zero everywhere")],
+)
+def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: tuple[int, ...], message: str) -> None:
+    blank = noisy.copy()
+    blank[7] = 0
+    with pytest.raises(ValueError, match=message):
+        recon.reconstruct(blank, VIEWS, steps=3, gaussians=100, held_out=held_out)
+    with pytest.raises(TypeError):
+        recon.reconstruct(noisy, VIEWS, steps=3, gaussians=100, held_out=(2.9,))  # type: ignore[arg-type]
+
+
+def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
+    kept = recon.reconstruct(noisy, VIEWS, steps=2, gaussians=100).checkpoint
+    with pytest.raises(ValueError, match=r"fit with at least 2\d views, these are 12"):
+        recon.reconstruct(noisy[:12], VIEWS.select(range(12)), steps=4, resume=kept)
 
 
 @pytest.mark.parametrize(
