@@ -36,6 +36,7 @@ class Problem:
         grid: the box that Gaussians live in; it should hold all that the views see, whatever volume is wanted later.
         half_field: mm.
         unit: 1/mm.
+        noise: standard deviation of a pixel's noise, in units of `images`.
         loss: the projection loss.
         backend: the device's operations, and the owner of all these arrays.
     """
@@ -47,6 +48,7 @@ class Problem:
     grid: Grid
     half_field: float
     unit: float
+    noise: float
     loss: ProjectionLoss[Any]
     backend: Backend[Any]
 
@@ -97,7 +99,7 @@ def make_problem(
     projection_loss = backend.projection_loss(
         geometry.detector_shape, ssim_weight, DataTerm(_KINDS[loss], delta, scale)
     )
-    empty = Problem((), (), (), geometry, grid, half_field, unit, projection_loss, backend)
+    empty = Problem((), (), (), geometry, grid, half_field, unit, delta, projection_loss, backend)
     return replace(_with_views(empty, filled, known), geometry=geometry)
 
 

@@ -326,3 +326,13 @@ def test_quaternions_are_brought_to_length_one_without_a_turn(
     np.testing.assert_allclose(unit, q / length, rtol=1e-6)
     np.testing.assert_allclose(brought.first["quaternions"], kept.first["quaternions"] * length, rtol=1e-5)
     np.testing.assert_allclose(brought.second["quaternions"], kept.second["quaternions"] * length**2, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("noise", "weight"), [(1e-4, 0.02), (2e-3, 0.08), (0.1, 0.15)])
+def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generator, noise: float, weight: float) -> None:
+    flat = np.full((VIEWS.n_views, *VIEWS.detector_shape), 5.0)
+    scale = 0.7 * max(GRID.shape) * GRID.voxel_size / 2
+    data = flat + rng.normal(0, noise * scale, flat.shape)
+    problem = fit.problem_of(data.astype(np.float32), VIEWS, GRID, 0.7, fit.FitSettings())
+    assert fit.tv_weight(fit.FitSettings(), problem) == pytest.approx(weight, rel=0.1)
+    assert fit.tv_weight(fit.FitSettings(tv_weight=0.0), problem) == 0
