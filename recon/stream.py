@@ -31,7 +31,7 @@ _BLIND = 100.0  # data so many times larger than the density unit explains: the 
 _ROOM = 0.1  # of the first count that a round may add; the last one has what is left of the growth
 
 # Slower than where all views are there from the start: each round would undo with its first fast steps what the last
-# one had learnt (battery of 180 views, 30.7 dB with the rates of `FitSettings`, 31.9 with these; a faster end alone 31.4).
+# one had learnt (battery of 180 views: 30.7 dB with the rates of `FitSettings`, 31.9 with these).
 WHILE_VIEWS_COME = fit.FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15)
 
 
