@@ -31,7 +31,7 @@ def warm_up(
     start: Start = "fbp",
     weighted: bool = False,
 ) -> None:
-    """Fit a toy for a few steps: some 12 s on a machine that has never done it, a fraction of a second afterwards.
+    """Fit a toy for a few steps: some 30 s on a machine that has never done it, a fraction of a second afterwards.
 
     numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
     What another kind of geometry, first volume or ray needs is compiled for it alone: leaning views, a cone or weights
