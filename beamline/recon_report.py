@@ -18,7 +18,7 @@ from beamline.storage.recon_file import Value
 from beamline.storage.source import ScanSource
 from drivers.frame import FrameKind
 from recon.fbp import Filter
-from recon.fit import Progress
+from recon.fit import FitSettings, Progress
 from recon.quality import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
 from recon.volume import Volume
 
@@ -75,12 +75,15 @@ class Made:
     def next_decibel(self) -> NextDecibel | None:
         """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
 
-        None for a direct method, while views still came, and for a resumed fit, whose whole time is not known.
+        None for a direct method, while views still came, for a resumed fit, whose whole time is not known, and for one
+        with other rates than the fits that were measured, such as one that followed a scan.
         """
         judged = judged_by(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:
             return None
         if self.method == "r2":
+            if self.settings.get("pace") != FitSettings().pace:
+                return None
             return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)
         return next_decibel(judged.seconds, judged.residuals)
 

@@ -11,8 +11,9 @@ import pytest
 from beamline.figures import quality_against_time
 from beamline.history import history_arrays, history_of, judged_by
 from beamline.recon_report import Made
-from recon.fit import Progress
+from recon.fit import FitSettings, Progress
 from recon.quality import next_decibel, next_decibel_of_fit
+from recon.stream import WHILE_VIEWS_COME
 from recon.volume import Grid, Volume
 
 GRID = Grid((1, 1, 1))
@@ -27,7 +28,8 @@ def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
 
 
 def _made(history: tuple[Progress, ...], method: str = "sirt") -> Made:
-    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, {})
+    settings = {"pace": FitSettings().pace} if method == "r2" else {}
+    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, settings)
 
 
 def test_there_and_back() -> None:
@@ -71,6 +73,8 @@ def test_a_fit_says_what_longer_fits_gained() -> None:
     assert made.next_decibel == next_decibel_of_fit(30.0, 60)
     assert "as longer fits gained on two other scans" in made.next_decibel_said
     late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
+    followed = replace(_made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace})
+    assert followed.next_decibel is None and followed.next_decibel_said == ""
     assert _made(late, "r2").next_decibel_said == "none in reach of what was measured"
 
 

@@ -223,8 +223,8 @@ def test_a_tenth_of_a_pixel_of_the_axis_costs_little(clean: F32, truth: F32) -> 
     for off in (0.0, 0.1, 0.5):
         views = Geometry.parallel(VIEWS.angles, SHAPE, axis_col=VIEWS.axis_col + off)
         # Over seeds a fit's PSNR scatters by 0.15 dB, a difference of two means of three by 0.12.
-        costs[off] = np.mean([psnr(truth, fitted(clean, views, 100, seed=seed).volume.data) for seed in range(3)])
-    assert costs[0.0] - costs[0.1] < 0.6  # 0.2 dB and three times that scatter
+        costs[off] = np.mean([psnr(truth, fitted(clean, views, 60, seed=seed).volume.data) for seed in range(3)])
+    assert costs[0.0] - costs[0.1] < 0.3
     assert costs[0.0] - costs[0.5] > 1
 
 
