@@ -205,6 +205,27 @@ class SampleMover(Protocol):
 
 
 @dataclass(frozen=True)
+class BeamReading:
+    """What a beam monitor says: a value in `unit` (A of an ion chamber, mA of the ring), at a time in s since 1970."""
+
+    value: float
+    unit: str
+    time: float
+
+
+class BeamMonitor(Protocol):
+    """Something that tells how much beam there is."""
+
+    name: str
+
+    def reading(self) -> BeamReading:
+        """The present value, always finite. Raises DeviceTimeout, or DeviceError for an answer that is no number."""
+        ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
 class Devices:
     """The instrument as acquisition sees it; made by the composition root."""
 
