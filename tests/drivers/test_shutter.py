@@ -1,0 +1,91 @@
+"""A shutter on an output: what goes out, how long it waits, and what it believes when the output disobeys."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.protocols import Shutter
+from drivers.shutter import OutputShutter
+from simulators.clock import VirtualClock
+
+
+class Line:
+    """An output: `tells` whether it can be read, `stuck` the level that it has whatever it is told."""
+
+    name = "output 1"
+
+    def __init__(self, tells: bool = True, stuck: bool | None = None, fails: bool = False) -> None:
+        self.level, self.tells, self.stuck, self.fails = False, tells, stuck, fails
+        self.told: list[bool] = []
+
+    def set(self, high: bool) -> None:
+        if self.fails:
+            raise DeviceError("box", "no reply")
+        self.told.append(high)
+        self.level = high if self.stuck is None else self.stuck
+
+    def get(self) -> bool | None:
+        return self.level if self.tells else None
+
+
+@pytest.mark.parametrize("tells", [True, False])
+@pytest.mark.parametrize("open_high", [True, False])
+def test_polarity_and_travel(tells: bool, open_high: bool) -> None:
+    line, clock = Line(tells), VirtualClock(0.0)
+    shutter: Shutter = OutputShutter(line, clock, open_high=open_high, settle=0.25)
+    if not tells:
+        assert not shutter.is_open()  # nobody counts on beam that was not asked for
+    shutter.open()
+    assert (line.told, shutter.is_open(), clock.now()) == ([open_high], True, 0.25)
+    shutter.open()
+    assert (line.told, clock.now()) == ([open_high], 0.25)
+    shutter.close()
+    assert (line.told, shutter.is_open(), clock.now()) == ([open_high, not open_high], False, 0.5)
+    shutter.close()  # it goes out again
+    assert (line.told[2:], clock.now()) == ([not open_high], 0.75)
+
+
+def test_an_output_that_does_not_hold_is_told() -> None:
+    shutter = OutputShutter(Line(stuck=False), VirtualClock(0.0))
+    with pytest.raises(DeviceError, match=r"output 1 does not hold.*Asked 'high'\. Answered 'low'.*is not known"):
+        shutter.open()
+    assert not shutter.is_open()
+
+
+def test_a_shutter_that_hangs_open_is_never_called_closed() -> None:
+    shutter = OutputShutter(Line(stuck=True), VirtualClock(0.0))
+    shutter.open()
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="closes the shutter"):
+            shutter.close()
+        assert shutter.is_open()
+
+
+def test_after_a_failure_nothing_is_believed() -> None:
+    line = Line(tells=False)
+    shutter = OutputShutter(line, VirtualClock(0.0), settle=1.0)
+    shutter.open()
+    line.fails = True
+    with pytest.raises(DeviceError, match="no reply"):
+        shutter.close()
+    assert not shutter.is_open()
+    line.fails = False
+    shutter.open()
+    assert line.told == [True, True]  # sent again: what the failed close did is not known
+
+
+def test_what_somebody_else_did_is_seen() -> None:
+    line = Line()
+    shutter = OutputShutter(line, VirtualClock(0.0))
+    shutter.open()
+    line.level = False
+    assert not shutter.is_open()
+    shutter.open()
+    assert line.told == [True, True]
+
+
+@pytest.mark.parametrize("settle", [-1.0, float("nan"), float("inf")])
+def test_settling_must_be_a_time(settle: float) -> None:
+    with pytest.raises(DeviceRefused, match="settling time"):
+        OutputShutter(Line(), VirtualClock(0.0), settle=settle)
