@@ -1,42 +1,68 @@
 """Serial line: one request and its reply at a time over any pyserial URL: a port, socket://, or a simulator's sim://.
 
-Rules that keep it in step with the device: one lock for the port, a finite timeout, every reply compared with the form
+Rules that keep it in step with the device: one request at a time, a finite timeout, every reply compared with the form
 it must have. After a timeout or a reply of the wrong form nothing that arrives is believed until a harmless probe has
-been answered and the line has fallen quiet.
+been answered and the line has fallen quiet. Commands without a reply wait for nobody: a stop goes out at once.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
-from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import serial
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceTimeout
+from drivers.transcript import Transcript
 
-END = b"\r\n"
 LONGEST_LINE = 1024
-TOLD_LINES = 6
-"""Lines that last went over the wire, for errors."""
-TOLD_CHARACTERS = 40
-"""Of each of these lines."""
+LONGEST_REPLY = 1 << 16
+"""Characters of a reply of several lines."""
 QUIET = 0.05
 """s without a byte after which a line counts as quiet."""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A query without side effects, and the form of its reply, by which the line finds its step again."""
+    """A query without side effects, and the form of its one-line reply, by which the line finds its step again."""
 
     request: str
     reply: str
 
 
+@dataclass(frozen=True)
+class Framing:
+    """How lines end: commands with `command_end`, what the device sends with `line_end`.
+
+    `continued`: text at the end of a line that says that another line follows; "" where every reply is one line. The
+    reply is then its lines without that text, joined by newlines.
+    """
+
+    command_end: bytes = b"\r\n"
+    line_end: bytes = b"\r\n"
+    continued: str = ""
+
+
+@dataclass(frozen=True)
+class _Damaged:
+    """A line that is not what the device sent, as its checksum says."""
+
+    text: str
+    why: str
+
+
+def _sound(line: str) -> str:
+    """A line without a checksum has nothing to say of itself."""
+    return ""
+
+
 class SerialLine:
-    """A device that talks ASCII lines ended by CR LF, 8 bits, no parity, 1 stop bit. Safe from several threads.
+    """A device that talks ASCII lines, 8 bits, no parity, 1 stop bit. Safe from several threads.
 
     Args:
         url: what pyserial opens: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
@@ -44,9 +70,11 @@ class SerialLine:
         probe: see `Probe`.
         timeout: s for a whole reply.
         unsolicited: form of lines that the device may send unasked; they are noted and passed over.
+        check: what is wrong with a received line, "" where nothing is; for checksums.
+        transcript: file to which every byte sent and received is appended with its time; None keeps none.
 
     Raises:
-        DeviceError: the port cannot be opened.
+        DeviceError: the port or the transcript cannot be opened.
     """
 
     def __init__(
@@ -59,18 +87,30 @@ class SerialLine:
         timeout: float,
         baudrate: int,
         unsolicited: str = r"(?!)",
+        framing: Framing = Framing(),
+        check: Callable[[str], str] = _sound,
+        transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
-        self._unsolicited = re.compile(unsolicited)
-        self._lock = threading.RLock()
-        self._transcript: deque[tuple[float, str, str]] = deque(maxlen=TOLD_LINES)  # time, mark, text
+        self._unsolicited, self._framing, self._check = re.compile(unsolicited), framing, check
+        self._asking, self._writing = threading.RLock(), threading.Lock()
         self._received = bytearray()
         self._in_step = True
+        try:
+            self._transcript = Transcript(clock, transcript)
+        except OSError as problem:
+            raise DeviceError(
+                device,
+                f"the transcript {str(transcript)!r} cannot be written: {problem}",
+                advice="Name a file in a folder that exists, or none",
+                state="Nothing was sent",
+            ) from problem
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baudrate, timeout=QUIET, write_timeout=timeout, exclusive=True
             )
         except (OSError, ValueError) as problem:
+            self._transcript.close()
             raise DeviceError(
                 device,
                 f"the port {url!r} does not open: {problem}",
@@ -80,13 +120,17 @@ class SerialLine:
             ) from problem
 
     def send(self, command: str) -> None:
-        """Send a command that has no reply. It goes out even where the line is out of step: a stop must not wait.
+        """Send a command that has no reply. It goes out even where the line is out of step or another thread waits for
+        its reply: a stop must not wait.
 
         Raises:
             DeviceError: the port is gone. DeviceTimeout: the device does not take bytes.
         """
-        with self._lock:
-            self._write(command)
+        self._write(command.encode("ascii") + self._framing.command_end, command)
+
+    def send_raw(self, data: bytes) -> None:
+        """`send` for bytes without an end, such as one control character."""
+        self._write(data, _readable(data))
 
     def query(self, request: str, reply: str, meaning: str, state: str = "") -> re.Match[str]:
         """Send a request and read its reply.
@@ -99,12 +143,27 @@ class SerialLine:
         Raises:
             DeviceTimeout: no whole reply within the timeout. DeviceError: a reply of another form, or the port is gone.
         """
-        with self._lock:
+        return self._query(request.encode("ascii") + self._framing.command_end, request, reply, meaning, state)
+
+    def query_raw(self, data: bytes, reply: str, meaning: str, state: str = "") -> re.Match[str]:
+        """`query` for bytes without an end, such as one control character."""
+        return self._query(data, _readable(data), reply, meaning, state)
+
+    def close(self) -> None:
+        """Free the port; a second time does nothing."""
+        with self._asking, self._writing:
+            with contextlib.suppress(OSError):  # a port that is gone has nothing to free
+                self._port.close()
+            self._transcript.close()
+
+    def _query(self, data: bytes, request: str, reply: str, meaning: str, state: str) -> re.Match[str]:
+        with self._asking:
             if not self._in_step:
                 self._find_step(state)
             self._in_step = False
-            self._write(request)
-            text = self._read_line()
+            self._pass_over_what_came_before()
+            self._write(data, request)
+            text = self._read_reply()
             if text is None:
                 raise self._error(
                     DeviceTimeout,
@@ -113,6 +172,16 @@ class SerialLine:
                     reply=_readable(self._received[:80]),
                     expected=meaning,
                     advice="Check power, cable and baud rate; the next request will first find the line's step again",
+                    state=state,
+                )
+            if isinstance(text, _Damaged):
+                raise self._error(
+                    DeviceError,
+                    f"the reply was damaged on the way: {text.why}",
+                    request=request,
+                    reply=text.text,
+                    expected=meaning,
+                    advice="Check the cable, its shield and the baud rate",
                     state=state,
                 )
             match = re.fullmatch(reply, text)
@@ -129,23 +198,19 @@ class SerialLine:
             self._in_step = True
             return match
 
-    def close(self) -> None:
-        """Free the port; a second time does nothing."""
-        with self._lock:
-            self._port.close()
-
     def _find_step(self, state: str) -> None:
         """Throw away what is on the line, probe, pass over late replies until the probe's own, wait for quiet."""
-        self._note("!", "out of step: probing")
+        self._transcript.tell("!", "out of step: probing")
         self._wait_for_quiet(state)
-        self._write(self._probe.request)
-        while (text := self._read_line()) is not None:
-            if re.fullmatch(self._probe.reply, text):
+        self._write(self._probe.request.encode("ascii") + self._framing.command_end, self._probe.request)
+        deadline = self._clock.now() + self._timeout
+        while (text := self._read_line(deadline)) is not None:
+            if isinstance(text, str) and re.fullmatch(self._probe.reply, text):
                 break
         else:
             raise self._error(
                 DeviceTimeout,
-                f"still no answer after an earlier failure, silent for {self._timeout:g} s",
+                f"still no answer after an earlier failure, for {self._timeout:g} s",
                 request=self._probe.request,
                 expected=f"a reply of the form {self._probe.reply}",
                 advice="Check power, cable and baud rate",
@@ -153,12 +218,12 @@ class SerialLine:
             )
         self._wait_for_quiet(state)
         self._in_step = True
-        self._note("!", "in step again")
+        self._transcript.tell("!", "in step again")
 
     def _wait_for_quiet(self, state: str) -> None:
         deadline = self._clock.now() + max(self._timeout, 10 * QUIET)
         while (junk := self._read()) or self._received:
-            self._note("!", f"passed over {_readable(self._received + junk)}")
+            self._transcript.tell("!", f"passed over {_readable(self._received + junk)}")
             self._received.clear()
             if self._clock.now() > deadline:
                 raise self._error(
@@ -168,29 +233,55 @@ class SerialLine:
                     state=state,
                 )
 
-    def _write(self, text: str) -> None:
-        self._note(">", text)
-        try:
-            self._port.write(text.encode("ascii") + END)
-        except serial.SerialTimeoutException as problem:
-            raise self._error(
-                DeviceTimeout,
-                f"it took no bytes for {self._timeout:g} s",
-                request=text,
-                advice="Check power, cable and flow control (none is expected)",
-            ) from problem
-        except OSError as problem:
-            raise self._port_gone(problem) from problem
+    def _pass_over_what_came_before(self) -> None:
+        """Whole lines that are here before the request cannot be its reply. The rest may begin a line sent unasked."""
+        while len(self._received) <= LONGEST_LINE and self._waiting():
+            self._received += self._read()
+        old, end, rest = bytes(self._received).rpartition(self._framing.line_end)
+        if end:
+            self._transcript.tell("!", f"passed over {_readable(old)}")
+            self._received = bytearray(rest)
 
-    def _read_line(self) -> str | None:
-        """The next line that the device was asked for; None where none is whole within the timeout."""
+    def _write(self, data: bytes, text: str) -> None:
+        with self._writing:
+            self._transcript.tell(">", text)
+            self._transcript.keep(">", data)
+            try:
+                self._port.write(data)
+            except serial.SerialTimeoutException as problem:
+                raise self._error(
+                    DeviceTimeout,
+                    f"it took no bytes for {self._timeout:g} s",
+                    request=text,
+                    advice="Check power, cable and flow control (none is expected)",
+                ) from problem
+            except OSError as problem:
+                raise self._port_gone(problem) from problem
+
+    def _read_reply(self) -> str | _Damaged | None:
+        """The lines of the reply, joined; None where they are not whole within the timeout or never end."""
         deadline = self._clock.now() + self._timeout
+        continued = self._framing.continued
+        lines: list[str] = []
+        while sum(map(len, lines)) <= LONGEST_REPLY:
+            line = self._read_line(deadline)
+            if not isinstance(line, str):
+                return line
+            if not continued or not line.endswith(continued):
+                return "\n".join([*lines, line])
+            lines.append(line.removesuffix(continued))
+        return None
+
+    def _read_line(self, deadline: float) -> str | _Damaged | None:
+        """The next line that the device was asked for; None where none is whole by `deadline`."""
         while True:
-            while END in self._received:
-                line, _, rest = bytes(self._received).partition(END)
+            while self._framing.line_end in self._received:
+                line, _, rest = bytes(self._received).partition(self._framing.line_end)
                 self._received = bytearray(rest)
                 text = _readable(line)
-                self._note("<", text)
+                self._transcript.tell("<", text)
+                if why := self._check(text):
+                    return _Damaged(text, why)
                 if not self._unsolicited.fullmatch(text):
                     return text
             if self._clock.now() >= deadline or len(self._received) > LONGEST_LINE:
@@ -199,8 +290,18 @@ class SerialLine:
 
     def _read(self) -> bytes:
         """What is there, or what comes first; nothing where the line is quiet."""
+        waiting = self._waiting()
         try:
-            return bytes(self._port.read(max(1, self._port.in_waiting)))
+            data = bytes(self._port.read(max(1, waiting)))
+        except OSError as problem:
+            raise self._port_gone(problem) from problem
+        self._transcript.keep("<", data)
+        return data
+
+    def _waiting(self) -> int:
+        """How many bytes can be read at once; over TCP only whether there are any."""
+        try:
+            return int(self._port.in_waiting)
         except OSError as problem:
             raise self._port_gone(problem) from problem
 
@@ -213,20 +314,8 @@ class SerialLine:
         )
 
     def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
-        return kind(self._device, problem, wire=self._told(), **parts)
-
-    def _told(self) -> str:
-        """The last lines and how long ago they went: ">" sent, "<" received, "!" what the driver did."""
-        now = self._clock.now()
-        return ", ".join(f"{mark} {_cut(text)} ({now - time:.2f} s ago)" for time, mark, text in self._transcript)
-
-    def _note(self, mark: str, text: str) -> None:
-        self._transcript.append((self._clock.now(), mark, text))
+        return kind(self._device, problem, wire=self._transcript.told(), **parts)
 
 
 def _readable(data: bytes | bytearray) -> str:
     return bytes(data).decode("ascii", errors="backslashreplace")
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= TOLD_CHARACTERS else text[:TOLD_CHARACTERS] + "..."

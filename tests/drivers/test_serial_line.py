@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError, DeviceTimeout
-from drivers.serial_line import TOLD_LINES, Probe, SerialLine
+from drivers.serial_line import Probe, SerialLine
 from drivers.stages.pm16c import PM16CStage
+from drivers.transcript import TOLD_LINES
 from simulators.clock import VirtualClock
 from simulators.serial_url import register
 from simulators.trigger_line import TriggerLine
