@@ -90,7 +90,12 @@ class TextBeamMonitor:
 def pattern_problem(pattern: str) -> str:
     """Why a pattern cannot be used; empty where it can."""
     try:
-        groups = re.compile(pattern).groups
+        groups = re.compile(within_a_line(pattern)).groups
     except re.error as error:
         return f"the pattern {pattern!r} is no regular expression ({error})"
     return "" if groups else f"the pattern {pattern!r} has no group (...) around the number"
+
+
+def within_a_line(pattern: str) -> str:
+    """The form of a whole line that holds what `pattern` finds."""
+    return f".*?(?:{pattern}).*"

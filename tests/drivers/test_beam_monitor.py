@@ -80,7 +80,9 @@ def test_a_long_page_is_told_in_part() -> None:
     assert len(str(caught.value)) < 600
 
 
-@pytest.mark.parametrize(("pattern", "problem"), [("(", "no regular expression"), ("mA", "no group")])
+@pytest.mark.parametrize(
+    ("pattern", "problem"), [("(", "no regular expression"), ("(?i)(x)", "no regular expression"), ("mA", "no group")]
+)
 def test_patterns_that_find_nothing(pattern: str, problem: str) -> None:
     with pytest.raises(DeviceRefused, match=problem):
         monitor("", pattern)
