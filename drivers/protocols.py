@@ -47,8 +47,25 @@ class TriggerTrain:
         return self.start + self.interval * (self.n - 1)
 
 
-class RotationStage(Protocol):
-    """A rotation stage with a position-synchronised trigger output."""
+@dataclass(frozen=True)
+class StageStatus:
+    """What the controller says of itself now.
+
+    Attributes:
+        counts: where it stands or passes, in whole encoder counts (motor pulses).
+        moving: it has not come to rest.
+        homed: its counts are those of the reference; None where this controller cannot tell.
+        fault: why the last move ended early, or a fault that stands, in words; "" where there is none.
+    """
+
+    counts: int
+    moving: bool
+    homed: bool | None
+    fault: str
+
+
+class Motion(Protocol):
+    """An axis that turns: angles in radians outside, whole counts inside. Relative moves: `drivers.motion`."""
 
     name: str
 
@@ -65,8 +82,20 @@ class RotationStage(Protocol):
         """Radians, read from the device."""
         ...
 
+    def status(self) -> StageStatus:
+        """What the controller says now; DeviceError where it says nothing that can be understood."""
+        ...
+
     def start_move(self, angle: float, speed: float) -> None:
         """Begin a move at `speed` (rad/s) and return at once. Refuses a target outside the limits."""
+        ...
+
+    def start_home(self) -> None:
+        """Begin the search for the reference and return at once; `wait` ends with it.
+
+        Raises:
+            DeviceRefused: the stage has no reference, or it moves.
+        """
         ...
 
     def moving(self) -> bool: ...
@@ -75,12 +104,6 @@ class RotationStage(Protocol):
         """Wait for the move to end; the position in rad. Raises DeviceTimeout, or DeviceError if it stopped short."""
         ...
 
-    def arm(self, train: TriggerTrain) -> None:
-        """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
-        ...
-
-    def disarm(self) -> None: ...
-
     def stop(self) -> None:
         """Decelerate and stand. Legal in every state."""
         ...
@@ -88,6 +111,24 @@ class RotationStage(Protocol):
     def abort(self) -> None:
         """Stop at once, without deceleration. Legal in every state."""
         ...
+
+
+class TriggerOutput(Protocol):
+    """Position-synchronised pulses from whatever turns the sample."""
+
+    def arm(self, train: TriggerTrain) -> None:
+        """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
+        ...
+
+    def disarm(self) -> None: ...
+
+    def remaining_pulses(self) -> int | None:
+        """Pulses of the armed train still to come, 0 where none is armed; None where the controller does not tell."""
+        ...
+
+
+class RotationStage(Motion, TriggerOutput, Protocol):
+    """A rotation stage with a position-synchronised trigger output."""
 
     def describe(self) -> dict[str, str | int | float]:
         """Identity and settings for the file's metadata."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
@@ -19,9 +20,8 @@ COUNT = r"([+-]\d{7,10})"
 STATUS = r"([RL])[0-9A-F]([PNS])(?:[0-9A-F]([0-9A-F]{2})|---)" + COUNT
 MAX_SPEED = 5_000_000
 """pulses/s."""
-ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit"}
-PULSE_WIDTHS = {5: 1e-3, 4: 100e-6, 3: 10e-6, 2: 200e-9}
-"""TMGM mode -> pulse width in s, the widest first."""
+ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
+STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 E24 = (
     1.0,
     1.1,
@@ -62,6 +62,11 @@ class ChannelStatus:
     counts: int
     raw: str
 
+    @property
+    def stopped(self) -> bool:
+        """Somebody stopped it."""
+        return bool(STOPS & set(self.ending.split(", ")))
+
 
 def steepest_code(acceleration: float) -> int:
     """The code of the steepest acceleration that is not above `acceleration` (pulses/s²).
@@ -83,7 +88,9 @@ class PM16CChannel:
         DeviceRefused: the controller is in LOCAL, or its motors move.
     """
 
-    def __init__(self, url: str, *, channel: int, name: str, clock: Clock, timeout: float, baudrate: int) -> None:
+    def __init__(
+        self, url: str, *, channel: int, name: str, clock: Clock, timeout: float, baudrate: int, transcript: Path | None
+    ) -> None:
         self._name, self._digit = name, f"{channel:X}"
         self._commanded = False
         self._restore_local = False
@@ -95,6 +102,7 @@ class PM16CChannel:
             timeout=timeout,
             baudrate=baudrate,
             unsolicited=STOPPED_NOTE,
+            transcript=transcript,
         )
 
     def open(self, rate_code: int) -> str:
@@ -152,24 +160,30 @@ class PM16CChannel:
 
     def start(self, target: int, speed: int) -> None:
         """Begin a move to `target` counts at `speed` pulses/s."""
-        c = self._digit
         self.standing("a move")
-        self._set(f"SPDH{c}{speed}", f"SPDH?{c}", speed)
-        self._line.send(f"SPDH{c}")
-        self._ask(f"SPD?{c}", "HSPD", "HSPD, the speed just selected")
-        self._commanded = True
-        self._line.send(f"ABS{c}{target:+d}")
-        status = self.status()
-        if not status.moving and status.counts != target:
-            raise DeviceError(
-                self._name,
-                f"the move did not start ({status.ending or self._complaint()})",
-                request=f"ABS{c}{target:+d}",
-                reply=status.raw,
-                expected="a moving motor",
-                advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
-                state=f"The stage stands at {status.counts} counts",
-            )
+        self._take_speed(speed)
+        self._begin(f"ABS{self._digit}{target:+d}", target)
+
+    def find_home(self, speed: int) -> None:
+        """Begin the search for the home switch at `speed` pulses/s; it leaves the trigger output cleared."""
+        self.standing("a home search")
+        self._make_ready(f"TMGC{self._digit}", "NO")
+        self._take_speed(speed)
+        self._begin(f"FDHP{self._digit}", None)
+
+    def go_home(self, home: int) -> None:
+        """Begin the move to the home that the search found, at the speed of the search."""
+        self._begin(f"GTHP{self._digit}", home)
+
+    def home(self) -> int | None:
+        """Where the home switch was found, in counts; None where no search has found it."""
+        reply = self._ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
+        return None if reply[1] is None else int(reply[1])
+
+    def preset(self, counts: int) -> None:
+        """Call the place where it stands `counts`."""
+        self.standing("a preset")
+        self._set(f"PS{self._digit}{counts:+d}", f"PS?{self._digit}", counts)
 
     def arm(self, mode: int, start: int, end: int, interval: int) -> None:
         """Set up the trigger output (counts) and make it ready."""
@@ -200,6 +214,29 @@ class PM16CChannel:
                 self._line.send("LOC")
         finally:
             self._line.close()
+
+    def _take_speed(self, speed: int) -> None:
+        c = self._digit
+        self._set(f"SPDH{c}{speed}", f"SPDH?{c}", speed)
+        self._line.send(f"SPDH{c}")
+        self._ask(f"SPD?{c}", "HSPD", "HSPD, the speed just selected")
+
+    def _begin(self, command: str, target: int | None) -> None:
+        """Send a command that moves and see that it does, or that it is at its target (None: no target) already."""
+        self._commanded = True
+        self._line.send(command)
+        status = self.status()
+        there = self.home() == status.counts if target is None else status.counts == target
+        if not status.moving and not there:
+            raise DeviceError(
+                self._name,
+                f"the move did not start ({status.ending or self._complaint()})",
+                request=command,
+                reply=status.raw,
+                expected="a moving motor",
+                advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
+                state=f"The stage stands at {status.counts} counts",
+            )
 
     def _make_ready(self, command: str, wanted: str) -> None:
         self._line.send(command)

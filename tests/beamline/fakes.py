@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.devices import Bench
 from beamline.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.timeline import work_out
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.frame import Frame
 from drivers.protocols import (
     CameraFrame,
@@ -20,6 +20,7 @@ from drivers.protocols import (
     CameraTiming,
     Devices,
     StageLimits,
+    StageStatus,
     TriggerSource,
     TriggerTrain,
 )
@@ -133,6 +134,12 @@ class Stage:
     def moving(self) -> bool:
         return self.bench.clock.now() < self.move.end
 
+    def status(self) -> StageStatus:
+        return StageStatus(round(self.count(self.bench.clock.now())), self.moving(), None, "")
+
+    def start_home(self) -> None:
+        raise DeviceRefused(self.name, "it has no reference")
+
     def wait(self, timeout: float) -> float:
         now = self.bench.clock.now()
         self.bench.clock.sleep(min(timeout, self.move.end - now))
@@ -152,6 +159,10 @@ class Stage:
         assert not self.moving()
         self.train = None
         self.pulses = []
+
+    def remaining_pulses(self) -> int | None:
+        now = self.bench.clock.now()
+        return sum(time > now for time, _ in self.pulses) if self.train is None else self.train.n
 
     def stop(self) -> None:
         self.bench.log.append("stop stage")

@@ -1,0 +1,22 @@
+"""Moves relative to where a stage stands, in whole counts, so that no angle is ever rounded twice."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.protocols import Motion
+
+
+def start_move_by(stage: Motion, angle: float, speed: float) -> None:
+    """Begin a move by `angle` (rad, rounded once to whole counts) from the count where the stage stands.
+
+    n such moves make exactly n times these counts, however long the sum. Where an angle is no whole number of counts,
+    its multiples are not n times them: for equally spaced views give `start_move` the multiples.
+
+    Raises:
+        DeviceRefused, DeviceError: as `start_move`.
+    """
+    if not math.isfinite(angle):
+        stage.start_move(angle, speed)  # refuses in the stage's own words
+        return
+    stage.start_move(stage.to_angle(stage.status().counts + stage.to_counts(angle)), speed)
