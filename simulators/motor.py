@@ -153,12 +153,14 @@ class PulseMotor:
         self.ended = Ended(0)
         self._clock, self._line, self._stall_at = clock, line, stall_at
         self._angle_of_count = 2 * math.pi / counts_per_turn
-        self._moves = deque([TrapezoidMove(clock.now(), 0.0, 0.0, ())], maxlen=MOVES_REMEMBERED)
+        self.zero = 0
+        """Count of the place where it stood at power-on."""
+        self._moves = deque([(TrapezoidMove(clock.now(), 0.0, 0.0, ()), self.zero)], maxlen=MOVES_REMEMBERED)
 
     @property
     def move(self) -> TrapezoidMove:
         """The move under way, or the last one."""
-        return self._moves[-1]
+        return self._moves[-1][0]
 
     def moving(self) -> bool:
         return self._clock.now() < self.move.end
@@ -170,8 +172,14 @@ class PulseMotor:
 
     def angle_at(self, time: float) -> float:
         """True angle in radians at any time since the oldest move remembered."""
-        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
-        return move.position(time) * self._angle_of_count
+        move, zero = next((past for past in reversed(self._moves) if past[0].begin <= time), self._moves[0])
+        return (move.position(time) - zero) * self._angle_of_count
+
+    def preset(self, count: int) -> None:
+        """Call the place where it stands `count`; nothing turns."""
+        now, here = self._clock.now(), self.position()
+        self.zero += count - here
+        self._moves.append((TrapezoidMove(now, count, count, ()), self.zero))
 
     def start(self, target: int, speed: float, acceleration: float) -> None:
         """Move from standing to `target` (counts; counts/s, counts/s²), or to the limit or stall on the way."""
@@ -184,7 +192,7 @@ class PulseMotor:
                 move, self.ended = move.halted(stop), why
         if (here >= high and move.direction > 0) or (here <= low and move.direction < 0):
             move, self.ended = TrapezoidMove(now, here, here, ()), Ended.LIMIT
-        self._moves.append(move)
+        self._moves.append((move, self.zero))
         self._put_on_line(now)
 
     def stop(self, acceleration: float) -> None:
@@ -197,22 +205,26 @@ class PulseMotor:
         stand = position + move.direction * velocity**2 / (2 * acceleration)
         last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
         if move.direction * (last - position) <= 0:
-            self._moves[-1] = move.halted(last)
+            self._replace(move.halted(last))
         else:
             braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
-            self._moves[-1] = TrapezoidMove(braked.begin, braked.start, last, braked.phases)
+            self._replace(TrapezoidMove(braked.begin, braked.start, last, braked.phases))
         self._put_on_line(now)
 
     def halt(self) -> None:
         """Stand at once, at the last pulse put out."""
         now = self._clock.now()
         if self.moving():
-            self._moves[-1] = self.move.halted(self.position())
+            self._replace(self.move.halted(self.position()))
             self._put_on_line(now)
         self.ended = Ended.EMERGENCY
+
+    def _replace(self, move: TrapezoidMove) -> None:
+        """The move under way ends otherwise than it was to."""
+        self._moves[-1] = (move, self.zero)
 
     def _put_on_line(self, now: float) -> None:
         edges = self.trigger.follow(self.move, now)
         if (line := self._line()) is not None:
             line.cancel_after(now)
-            line.schedule(Pulse(time, count * self._angle_of_count) for time, count in edges)
+            line.schedule(Pulse(time, (count - self.zero) * self._angle_of_count) for time, count in edges)

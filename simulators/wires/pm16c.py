@@ -54,6 +54,7 @@ QUERIES: tuple[tuple[str, Query], ...] = (
     (r"VERH\?", lambda box: "HD-VER2"),
     (r"SETCH\?", lambda box: box.mapped),
     (rf"PS\?{_C}", lambda box, c: f"{box.channels[c].motor.position():+08d}"),
+    (rf"SHP\?{_C}", PM16CBox.home),
     (rf"SPD\?{_C}", lambda box, c: f"{box.channels[c].selected}SPD"),
     (rf"SPD([HML])\?{_C}", lambda box, level, c: f"{box.channels[c].speeds[level]:07d}"),
     (rf"RTE\?{_C}", lambda box, c: f"{box.channels[c].rate:03d}"),
@@ -86,6 +87,9 @@ REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
     (r"SETCH([0-9A-F-]{4})", PM16CBox.map),
     (rf"ABS{_C}{_D}", lambda box, c, d: box.start(c, int(d))),
     (rf"REL{_C}{_D}", lambda box, c, d: box.start(c, box.channels[c].motor.position() + int(d))),
+    (rf"PS{_C}{_D}", lambda box, c, d: box.preset(c, int(d))),
+    (rf"FDHP{_C}", PM16CBox.find_home),
+    (rf"GTHP{_C}", PM16CBox.go_home),
     (rf"SPD([HML]){_C}(\d*)", PM16CBox.set_speed),
     (rf"RTE{_C}(\d{{1,3}})", lambda box, c, d: box.set_rate(c, int(d))),
     (rf"([FB])L{_C}{_D}", _set_limit),
@@ -109,6 +113,7 @@ class PM16CController:
         line: what the TP0 connector (position controller A) is wired to; it also learns the sample's true angle.
         channel: the motor that turns the sample.
         counts_per_turn: its pulses for 2π.
+        home_at: where the sample's home switch is, in pulses since power-on; None plugs none in.
         lost: trigger pulses (from 0, since power-on) that never reach the line.
         stall_at: count at which a move of the sample's motor that would pass stops short, as by an interlock.
         silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
@@ -121,6 +126,7 @@ class PM16CController:
         *,
         channel: int = 0,
         counts_per_turn: int = 360_000,
+        home_at: int | None = 0,
         lost: Set[int] = frozenset(),
         stall_at: int | None = None,
         silent: Set[int] = frozenset(),
@@ -128,7 +134,15 @@ class PM16CController:
     ) -> None:
         self.clock = clock
         self.queries = 0
-        self.box = PM16CBox(clock, line, channel=channel, counts_per_turn=counts_per_turn, lost=lost, stall_at=stall_at)
+        self.box = PM16CBox(
+            clock,
+            line,
+            channel=channel,
+            counts_per_turn=counts_per_turn,
+            lost=lost,
+            stall_at=stall_at,
+            home_at=home_at,
+        )
         self._silent, self._garbled = silent, garbled
         self._in, self._out = bytearray(), bytearray()
         self._lock = threading.RLock()

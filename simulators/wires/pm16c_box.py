@@ -13,6 +13,7 @@ from enum import IntFlag
 from drivers.clock import Clock
 from simulators.motor import Output, PulseMotor, TriggerSettings
 from simulators.trigger_line import TriggerLine
+from simulators.wires.pm16c_home import HomeSwitch
 
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
@@ -54,8 +55,9 @@ class Refused(Exception):  # noqa: N818 - not an error of this program
 class Channel:
     """A motor and what the box keeps for it."""
 
-    def __init__(self, motor: PulseMotor) -> None:
+    def __init__(self, motor: PulseMotor, home_at: int | None = None) -> None:
         self.motor = motor
+        self.home = HomeSwitch(motor, home_at)
         self.speeds = {"H": 1000, "M": 500, "L": 100}
         self.selected = "H"
         self.rate = 24
@@ -86,6 +88,7 @@ class PM16CBox:
     Args:
         channel: the motor that turns the sample; the others turn nothing.
         line: what the TP0 connector, the output of position controller A, is wired to.
+        home_at: where its home switch is, in pulses since power-on; None plugs none in.
         lost, stall_at: faults of the sample's motor, see `PulseMotor`.
     """
 
@@ -98,6 +101,7 @@ class PM16CBox:
         counts_per_turn: int,
         lost: Set[int],
         stall_at: int | None,
+        home_at: int | None,
     ) -> None:
         self.clock = clock
         self.remote = False
@@ -112,7 +116,7 @@ class PM16CBox:
             return line if self.mapped[0] == sample else None
 
         self.sample = PulseMotor(clock, tp0, counts_per_turn=counts_per_turn, lost=lost, stall_at=stall_at)
-        self.channels[sample] = Channel(self.sample)
+        self.channels[sample] = Channel(self.sample, home_at)
 
     def moving(self) -> int:
         """How many motors move."""
@@ -143,13 +147,44 @@ class PM16CBox:
 
     def start(self, c: str, target: int) -> None:
         """Move with the selected speed; at most four motors at once."""
+        channel = self._ready_to_move(c, target)
+        channel.motor.start(target, channel.speeds[channel.selected], channel.acceleration)
+
+    def find_home(self, c: str) -> None:
+        """Search for the home switch with the selected speed."""
+        if self.channels[c].home.at is None:
+            raise Refused(Error.COMMAND)
+        channel = self._ready_to_move(c, 0)
+        channel.home.search(channel.speeds[channel.selected], channel.acceleration)
+
+    def go_home(self, c: str) -> None:
+        home = self.channels[c].home.found()
+        if home is None:
+            raise Refused(Error.COMMAND)
+        self.start(c, home)
+
+    def home(self, c: str) -> str:
+        """The reply to SHP?x."""
+        found = self.channels[c].home.found()
+        return "NO H.P" if found is None else f"{found:+08d}"
+
+    def preset(self, c: str, count: int) -> None:
+        """Call the place where it stands `count`."""
+        motor = self.standing(c).motor
+        if abs(count) > MAX_COUNT or motor.trigger.ready(self.clock.now()):
+            raise Refused(Error.COMMAND)
+        self.channels[c].home.forget_search()
+        motor.preset(count)
+
+    def _ready_to_move(self, c: str, target: int) -> Channel:
         channel = self.channels[c]
         if abs(target) > MAX_COUNT:
             raise Refused(Error.BAD_ABS)
         if channel.motor.moving() or self.moving() >= 4:
             raise Refused(Error.BUSY)
+        channel.home.forget_search()
         channel.motor.limits = (channel.soft["B"], channel.soft["F"]) if channel.switches[0] == "1" else None
-        channel.motor.start(target, channel.speeds[channel.selected], channel.acceleration)
+        return channel
 
     def slow_stop(self, c: str) -> None:
         self.channels[c].motor.stop(self.channels[c].acceleration)
