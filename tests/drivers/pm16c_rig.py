@@ -45,11 +45,13 @@ class Rig:
             "acceleration": math.radians(60),
             "low": math.radians(-5),
             "high": math.radians(100),
+            "home": 0.0,
+            "home_speed": math.radians(15),
         }
         return PM16CStage(self.url, **(usual | settings))
 
-    def bench(self) -> StageBench:
-        return StageBench(self.open(), self.clock, self.line)
+    def bench(self, **settings: Any) -> StageBench:
+        return StageBench(self.open(**settings), self.clock, self.line)
 
     def lose(self, prefix: str) -> None:
         """From now on commands (not queries) that begin so do not reach the controller."""

@@ -1,4 +1,4 @@
-"""What every rotation stage must do, real driver over a simulated wire or simulator: subclass it and give a `bench`.
+"""What every rotation stage must do, real driver over a simulated wire or simulator: subclass it and give a `build`.
 
 All angles are asked for in whole counts, so that every stage can reach them exactly. Nothing here knows the protocol.
 """
@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.motion import start_move_by
 from drivers.protocols import RotationStage, TriggerTrain
 from simulators.trigger_line import Pulse, TriggerLine
 
@@ -56,12 +57,36 @@ class StageBench:
         return 360.0 / self.stage.limits.counts_per_turn
 
 
+Build = Callable[..., StageBench]
+
+
 class StageConformance:
-    """The shared suite. A subclass has a fixture `bench` that yields a fresh StageBench."""
+    """The shared suite. A subclass has a fixture `build` that gives a function: called with settings of the stage's
+    constructor that differ from the usual ones it opens the stage, on a fresh wire, and returns its bench.
+
+    Attributes:
+        WIDTH: a pulse width (s) that the output has, at most 1 ms; None where it has no choice.
+        NO_WIDTH: one that it has not, or has not beside others.
+        INVERTS: its pulses may be active low.
+        HOMES: the stage of the bench has a reference, within its limits.
+        STOPS_ARE_TOLD: `status` tells that the last move was stopped.
+    """
+
+    WIDTH: float | None = 100e-6
+    NO_WIDTH: float = 0.0
+    INVERTS = False
+    HOMES = True
+    STOPS_ARE_TOLD = True
 
     @pytest.fixture
-    def bench(self) -> Iterator[StageBench]:
-        raise NotImplementedError("the subclass gives the bench")
+    def build(self) -> Build:
+        raise NotImplementedError("the subclass gives the benches")
+
+    @pytest.fixture
+    def bench(self, build: Build) -> Iterator[StageBench]:
+        bench = build()
+        yield bench
+        bench.stage.close()
 
     # identity
 
@@ -151,6 +176,126 @@ class StageConformance:
             bench.stage.wait(0.5)
         assert bench.stage.moving()
         assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
+
+    # relative moves
+
+    def test_a_thousand_relative_moves_of_a_third_of_a_degree_land_on_exact_counts(self, bench: StageBench) -> None:
+        """A third of a degree is no whole count; no move may add another rounding, up, down, or at the turns."""
+        stage = bench.stage
+        third = math.radians(1 / 3)
+        counts = stage.to_counts(third)
+        assert third != stage.to_angle(counts)
+        speed = stage.limits.max_speed
+        expected = 0
+        for sign, moves in ((1, 290), (-1, 300), (1, 295), (-1, 115)):
+            for _ in range(moves):
+                start_move_by(stage, sign * third, speed)
+                stage.wait(LONG)
+            expected += sign * moves * counts
+            assert stage.status().counts == expected
+            assert stage.to_counts(stage.position()) == expected
+        assert bench.line.angle_at(bench.clock.now()) == pytest.approx(stage.to_angle(expected), rel=1e-9)
+
+    @pytest.mark.parametrize("degrees", [-5.5, 101.0, math.nan, math.inf])
+    def test_a_relative_move_beyond_the_limits_is_refused(self, bench: StageBench, degrees: float) -> None:
+        bench.go(1.0)
+        with pytest.raises(DeviceRefused, match="Nothing has moved"):
+            start_move_by(bench.stage, math.radians(degrees) - math.radians(1.0), SPEED)
+        assert math.degrees(bench.stage.position()) == pytest.approx(1.0, abs=bench.count)
+
+    def test_a_relative_move_is_refused_while_it_moves(self, bench: StageBench) -> None:
+        bench.stage.start_move(math.radians(20), SPEED)
+        bench.clock.sleep(0.5)
+        with pytest.raises(DeviceRefused, match="moves"):
+            start_move_by(bench.stage, 0.1, SPEED)
+        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
+
+    # status
+
+    def test_its_status_is_where_it_is_and_what_it_does(self, bench: StageBench) -> None:
+        stage = bench.stage
+        status = stage.status()
+        assert (status.counts, status.moving, status.fault) == (0, False, "")
+        stage.start_move(math.radians(30), SPEED)
+        bench.clock.sleep(1.5)
+        status = stage.status()
+        assert status.moving
+        assert 0 < status.counts < bench.counts(30)
+        assert status.counts == pytest.approx(bench.counts(math.degrees(bench.line.angle_at(bench.clock.now()))), abs=2)
+        stage.wait(LONG)
+        status = stage.status()
+        assert (status.counts, status.moving, status.fault) == (bench.counts(30), False, "")
+
+    def test_its_status_tells_a_stop_until_the_next_move(self, bench: StageBench) -> None:
+        if not self.STOPS_ARE_TOLD:
+            pytest.skip("this controller does not remember stops")
+        bench.stage.start_move(math.radians(30), SPEED)
+        bench.clock.sleep(1.0)
+        bench.stage.stop()
+        assert bench.stage.status().fault != ""
+        bench.go(2.0)
+        assert bench.stage.status().fault == ""
+
+    # the reference
+
+    def test_a_search_ends_at_the_same_place_from_either_side(self, bench: StageBench) -> None:
+        if not self.HOMES:
+            pytest.skip("the stage of this bench has no reference; that it refuses a search is tested below")
+        places, counts = [], []
+        for degrees in (20.0, -4.0, 0.0):
+            bench.go(degrees)
+            before = bench.clock.now()
+            bench.stage.start_home()
+            assert bench.clock.now() - before < 0.5
+            where = bench.stage.wait(LONG)
+            status = bench.stage.status()
+            assert bench.stage.to_counts(where) == status.counts
+            assert (status.moving, status.homed in {True, None}, status.fault) == (False, True, "")
+            places.append(bench.line.angle_at(bench.clock.now()))
+            counts.append(status.counts)
+        assert places == pytest.approx([places[0]] * 3, abs=math.radians(bench.count))
+        assert counts == [counts[0]] * 3
+        assert bench.go(5.0) == pytest.approx(5.0, abs=bench.count)
+        assert bench.pulses() == []
+
+    def test_a_search_may_need_more_than_one_wait(self, bench: StageBench) -> None:
+        if not self.HOMES:
+            pytest.skip("the stage of this bench has no reference")
+        bench.go(30.0)
+        bench.stage.start_home()
+        with pytest.raises(DeviceTimeout, match="left moving"):
+            bench.stage.wait(0.1)
+        bench.stage.wait(LONG)
+        assert bench.stage.status().homed in {True, None}
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_search_that_is_stopped_is_not_taken_for_done(self, bench: StageBench, hard: bool) -> None:
+        if not self.HOMES:
+            pytest.skip("the stage of this bench has no reference")
+        bench.go(90.0)
+        bench.stage.start_home()
+        bench.clock.sleep(0.3)
+        (bench.stage.abort if hard else bench.stage.stop)()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(LONG)
+        where = bench.stage.position()
+        bench.clock.sleep(30.0)
+        assert bench.stage.position() == where
+        bench.stage.start_home()
+        bench.stage.wait(LONG)
+        assert bench.stage.status().homed in {True, None}
+
+    def test_a_search_is_refused_while_it_moves_or_without_a_reference(self, bench: StageBench) -> None:
+        if self.HOMES:
+            bench.stage.start_move(math.radians(20), SPEED)
+            bench.clock.sleep(0.5)
+            with pytest.raises(DeviceRefused, match="moves"):
+                bench.stage.start_home()
+            assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
+        else:
+            with pytest.raises(DeviceRefused, match="Nothing has moved"):
+                bench.stage.start_home()
+            assert bench.stage.position() == 0.0
 
     # triggers
 
@@ -242,6 +387,53 @@ class StageConformance:
         with pytest.raises(DeviceRefused, match="moves"):
             bench.stage.arm(bench.train(8.0, 1.0, 3))
         assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(5.0, abs=bench.count)
+
+    def test_pulses_still_to_come_are_counted_where_the_controller_tells(self, bench: StageBench) -> None:
+        told = [bench.stage.remaining_pulses()]
+        bench.stage.arm(bench.train(1.0, 1.0, 5))
+        told.append(bench.stage.remaining_pulses())
+        bench.go(2.5)
+        told.append(bench.stage.remaining_pulses())
+        bench.go(10.0)
+        told.append(bench.stage.remaining_pulses())
+        assert told in ([0, 5, 3, 0], [None] * 4)
+
+    def test_a_pulse_width_is_kept_and_trains_that_would_run_together_are_refused(self, build: Build) -> None:
+        if self.WIDTH is None:
+            pytest.skip("this output's pulses have one width; that another is refused is tested below")
+        bench = build(pulse_width=self.WIDTH)
+        described = bench.stage.describe()["pulse_width_s"]
+        assert described == pytest.approx(self.WIDTH)
+        per_count = 2 * math.pi / bench.stage.limits.counts_per_turn / bench.stage.limits.max_speed
+        touching, apart = math.floor(self.WIDTH / per_count), math.ceil(2.5 * self.WIDTH / per_count)
+        if touching > 0:
+            with pytest.raises(DeviceRefused, match="cannot be emitted"):
+                bench.stage.arm(TriggerTrain(bench.counts(2.0), touching, 5))
+        bench.stage.arm(TriggerTrain(bench.counts(2.0), apart, 50))
+        bench.stage.start_move(math.radians(90), bench.stage.limits.max_speed)
+        bench.stage.wait(LONG)
+        assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [
+            bench.counts(2.0) + k * apart for k in range(50)
+        ]
+        bench.stage.close()
+
+    def test_a_pulse_width_or_polarity_that_it_has_not_is_refused(self, build: Build) -> None:
+        with pytest.raises((DeviceRefused, ValueError)):
+            build(pulse_width=self.NO_WIDTH)
+        if not self.INVERTS:
+            with pytest.raises((DeviceRefused, ValueError)):
+                build(active_high=False)
+
+    def test_inverted_pulses_are_as_many_and_at_the_same_angles(self, build: Build) -> None:
+        if not self.INVERTS:
+            pytest.skip("this output cannot be inverted; that it refuses is tested above")
+        bench = build(active_high=False)
+        bench.stage.arm(bench.train(1.0, 0.5, 10))
+        bench.go(10.0)
+        assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [
+            bench.counts(1.0) + k * bench.counts(0.5) for k in range(10)
+        ]
+        bench.stage.close()
 
     # stops
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Iterator
 
 import pytest
 
@@ -14,7 +13,7 @@ from drivers.protocols import RotationStage, TriggerTrain
 from drivers.stages.pm16c import limits_of
 from drivers.stages.pm16c_channel import RATES, steepest_code
 from tests.drivers.pm16c_rig import COUNTS, Rig
-from tests.drivers.stage_conformance import LONG, SPEED, StageBench, StageConformance
+from tests.drivers.stage_conformance import LONG, SPEED, Build, StageConformance
 
 
 @pytest.fixture
@@ -23,11 +22,23 @@ def rig() -> Rig:
 
 
 class TestConformance(StageConformance):
+    NO_WIDTH = 50e-6
+
     @pytest.fixture
-    def bench(self, rig: Rig) -> Iterator[StageBench]:
-        bench = rig.bench()
-        yield bench
-        bench.stage.close()
+    def build(self) -> Build:
+        return lambda **settings: Rig(home_at=500).bench(**({"home": math.radians(2.0)} | settings))
+
+
+class TestConformanceWithoutHome(StageConformance):
+    """A stage without a home switch; and a width chosen for all trains."""
+
+    HOMES = False
+    WIDTH = 1e-3
+    NO_WIDTH = 2e-3
+
+    @pytest.fixture
+    def build(self) -> Build:
+        return lambda **settings: Rig(home_at=None).bench(**({"home": None} | settings))
 
 
 # opening and closing
