@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -149,6 +150,29 @@ def test_pulses_are_the_widest_that_the_interval_allows(rig: Rig) -> None:
     for interval, mode in ((15, "5"), (14, "4"), (1, "3")):
         stage.arm(TriggerTrain(100, interval, 3))
         assert rig.say("TMGM?B") == mode
+
+
+def test_a_chosen_width_is_the_one_set_and_a_single_pulse_may_be_wide(rig: Rig) -> None:
+    stage = rig.open(pulse_width=1e-3)
+    assert stage.describe()["pulse_width_s"] == 1e-3
+    with pytest.raises(DeviceRefused, match=r"not closer than 0\.002 s"):
+        stage.arm(TriggerTrain(100, 14, 3))
+    for train in (TriggerTrain(100, 15, 3), TriggerTrain(100, 1, 1)):
+        stage.arm(train)
+        assert rig.say("TMGM?B") == "5"
+
+
+def test_what_cannot_be_set_is_refused_before_anything_is_sent(rig: Rig) -> None:
+    for settings in ({"pulse_width": 5e-3}, {"pulse_width": math.nan}, {"active_high": False}):
+        with pytest.raises(DeviceRefused, match="Nothing was sent"):
+            rig.open(**settings)
+    assert rig.controller.queries == 0
+
+
+def test_the_transcript_holds_the_opening(rig: Rig, tmp_path: Path) -> None:
+    rig.open(transcript=tmp_path / "line.txt").close()
+    text = (tmp_path / "line.txt").read_text()
+    assert text.index(r"> b'VER?\r\n'") < text.index("PM16C-04XDL-SIMULATED") < text.index(r"> b'LOC\r\n'")
 
 
 def test_after_a_stop_on_the_way_going_on_gives_the_rest_and_going_back_gives_none(rig: Rig) -> None:
