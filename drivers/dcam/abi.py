@@ -1,126 +1,39 @@
-"""The DCAM-API v4 through ctypes: its structures, its library, and one Python method for each call that we use.
-
-Structures use natural alignment, which equals the vendor's 8-byte packing on 64-bit machines. Each begins with its own
-size in bytes, which the caller must set.
-"""
+"""The DCAM-API v4 through ctypes: its library, and one Python method for each call that we use."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
 from collections.abc import Mapping
-from ctypes import POINTER, byref, c_char_p, c_double, c_int32, c_uint32, c_void_p, sizeof
+from ctypes import POINTER, byref, c_char_p, c_double, c_int32, c_void_p, sizeof
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property, Text, error_name
+from drivers.dcam.codes import Capability, CaptureMode, CaptureState, Error, Property, Text, error_name
+from drivers.dcam.structures import (
+    ApiInit,
+    BufFrame,
+    DevCapability,
+    DevOpen,
+    DevString,
+    PropAttr,
+    TransferInfo,
+    WaitOpen,
+    WaitStart,
+)
 from drivers.errors import DeviceError
 
 _TEXT_BYTES = 256
 
 
-class ApiInit(ctypes.Structure):
-    """DCAMAPI_INIT."""
-
-    _fields_ = (
-        ("size", c_int32),
-        ("device_count", c_int32),
-        ("reserved", c_int32),
-        ("option_bytes", c_int32),
-        ("options", c_void_p),
-        ("guid", c_void_p),
-    )
-
-
-class DevOpen(ctypes.Structure):
-    """DCAMDEV_OPEN."""
-
-    _fields_ = (("size", c_int32), ("index", c_int32), ("camera", c_void_p))
-
-
-class DevString(ctypes.Structure):
-    """DCAMDEV_STRING."""
-
-    _fields_ = (("size", c_int32), ("which", c_int32), ("text", c_char_p), ("text_bytes", c_int32))
-
-
-class PropAttr(ctypes.Structure):
-    """DCAMPROP_ATTR."""
-
-    _fields_ = (
-        ("size", c_int32),
-        ("prop", c_int32),
-        ("option", c_int32),
-        ("reserved1", c_int32),
-        ("attribute", c_int32),
-        ("group", c_int32),
-        ("unit", c_int32),
-        ("attribute2", c_int32),
-        ("minimum", c_double),
-        ("maximum", c_double),
-        ("step", c_double),
-        ("default", c_double),
-        ("max_channel", c_int32),
-        ("reserved3", c_int32),
-        ("max_view", c_int32),
-        ("number_of_element", c_int32),
-        ("array_base", c_int32),
-        ("element_step", c_int32),
-    )
-
-
-class TimeStamp(ctypes.Structure):
-    """DCAM_TIMESTAMP, from an epoch of the camera's own: only differences mean anything."""
-
-    _fields_ = (("seconds", c_uint32), ("microseconds", c_int32))
-
-
-class TransferInfo(ctypes.Structure):
-    """DCAMCAP_TRANSFERINFO."""
-
-    _fields_ = (("size", c_int32), ("kind", c_int32), ("newest", c_int32), ("count", c_int32))
-
-
-class BufFrame(ctypes.Structure):
-    """DCAMBUF_FRAME."""
-
-    _fields_ = (
-        ("size", c_int32),
-        ("kind", c_int32),
-        ("option", c_int32),
-        ("index", c_int32),
-        ("buffer", c_void_p),
-        ("row_bytes", c_int32),
-        ("pixel_type", c_int32),
-        ("width", c_int32),
-        ("height", c_int32),
-        ("left", c_int32),
-        ("top", c_int32),
-        ("timestamp", TimeStamp),
-        ("framestamp", c_int32),
-        ("camerastamp", c_int32),
-    )
-
-
-class WaitOpen(ctypes.Structure):
-    """DCAMWAIT_OPEN."""
-
-    _fields_ = (("size", c_int32), ("supported", c_int32), ("wait", c_void_p), ("camera", c_void_p))
-
-
-class WaitStart(ctypes.Structure):
-    """DCAMWAIT_START."""
-
-    _fields_ = (("size", c_int32), ("happened", c_int32), ("mask", c_int32), ("timeout_ms", c_int32))
-
-
-_ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
+ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
     {
         "dcamapi_init": (POINTER(ApiInit),),
         "dcamapi_uninit": (),
         "dcamdev_open": (POINTER(DevOpen),),
         "dcamdev_close": (c_void_p,),
+        "dcamdev_getcapability": (c_void_p, POINTER(DevCapability)),
         "dcamdev_getstring": (c_void_p, POINTER(DevString)),
         "dcamprop_getattr": (c_void_p, POINTER(PropAttr)),
         "dcamprop_getvalue": (c_void_p, c_int32, POINTER(c_double)),
@@ -136,9 +49,11 @@ _ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
         "dcamcap_firetrigger": (c_void_p, c_int32),
         "dcamwait_open": (POINTER(WaitOpen),),
         "dcamwait_close": (c_void_p,),
+        "dcamwait_abort": (c_void_p,),
         "dcamwait_start": (c_void_p, POINTER(WaitStart)),
     }
 )
+"""Every function that this driver calls, and the types of what it takes; all answer with an int32."""
 
 _ADVICE: Mapping[int, str] = MappingProxyType(
     {
@@ -149,6 +64,12 @@ _ADVICE: Mapping[int, str] = MappingProxyType(
         Error.FAILOPENCAMERA: "Close other programs that use the camera, then switch it off and on",
         Error.NOCONNECTION: "Check the camera's power and cable, then connect again",
         Error.NOMEMORY: "Give the camera's ring fewer bytes or free memory",
+        Error.BUSY: "End other sessions with the camera in this process, or the capture that runs",
+        Error.FAILOPEN: "Close other programs that use the camera, then switch it off and on",
+        Error.TOOFREQUENTTRIGGER: "Turn the stage more slowly or expose for a shorter time: triggers come too fast",
+        Error.NOTRIGGER: "Check the trigger cable and its polarity",
+        Error.COOLINGTROUBLE: "Check the camera's fan and cooling water, and let it cool down",
+        Error.TEMPERATURE_TROUBLE: "Check the camera's fan and cooling water, and let it cool down",
         Error.LESSSYSTEMMEMORY: "Give the camera's ring fewer bytes or free memory",
     }
 )
@@ -161,6 +82,11 @@ class DcamError(DeviceError):
         self.code = code & 0xFFFFFFFF
         reply, advice = error_name(code), _ADVICE.get(self.code, "")
         super().__init__(device, "the camera's library reports an error", request=call, reply=reply, advice=advice)
+
+
+def installed_library(platform: str) -> str:
+    """The name under which the vendor's runtime installs the library; `platform` as sys.platform has it."""
+    return "dcamapi.dll" if platform == "win32" else "libdcamapi.so"
 
 
 class Dcam:
@@ -178,7 +104,7 @@ class Dcam:
 
     def __init__(self, library: Path | None, device: str) -> None:
         self._device = device
-        name = str(library or ("dcamapi.dll" if sys.platform == "win32" else "libdcamapi.so"))
+        name = str(library or installed_library(sys.platform))
         try:
             # RTLD_GLOBAL: the camera modules that the library loads resolve their symbols from it.
             # winmode 0: the full Windows search path, where the vendor's runtime installs itself.
@@ -187,15 +113,15 @@ class Dcam:
             problem = f"the camera's library {name} cannot be loaded ({error})"
             advice = "Install the vendor's DCAM-API runtime, or give the library's path in the configuration"
             raise DeviceError(device, problem, advice=advice, state="Nothing was changed") from error
-        missing = [call for call in _ARGUMENTS if getattr(loaded, call, None) is None]
+        missing = [call for call in ARGUMENTS if getattr(loaded, call, None) is None]
         if missing:
             problem = f"{name} is not a DCAM-API version 4 library: it lacks {', '.join(missing)}"
             raise DeviceError(
                 device, problem, advice="Check the library's path and version", state="Nothing was changed"
             )
-        self._functions = {call: getattr(loaded, call) for call in _ARGUMENTS}
+        self._functions = {call: getattr(loaded, call) for call in ARGUMENTS}
         for call, function in self._functions.items():
-            function.argtypes, function.restype = _ARGUMENTS[call], c_int32
+            function.argtypes, function.restype = ARGUMENTS[call], c_int32
 
     def _call(self, call: str, *arguments: Any, detail: str = "") -> None:
         code = self._functions[call](*arguments)
@@ -220,6 +146,12 @@ class Dcam:
 
     def dev_close(self, camera: int) -> None:
         self._call("dcamdev_close", camera)
+
+    def dev_getcapability(self, camera: int) -> Capability:
+        """Which stamps frames carry, as the library says."""
+        capability = DevCapability(size=sizeof(DevCapability))  # domain 0: functions
+        self._call("dcamdev_getcapability", camera, byref(capability))
+        return Capability(capability.flags)
 
     def dev_getstring(self, camera: int, which: Text) -> str:
         buffer = ctypes.create_string_buffer(_TEXT_BYTES)
@@ -290,11 +222,15 @@ class Dcam:
     def wait_close(self, wait: int) -> None:
         self._call("dcamwait_close", wait)
 
+    def wait_abort(self, wait: int) -> None:
+        """End the wait of another thread; nothing where none waits."""
+        self._call("dcamwait_abort", wait)
+
     def wait_start(self, wait: int, mask: int, timeout_ms: int) -> None:
         """Block until an event of `mask`. Several may fold into one: it is a hint, the transfer count is the truth.
 
         Raises:
-            DcamError: also TIMEOUT, LOSTFRAME and MISSINGFRAME_TROUBLE.
+            DcamError: also TIMEOUT, ABORT, LOSTFRAME and MISSINGFRAME_TROUBLE.
         """
         start = WaitStart(size=sizeof(WaitStart), mask=mask, timeout_ms=timeout_ms)
         self._call("dcamwait_start", wait, byref(start), detail=f"for {timeout_ms} ms")

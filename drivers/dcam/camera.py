@@ -2,54 +2,47 @@
 
 from __future__ import annotations
 
-import ctypes
 import threading
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers import usb
 from drivers.clock import Clock, SystemClock
-from drivers.dcam import codes
-from drivers.dcam.abi import BufFrame, Dcam, DcamError
-from drivers.dcam.codes import CaptureMode, CaptureState, Error, Event, Property, Text
+from drivers.dcam import cooling
+from drivers.dcam.abi import DcamError
+from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property
+from drivers.dcam.description import description
+from drivers.dcam.options import DcamOptions, TriggerMode
 from drivers.dcam.properties import Properties
+from drivers.dcam.ring import Ring
+from drivers.dcam.session import Session, run_all
+from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
+from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 
 _WAIT_SLICE = 0.1  # s; an event may fall between looking and waiting, so that no single wait may be long
 _START_TIMEOUT = 5.0  # s
 _LEAST_SLOTS = 16  # where memory allows: the camera may run on beyond the frames asked for while the host stalls
-
-
-@dataclass
-class _Capture:
-    """One run of the ring. `next` is the number, from 0, of the frame to hand out next."""
-
-    slots: int
-    next: int = 0
-    clock_offset: float | None = None  # s, host time minus the camera's
+_TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 
 
 class DcamCamera:
     """A triggered Hamamatsu camera (ORCA-Quest); implements drivers.protocols.Camera.
 
-    A lost frame stays visible: framestamps are the camera's own count, so that a frame lost anywhere leaves a gap; and
-    `describe` says how many were overwritten in the ring before they were fetched, and how often the transport reported
-    a loss. One thread takes frames; `disarm` may be called from another one and ends its wait.
+    A lost frame stays visible: framestamps are the camera's own count, so that a frame lost anywhere leaves a gap. A
+    ring that was overrun is an error besides, and `describe` says how many frames it cost and how often the transport
+    reported a loss. Triggers that come too early leave nothing at all: only times tell. One thread takes frames;
+    `disarm` and `close` may be called from another one and end its wait.
 
     Args:
         library: path of the DCAM-API library; None takes the installed one. A process can have one session with it.
         index: which camera, where DCAM finds several.
         name: what errors call it.
         clock: dates the first frame of a run when it is fetched; the camera's clock gives the differences after it.
-        ring_bytes: most memory for the ring; a full 16-bit frame of an ORCA-Quest has 18.9 MB.
+        options: how it takes triggers, what it does to its counts, and the memory of its ring.
 
     Raises:
-        DeviceError: no library, no camera, or it does not deliver a test frame.
+        DeviceError: no library, no camera, or it does not deliver two test frames that it counts.
     """
 
     def __init__(
@@ -59,32 +52,27 @@ class DcamCamera:
         name: str = "camera",
         *,
         clock: Clock | None = None,
-        ring_bytes: int = 1 << 30,
+        options: DcamOptions | None = None,
     ) -> None:
         self.name = name
-        self._clock = clock or SystemClock()
-        self._ring_bytes = ring_bytes
+        self._clock, self._options = clock or SystemClock(), options or DcamOptions()
+        self._inside = threading.Lock()  # held by whoever takes a frame: close() waits for it
         self._ring_lock = threading.Lock()  # held while slots are read or freed
-        self._capture: _Capture | None = None
-        self._overwritten = self._transport_losses = 0
+        self._ring: Ring | None = None  # armed
+        self._held: Ring | None = None  # in the library's memory, also one that could not be freed
+        self._clock_offset: float | None = None  # s, host time minus the camera's, in this run
+        self._overwritten, self._transport_losses = 0, 0
         self._closed = False
-        self._dcam = Dcam(library, name)
-        with ExitStack() as undo:
-            undo.callback(self._dcam.api_uninit)  # a session that failed to start must be ended too
-            found = self._start_session()
-            if index >= found:
-                raise DeviceError(
-                    name, f"there is no camera {index}", expected=f"an index below {found}, as DCAM found"
-                )
-            self._camera = self._dcam.dev_open(index)
-            undo.callback(self._dcam.dev_close, self._camera)
-            self._wait, supported = self._dcam.wait_open(self._camera)
-            self._events = (Event.FRAMEREADY | Event.STOPPED) & supported
-            undo.callback(self._dcam.wait_close, self._wait)
+        self._session = Session(library, index, name)
+        try:
+            self._dcam, self._camera = self._session.dcam, self._session.camera
             self._properties = Properties(self._dcam, self._camera, name)
+            self._apply(_TEST_SETTINGS)  # another program may have left anything
             self._first_stamp = self._stamp_of_a_first_frame()
-            self._settings = self._properties.read()
-            self._cleanup = undo.pop_all()
+        except BaseException:
+            with suppress(DcamError):
+                self._session.close()
+            raise
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Apply and read back: the exposure as the camera rounded it, all else as asked.
@@ -93,20 +81,20 @@ class DcamCamera:
             DeviceRefused: the camera cannot, or it is armed; it has the settings that it had.
         """
         self._require_open()
-        if self._capture is not None:
+        if self._ring is not None:
             raise DeviceRefused(self.name, "it is armed and takes no settings", advice="disarm() it first")
+        before = self._settings
         try:
-            self._properties.apply(settings)
+            self._apply(settings)
         except DeviceRefused:
-            self._properties.apply(self._settings)
+            self._apply(before)
             raise
-        self._settings = self._properties.read()
         return self._settings
 
     @property
     def timing(self) -> CameraTiming:
         self._require_open()
-        return self._properties.timing()
+        return read_timing(self._properties, self._settings.trigger, self._options)
 
     def arm(self, n_frames: int) -> None:
         """Allocate the ring and start; when it returns, the camera takes triggers.
@@ -115,22 +103,23 @@ class DcamCamera:
             DeviceRefused: it is armed already, or n_frames < 1.
         """
         self._require_open()
-        if self._capture is not None:
+        if self._ring is not None:
             raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
         if n_frames < 1:
             raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
+        self.disarm()  # a ring that could not be freed
+        if self._options.trigger_mode is TriggerMode.START:
+            apply_trigger_source(self._properties, self._settings.trigger)
         # One slot more than frames: the oldest slot of a full ring may be half overwritten at any moment.
-        fitting = self._ring_bytes // round(self._properties.get(Property.BUFFER_FRAMEBYTES))
+        fitting = self._options.ring_bytes // round(self._properties.get(Property.BUFFER_FRAMEBYTES))
         slots = max(2, min(max(n_frames + 1, _LEAST_SLOTS), fitting))
-        with ExitStack() as undo:
-            self._start(slots, CaptureMode.SEQUENCE, undo)
-            undo.pop_all()
-        self._overwritten = self._transport_losses = 0
-        self._capture = _Capture(slots)
+        ring = self._start(slots, CaptureMode.SEQUENCE)
+        self._overwritten, self._transport_losses, self._clock_offset = 0, 0, None
+        self._ring = ring
 
     def software_trigger(self) -> None:
-        if self._capture is None or self._settings.trigger is not TriggerSource.SOFTWARE:
-            armed = "not armed" if self._capture is None else "armed"
+        if self._ring is None or self._settings.trigger is not TriggerSource.SOFTWARE:
+            armed = "not armed" if self._ring is None else "armed"
             problem = f"it takes no software trigger ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         self._dcam.cap_firetrigger(self._camera)
@@ -141,144 +130,162 @@ class DcamCamera:
         Raises:
             DeviceTimeout: none came within `timeout` s.
             DeviceRefused: not armed, or disarmed while waiting.
-            DeviceError: unplugged, or the capture ended by itself.
+            DeviceError: the ring was overrun (later frames can still be taken), the camera is unplugged, or the capture
+                ended by itself.
         """
         deadline = self._clock.now() + timeout
         while True:
-            self._require_open()
-            state = self._dcam.cap_status(self._camera)  # before looking into the ring, so that no last frame is missed
-            frame = self._take()
-            if frame is not None:
-                return frame
-            if state is not CaptureState.BUSY:
-                problem = f"the capture ended by itself (state {state.name})"
-                raise DeviceError(self.name, problem, advice="Check the camera's power and cable, then arm it again")
-            left = deadline - self._clock.now()
-            if left <= 0:
-                problem = f"no frame came within {timeout:g} s of waiting for a trigger ({self._settings.trigger})"
-                advice = "Check that triggers arrive, and no closer together than the camera's least period"
-                raise DeviceTimeout(self.name, problem, advice=advice, state="It is still armed")
-            self._await_event(min(left, _WAIT_SLICE))
+            with self._inside:
+                frame = self._look()
+                if frame is not None:
+                    return frame
+                left = deadline - self._clock.now()
+                if left <= 0:
+                    problem = f"no frame came within {timeout:g} s of waiting for a trigger ({self._settings.trigger})"
+                    advice = "Check that triggers arrive, and no closer together than the camera's least period"
+                    raise DeviceTimeout(self.name, problem, advice=advice, state="It is still armed")
+                self._await_event(min(left, _WAIT_SLICE))
 
     def disarm(self) -> None:
-        """Stop and free the ring; legal in every state."""
-        with self._ring_lock, ExitStack() as steps:
-            if self._closed or self._capture is None:
-                return
-            self._capture = None
-            # Run in reverse, the second even where the first fails: an unplugged camera still has memory to free.
-            steps.callback(self._dcam.buf_release, self._camera)
-            steps.callback(self._dcam.cap_stop, self._camera)
+        """Stop and free the ring; legal in every state, and another thread's wait for a frame ends.
+
+        Raises:
+            DcamError: the library cannot; calling again tries again.
+        """
+        if not self._closed:
+            self._free()
+
+    def wait_until_cold(self, timeout: float, progress: cooling.Progress = lambda celsius, status: None) -> float:
+        """Wait until the sensor has the temperature that the cooler holds; °C.
+
+        Args:
+            timeout: s.
+            progress: takes the temperature and the cooler's status, once a second.
+
+        Raises:
+            DeviceRefused: the cooler is off.
+            DeviceTimeout: it was not cold in time.
+            DeviceError: the cooler reports trouble.
+        """
+        self._require_open()
+        return cooling.wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
 
     def describe(self) -> dict[str, str | int | float]:
         """Identity, what the camera reports of its state, and the losses of the present or last run."""
         self._require_open()
-        get = self._properties.get
         return {
-            **{which.name.lower(): self._dcam.dev_getstring(self._camera, which) for which in Text},
-            "exposure": get(Property.EXPOSURETIME),
-            "trigger": str(self._settings.trigger),
-            "readout": self._settings.readout,
-            "binning": self._settings.binning,
-            "sensor_temperature_c": get(Property.SENSORTEMPERATURE),
-            "conversion_factor": get(Property.CONVERSIONFACTOR_COEFF),
-            "conversion_offset": get(Property.CONVERSIONFACTOR_OFFSET),
-            "defect_correction": "on" if get(Property.DEFECTCORRECT_MODE) == codes.ON else "off",
+            **description(self._session, self._properties, self._settings, self._options),
             "frames_overwritten": self._overwritten,
             "transport_losses": self._transport_losses,
         }
 
     def close(self) -> None:
-        """Free everything; may be called again. A camera that no longer answers is let go without complaint."""
+        """Free everything, also after a failure; may be called again.
+
+        Raises:
+            DcamError: the first thing that failed. A camera that is not connected any more is let go without complaint.
+        """
         if self._closed:
             return
-        with suppress(DcamError):
-            self.disarm()
         self._closed = True
-        with suppress(DcamError):
-            self._cleanup.close()
+        run_all(self._free, self._end)
 
     def _require_open(self) -> None:
         if self._closed:
             raise DeviceError(self.name, "it is closed", advice="Connect again")
 
-    def _start_session(self) -> int:
-        try:
-            return self._dcam.api_init()
-        except DcamError as error:
-            if error.code != Error.NOCAMERA:
-                raise
-            advice = f"Switch the camera on and check its cable. {usb.preflight().message}"
-            reply = codes.error_name(error.code)
-            raise DeviceError(self.name, "DCAM finds no camera", reply=reply, advice=advice) from error
+    def _apply(self, settings: CameraSettings) -> None:
+        apply_settings(self._properties, self.name, settings, self._options)
+        self._settings = read_settings(self._properties, settings.trigger)
 
-    def _start(self, slots: int, mode: CaptureMode, undo: ExitStack) -> None:
-        self._dcam.buf_alloc(self._camera, slots)
-        undo.callback(self._dcam.buf_release, self._camera)
-        self._dcam.cap_start(self._camera, mode)
-        undo.callback(self._dcam.cap_stop, self._camera)
+    def _free(self) -> None:
+        with self._ring_lock:
+            held, self._ring = self._held, None
+            if held is not None:
+                run_all(lambda: self._dcam.wait_abort(self._session.wait), held.free)
+                self._held = None
+
+    def _end(self) -> None:
+        with self._inside:
+            self._session.close()
+
+    def _start(self, slots: int, mode: CaptureMode) -> Ring:
+        """A ring that captures; it is held until `_free`, also after an error."""
+        ring = self._held = Ring(self._dcam, self._camera, self.name, slots)
         deadline = self._clock.now() + _START_TIMEOUT
-        # Triggers that come before BUSY are lost. A SNAP may be over already.
-        while mode is CaptureMode.SEQUENCE and self._dcam.cap_status(self._camera) is not CaptureState.BUSY:
-            if self._clock.now() > deadline:
-                raise DeviceTimeout(self.name, f"the capture did not start within {_START_TIMEOUT:g} s")
-            self._clock.sleep(0.001)
+        try:
+            ring.start(mode)
+            # Triggers that come before BUSY are lost. A SNAP may be over already.
+            while mode is CaptureMode.SEQUENCE and ring.state() is not CaptureState.BUSY:
+                if self._clock.now() > deadline:
+                    raise DeviceTimeout(self.name, f"the capture did not start within {_START_TIMEOUT:g} s")
+                self._clock.sleep(0.001)
+        except BaseException:
+            with suppress(DcamError):
+                self._free()
+            raise
+        return ring
 
     def _stamp_of_a_first_frame(self) -> int:
         """0 or 1, as the model has it: without it, the loss of a run's first frame could not be seen."""
-        self._properties.set_exactly(Property.TRIGGERSOURCE, codes.TRIGGERSOURCE_INTERNAL)
+        ring = self._start(2, CaptureMode.SNAP)
         deadline = self._clock.now() + _START_TIMEOUT
-        with ExitStack() as undo:
-            self._start(1, CaptureMode.SNAP, undo)
-            while self._dcam.cap_transferinfo(self._camera) == 0:
-                if self._clock.now() > deadline:
-                    problem = f"no test frame came within {_START_TIMEOUT:g} s in free run"
-                    raise DeviceTimeout(self.name, problem, advice="Check its cable, then switch it off and on")
-                self._await_event(_WAIT_SLICE)
-            return int(self._dcam.buf_lockframe(self._camera, 0).framestamp)
+        while ring.arrived() < 2:
+            if self._clock.now() > deadline:
+                problem = f"no test frames came within {_START_TIMEOUT:g} s in free run"
+                raise DeviceTimeout(self.name, problem, advice="Check its cable, then switch it off and on")
+            self._await_event(_WAIT_SLICE)
+        first, second = ring.stamps(0), ring.stamps(1)
+        self._free()
+        if second.framestamp - first.framestamp != 1 or not _seconds(second) > _seconds(first):
+            problem = (
+                f"it does not count and date its frames: framestamps {first.framestamp}, {second.framestamp}, "
+                f"times {_seconds(first):.6f} s, {_seconds(second):.6f} s"
+            )
+            expected = "framestamps one apart and times that grow, without which a lost frame cannot be seen"
+            raise DeviceError(self.name, problem, expected=expected)
+        return int(first.framestamp)
 
     def _await_event(self, seconds: float) -> None:
         """Wait for a reason to look into the ring again; what there is to see, the ring itself says."""
         try:
-            self._dcam.wait_start(self._wait, self._events, max(1, round(seconds * 1000)))
+            self._dcam.wait_start(self._session.wait, self._session.events, max(1, round(seconds * 1000)))
         except DcamError as error:
             if error.code in (Error.LOSTFRAME, Error.MISSINGFRAME_TROUBLE):
                 self._transport_losses += 1  # capture goes on; the framestamps show which frame is missing
-            elif error.code != Error.TIMEOUT:
+            elif error.code not in (Error.TIMEOUT, Error.ABORT):
                 raise
 
-    def _take(self) -> CameraFrame | None:
+    def _look(self) -> CameraFrame | None:
         """The next frame of the ring, or None where there is none yet."""
+        self._require_open()
         with self._ring_lock:
-            capture = self._capture
-            if capture is None:
+            ring = self._ring
+            if ring is None:
                 raise DeviceRefused(self.name, "it is not armed, so no frame will come", advice="arm() it first")
-            while True:
-                # The ring overwrites without asking. Frames older than its slots are gone, and the oldest one may go.
-                count = self._dcam.cap_transferinfo(self._camera)
-                oldest = count - capture.slots + 1
-                self._overwritten += max(oldest - capture.next, 0)
-                capture.next = max(capture.next, oldest)
-                if capture.next >= count:
-                    return None
-                frame = self._dcam.buf_lockframe(self._camera, capture.next % capture.slots)
-                counts = _copy(frame)
-                if self._dcam.cap_transferinfo(self._camera) - capture.slots >= capture.next:
-                    continue  # it may have been overwritten while it was copied
-                capture.next += 1
-                return CameraFrame(counts, frame.framestamp - self._first_stamp, self._host_time(capture, frame))
+            state = ring.state()  # before looking into the ring, so that no last frame is missed
+            try:
+                taken = ring.take()
+            finally:
+                self._overwritten = ring.overwritten
+        if taken is not None:
+            counts, frame = taken
+            return CameraFrame(counts, frame.framestamp - self._first_stamp, self._trigger_time(frame))
+        if state is not CaptureState.BUSY:
+            problem = f"the capture ended by itself (state {state.name})"
+            raise DeviceError(self.name, problem, advice="Check the camera's power and cable, then arm it again")
+        return None
 
-    def _host_time(self, capture: _Capture, frame: BufFrame) -> float:
+    def _trigger_time(self, frame: BufFrame) -> float:
         """Camera clocks start anywhere: the first frame is dated by the host, less its exposure and readout."""
-        stamp = float(frame.timestamp.seconds + 1e-6 * frame.timestamp.microseconds)
-        if capture.clock_offset is None:
+        stamp = _seconds(frame)
+        if self._clock_offset is None:
             delay = self._settings.exposure + self._properties.get(Property.TIMING_READOUTTIME)
-            capture.clock_offset = self._clock.now() - delay - stamp
-        return capture.clock_offset + stamp
+            self._clock_offset = self._clock.now() - delay - stamp
+        external = self._settings.trigger is TriggerSource.EXTERNAL
+        return self._clock_offset + stamp - (self._options.trigger_delay if external else 0.0)
 
 
-def _copy(frame: BufFrame) -> NDArray[np.uint16]:
-    """uint16 [row, col] out of the ring; its rows may be padded."""
-    rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
-    memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
-    return np.ndarray((rows, cols), dtype="<u2", buffer=memoryview(memory), strides=(stride, 2)).copy()
+def _seconds(frame: BufFrame) -> float:
+    """The camera's own time of a frame."""
+    return float(frame.timestamp.seconds + 1e-6 * frame.timestamp.microseconds)

@@ -6,6 +6,7 @@
 
 typedef struct { int32_t size, iDeviceCount, reserved, initoptionbytes; const int32_t *initoption; const void *guid; } DCAMAPI_INIT;
 typedef struct { int32_t size, index; void *hdcam; } DCAMDEV_OPEN;
+typedef struct { int32_t size, domain, capflag, kind; } DCAMDEV_CAPABILITY;
 typedef struct { int32_t size, iString; char *text; int32_t textbytes; } DCAMDEV_STRING;
 typedef struct {
     int32_t cbSize, iProp, option, iReserved1, attribute, iGroup, iUnit, attribute2;
@@ -28,6 +29,7 @@ typedef struct { int32_t size, eventhappened, eventmask, timeout; } DCAMWAIT_STA
 #define SUCCESS 1
 #define NONE 0 /* nothing to do: not a failure */
 #define BUSY ERR(0x80000101u)
+#define ABORT ERR(0x80000102u)
 #define NOTREADY ERR(0x80000103u)
 #define NOTSTABLE ERR(0x80000104u)
 #define TIMEOUT ERR(0x80000106u)
@@ -54,6 +56,7 @@ int fakedcam_layout(char *out, int size) {
     T(DCAMAPI_INIT); F(DCAMAPI_INIT, size); F(DCAMAPI_INIT, iDeviceCount); F(DCAMAPI_INIT, reserved);
     F(DCAMAPI_INIT, initoptionbytes); F(DCAMAPI_INIT, initoption); F(DCAMAPI_INIT, guid);
     T(DCAMDEV_OPEN); F(DCAMDEV_OPEN, size); F(DCAMDEV_OPEN, index); F(DCAMDEV_OPEN, hdcam);
+    T(DCAMDEV_CAPABILITY); F(DCAMDEV_CAPABILITY, size); F(DCAMDEV_CAPABILITY, domain); F(DCAMDEV_CAPABILITY, capflag); F(DCAMDEV_CAPABILITY, kind);
     T(DCAMDEV_STRING); F(DCAMDEV_STRING, size); F(DCAMDEV_STRING, iString); F(DCAMDEV_STRING, text); F(DCAMDEV_STRING, textbytes);
     T(DCAMPROP_ATTR); F(DCAMPROP_ATTR, cbSize); F(DCAMPROP_ATTR, iProp); F(DCAMPROP_ATTR, option); F(DCAMPROP_ATTR, iReserved1);
     F(DCAMPROP_ATTR, attribute); F(DCAMPROP_ATTR, iGroup); F(DCAMPROP_ATTR, iUnit); F(DCAMPROP_ATTR, attribute2);

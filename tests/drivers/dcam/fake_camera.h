@@ -1,8 +1,8 @@
-/* An ORCA-Quest for the fake library: its properties, its ring, its trigger input, and what may go wrong.
+/* An ORCA-Quest for the fake library: its properties, its ring, its trigger input.
  *
  * Pixels say where and when they were taken: four bits of the framestamp, six of the sensor row, six of the sensor column.
  * Row padding is 0xEE. A frame is in the ring an exposure and a readout after its trigger. Time is virtual (a wait jumps to
- * the next thing that happens) or real. The world outside acts through the functions named fakedcam_*. */
+ * the next thing that happens) or real. The world outside acts through fake_world.h. */
 #include <math.h>
 #include <pthread.h>
 #include <stdlib.h>
@@ -10,6 +10,7 @@
 #include <time.h>
 
 #define PULSE_WIDTH 1e-3
+#define LONG_AGO (-1e9)
 
 enum { ST_BUSY = 1, ST_READY = 2, ST_STABLE = 3 };
 enum { EV_FRAMEREADY = 2, EV_STOPPED = 16 };
@@ -20,8 +21,9 @@ enum { MODE = 1, LONG = 2, REAL = 3, ROUNDS = 0x800000 };
 typedef struct { int32_t id, access, type; double min, max, step, initial; int legal[4]; double value; } Property;
 enum {
     TRIGGERSOURCE, TRIGGERACTIVE, TRIGGER_MODE, TRIGGERPOLARITY, TRIGGERTIMES, TRIGGERDELAY, GLOBALEXPOSURE, EXPOSURETIME,
-    TEMPERATURE, READOUTSPEED, SENSORMODE, BINNING, HPOS, HSIZE, VPOS, VSIZE, SUBARRAYMODE, READOUTTIME, CYCLIC, BLANKING,
-    MININTERVAL, FRAMEINTERVAL, BITS, WIDTH, HEIGHT, ROWBYTES, PIXELTYPE, FRAMEBYTES, BUNDLE, DEFECT, COEFF, OFFSET, N_PROPS
+    TEMPERATURE, COOLERSTATUS, READOUTSPEED, SENSORMODE, BINNING, HPOS, HSIZE, VPOS, VSIZE, SUBARRAYMODE, READOUTTIME, CYCLIC,
+    BLANKING, MININTERVAL, FRAMEINTERVAL, BITS, WIDTH, HEIGHT, ROWBYTES, PIXELTYPE, FRAMEBYTES, BUNDLE, TIMEPRODUCER,
+    STAMPPRODUCER, DEFECT, HOTPIXEL, COEFF, OFFSET, N_PROPS
 };
 static const Property TABLE[N_PROPS] = {
     [TRIGGERSOURCE] = {0x00100110, SRB, MODE, 1, 4, 1, 1, {1, 2, 3, 4}},
@@ -33,6 +35,7 @@ static const Property TABLE[N_PROPS] = {
     [GLOBALEXPOSURE] = {0x001F0300, S, MODE, 3, 5, 1, 3, {3, 5}},
     [EXPOSURETIME] = {0x001F0110, SRB, REAL | ROUNDS, 7.2e-6, 1800, 1e-8, 8.2944e-3},
     [TEMPERATURE] = {0x00200310, RO, REAL, -50, 100, 0.1, -20},
+    [COOLERSTATUS] = {0x00200340, RO, MODE, -4, 5, 1, 2, {1, 2, 3, 4}},
     [READOUTSPEED] = {0x00400110, S, MODE, 1, 2, 1, 2, {1, 2}},
     [SENSORMODE] = {0x00400210, S, MODE, 1, 18, 1, 1, {1, 12, 18}},
     [BINNING] = {0x00401110, S, MODE, 1, 4, 1, 1, {1, 2, 4}},
@@ -53,32 +56,41 @@ static const Property TABLE[N_PROPS] = {
     [PIXELTYPE] = {0x00420270, S, MODE, 1, 2, 1, 2, {1, 2}},
     [FRAMEBYTES] = {0x00420340, RO, LONG},
     [BUNDLE] = {0x00421010, RO, MODE, 1, 2, 1, 1, {1, 2}},
+    [TIMEPRODUCER] = {0x00410A10, RO, MODE, 1, 5, 1, 5, {5}},
+    [STAMPPRODUCER] = {0x00410A20, RO, MODE, 1, 5, 1, 5, {5}},
     [DEFECT] = {0x00470010, SRB, MODE, 1, 2, 1, 2, {1, 2}},
+    [HOTPIXEL] = {0x00470030, SRB, MODE, 1, 3, 1, 1, {1, 2, 3}},
     [COEFF] = {0x00FFE010, RO, REAL, 0, 1, 0, 0.107},
     [OFFSET] = {0x00FFE020, RO, REAL, 0, 1000, 0, 200},
 };
 
 /* What the outside can do to the camera and its library. */
-static const char *const FAULTS[] = {"no_camera", "unplugged", "drop", "report_loss", "pad", "first_stamp", "start_polls",
-                                     "overrun_in_lock", "swallow_events", "refuse", "no_memory", "no_stopped_event"};
-enum { NO_CAMERA, UNPLUGGED, DROP, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, NO_MEMORY, NO_STOPPED_EVENT, N_FAULTS };
+static const char *const FAULTS[] = {"no_camera", "unplugged", "unplug_at", "report_loss", "pad", "first_stamp", "start_polls",
+                                     "overrun_in_lock", "swallow_events", "refuse", "unsupported", "no_memory",
+                                     "no_stopped_event", "no_stamps", "short_ring", "drop"};
+enum { NO_CAMERA, UNPLUGGED, UNPLUG_AT, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, UNSUPPORTED,
+       NO_MEMORY, NO_STOPPED_EVENT, NO_STAMPS, SHORT_RING, DROP, N_FAULTS };
 
-enum { MAX_PULSES = 4096 };
+enum { MAX_PULSES = 4096, MAX_HANDLES = 4096, MAX_CALLS = 64 };
+static char handles[MAX_HANDLES]; /* their addresses are the handles; none is given out twice, so that old ones are known */
 static struct {
     Property props[N_PROPS];
     int overridden[N_PROPS], faults[N_FAULTS];
     double override[N_PROPS];
-    int sensor_rows, sensor_cols, devices;
-    int session, opened, waiting_open, status, mode, polls, waiters, pending;
-    int slots, count, exposed, accepted;
+    int sensor_rows, sensor_cols, devices, n_handles;
+    int session, status, mode, polls, waiters, aborts, pending;
+    void *camera, *wait; /* NULL where closed */
+    int slots, count, exposed, edges, externals; /* externals: exposures by external trigger over the camera's life */
     uint8_t **ring;
     int32_t *stamps;
-    double *times, last_edge, started, boot, virtual_now; /* virtual_now 0: real time */
-    double pulses[MAX_PULSES];
+    double *times, last_edge, open_edge, started, boot, virtual_now; /* virtual_now 0: real time */
+    double pulses[MAX_PULSES], looked; /* looked: time of the last pulse taken off the cable */
+    double (*cable)(double after);     /* time of the first pulse later than that; negative for none */
     int n_pulses, seen;
-    struct { double edge, ready; int stamp; } flying[4]; /* exposed, not yet read out */
+    unsigned char lost[1 << 16]; /* external exposures that never reach the ring */
+    struct { double begin, ready; int stamp; } flying[4]; /* exposed, not yet read out */
     int n_flying;
-    char camera, wait; /* their addresses are the handles */
+    struct { const char *name; int count, fail_in; int32_t code; } calls[MAX_CALLS];
 } fake;
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static pthread_cond_t changed = PTHREAD_COND_INITIALIZER;
@@ -90,21 +102,30 @@ static double now(void) {
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
+static int is(int p, int value) { return fake.props[p].value == value; }
+
+static int counts_photons(void) { return is(SENSORMODE, 18); }
+
+static int slow(void) { return is(READOUTSPEED, 1) || counts_photons(); }
+
 static double get(int p) {
     if (fake.overridden[p]) return fake.override[p];
-    int subarray = fake.props[SUBARRAYMODE].value == 2, binning = (int)fake.props[BINNING].value;
-    int rows = subarray ? (int)fake.props[VSIZE].value : fake.sensor_rows;
-    int cols = subarray ? (int)fake.props[HSIZE].value : fake.sensor_cols;
-    double line = fake.props[READOUTSPEED].value == 1 ? 172.8e-6 : 7.2e-6, exposure = fake.props[EXPOSURETIME].value;
+    int binning = (int)fake.props[BINNING].value;
+    int rows = is(SUBARRAYMODE, 2) ? (int)fake.props[VSIZE].value : fake.sensor_rows;
+    int cols = is(SUBARRAYMODE, 2) ? (int)fake.props[HSIZE].value : fake.sensor_cols;
+    double line = slow() ? 172.8e-6 : 7.2e-6, exposure = fake.props[EXPOSURETIME].value;
     switch (p) {
     case READOUTTIME: return rows / 2 * line;
     case BLANKING: return (rows / 2 + 5) * line;
-    case CYCLIC: case MININTERVAL: return exposure + (rows / 2 + 5) * line;
+    case CYCLIC: case MININTERVAL: return (is(TRIGGERACTIVE, 1) ? exposure : 0) + (rows / 2 + 5) * line;
     case FRAMEINTERVAL: return fmax(exposure, (rows / 2 + 5) * line);
     case WIDTH: return cols / binning;
     case HEIGHT: return rows / binning;
     case ROWBYTES: return cols / binning * 2 + fake.faults[PAD];
     case FRAMEBYTES: return get(ROWBYTES) * get(HEIGHT);
+    case READOUTSPEED: return slow() ? 1 : 2;
+    case COEFF: return counts_photons() ? 1 : fake.props[p].value;
+    case OFFSET: return counts_photons() ? 0 : fake.props[p].value;
     default: return fake.props[p].value;
     }
 }
@@ -113,7 +134,7 @@ static int capturing(void) { return fake.status == ST_BUSY && fake.polls >= fake
 
 static void deliver(void) { /* the oldest exposed frame, into the ring */
     int slot = fake.count % fake.slots, rows = (int)get(HEIGHT), cols = (int)get(WIDTH), stride = (int)get(ROWBYTES);
-    int subarray = fake.props[SUBARRAYMODE].value == 2, binning = (int)fake.props[BINNING].value;
+    int subarray = is(SUBARRAYMODE, 2), binning = (int)fake.props[BINNING].value;
     int row0 = subarray ? (int)fake.props[VPOS].value : 0, col0 = subarray ? (int)fake.props[HPOS].value : 0;
     int stamp = fake.flying[0].stamp;
     for (int r = 0; r < rows; r++) {
@@ -125,8 +146,8 @@ static void deliver(void) { /* the oldest exposed frame, into the ring */
             row[2 * c + 1] = (uint8_t)(v >> 8);
         }
     }
-    fake.stamps[slot] = stamp;
-    fake.times[slot] = fake.flying[0].edge - fake.boot; /* the camera's clock starts when it is switched on */
+    fake.stamps[slot] = fake.faults[NO_STAMPS] ? 0 : stamp;
+    fake.times[slot] = fake.flying[0].begin - fake.boot; /* the camera's clock starts when it is switched on */
     memmove(fake.flying, fake.flying + 1, sizeof fake.flying - sizeof *fake.flying);
     fake.n_flying--;
     fake.count++;
@@ -136,38 +157,59 @@ static void deliver(void) { /* the oldest exposed frame, into the ring */
     pthread_cond_broadcast(&changed);
 }
 
-static void expose(double edge) {
+static void expose(double begin, double exposure) {
     int stamp = fake.faults[FIRST_STAMP] + fake.exposed++;
-    fake.last_edge = edge;
-    if (fake.n_flying == 4) deliver();
+    if (is(TRIGGERSOURCE, 2)) {
+        int number = fake.externals++;
+        if (fake.faults[UNPLUG_AT] && number >= fake.faults[UNPLUG_AT]) fake.faults[UNPLUGGED] = 1;
+        if (number < (int)sizeof fake.lost && fake.lost[number]) return;
+    }
     if (fake.faults[DROP] > 0) { fake.faults[DROP]--; return; }
-    fake.flying[fake.n_flying].edge = edge;
-    fake.flying[fake.n_flying].ready = edge + get(EXPOSURETIME) + get(READOUTTIME);
+    if (fake.n_flying == 4) deliver();
+    fake.flying[fake.n_flying].begin = begin;
+    fake.flying[fake.n_flying].ready = begin + exposure + get(READOUTTIME);
     fake.flying[fake.n_flying++].stamp = stamp;
 }
 
-static double next_edge(void) {
-    if (fake.seen < fake.n_pulses) return fake.pulses[fake.seen] + (fake.props[TRIGGERPOLARITY].value == 2 ? 0 : PULSE_WIDTH);
-    if (!capturing() || fake.props[TRIGGERSOURCE].value != 1 || (fake.mode == 0 && fake.exposed >= fake.slots)) return INFINITY;
+static double next_pulse(void) { /* a rising edge on the trigger input */
+    if (!fake.cable) return fake.seen < fake.n_pulses ? fake.pulses[fake.seen] : INFINITY;
+    double time = fake.cable(fake.looked);
+    return time < 0 ? INFINITY : time;
+}
+
+static double free_run(void) {
+    if (!capturing() || !is(TRIGGERSOURCE, 1) || (fake.mode == 0 && fake.exposed >= fake.slots)) return INFINITY;
     return fake.started + fake.exposed * get(FRAMEINTERVAL);
 }
 
-static double next_ready(void) { return fake.n_flying ? fake.flying[0].ready : INFINITY; }
+static void external_edge(double edge) {
+    if (!capturing() || !is(TRIGGERSOURCE, 2)) return;
+    if (++fake.edges % (int)fake.props[TRIGGERTIMES].value) return;
+    if (edge - fake.last_edge < get(MININTERVAL) - 1e-6) return; /* too early: ignored without a word */
+    double begin = edge + fake.props[TRIGGERDELAY].value;
+    fake.last_edge = edge;
+    if (is(TRIGGER_MODE, 6)) { /* START: runs freely from here on, and forgets where the start came from */
+        fake.props[TRIGGERSOURCE].value = 1;
+        fake.started = begin;
+    } else if (is(TRIGGERACTIVE, 3)) { /* SYNCREADOUT: each pulse ends one exposure and begins the next */
+        if (fake.open_edge > LONG_AGO) expose(fake.open_edge, begin - fake.open_edge);
+        fake.open_edge = begin;
+    } else expose(begin, is(TRIGGERACTIVE, 2) ? PULSE_WIDTH : get(EXPOSURETIME));
+}
 
-static void trigger(double edge) { /* an edge on the input, or of the free run */
-    if (fake.seen < fake.n_pulses) {
-        fake.seen++;
-        if (!capturing() || fake.props[TRIGGERSOURCE].value != 2 || edge - fake.last_edge < get(MININTERVAL) - 1e-6) return;
-        if (++fake.accepted % (int)fake.props[TRIGGERTIMES].value) return;
-        edge += fake.props[TRIGGERDELAY].value;
-    }
-    expose(edge);
+static double next_event(void) { /* in the camera or on its cable; what lies before now has happened */
+    double event = fmin(free_run(), fake.n_flying ? fake.flying[0].ready : INFINITY);
+    return fmin(event, next_pulse() + (is(TRIGGERPOLARITY, 2) ? 0 : PULSE_WIDTH));
 }
 
 static void catch_up(void) {
-    while (fmin(next_edge(), next_ready()) <= now()) {
-        if (next_ready() <= next_edge()) deliver();
-        else trigger(next_edge());
+    for (;;) {
+        double pulse = next_pulse(), edge = pulse + (is(TRIGGERPOLARITY, 2) ? 0 : PULSE_WIDTH), run = free_run();
+        double ready = fake.n_flying ? fake.flying[0].ready : INFINITY, first = fmin(ready, fmin(edge, run));
+        if (first > now()) return;
+        if (ready <= first) deliver();
+        else if (run <= first) { fake.last_edge = run; expose(run, get(EXPOSURETIME)); }
+        else { fake.seen++; fake.looked = pulse; external_edge(edge); }
     }
 }
 
@@ -188,68 +230,7 @@ static void stop(void) {
     pthread_cond_broadcast(&changed);
 }
 
-void fakedcam_reset(int devices, int rows, int cols, double virtual_now) {
-    pthread_mutex_lock(&lock);
-    if (fake.slots) release();
-    memset(&fake, 0, sizeof fake);
-    fake.virtual_now = virtual_now; fake.boot = now() - 77.25;
-    fake.devices = devices; fake.sensor_rows = rows; fake.sensor_cols = cols; fake.status = ST_STABLE;
-    memcpy(fake.props, TABLE, sizeof TABLE);
-    for (int p = 0; p < N_PROPS; p++) fake.props[p].value = TABLE[p].initial;
-    fake.props[HPOS].max = cols - 4; fake.props[VPOS].max = rows - 4;
-    fake.props[HSIZE].max = fake.props[HSIZE].value = cols; fake.props[VSIZE].max = fake.props[VSIZE].value = rows;
-    pthread_mutex_unlock(&lock);
-}
-
-int fakedcam_fault(const char *name, int value) {
-    for (int i = 0; i < N_FAULTS; i++) if (!strcmp(name, FAULTS[i])) { fake.faults[i] = value; return 1; }
-    return 0;
-}
-
 static int find(int32_t id) {
-    for (int p = 0; p < N_PROPS; p++) if (TABLE[p].id == id) return p;
+    for (int p = 0; p < N_PROPS; p++) if (TABLE[p].id == id && fake.faults[UNSUPPORTED] != id) return p;
     return -1;
 }
-
-int fakedcam_override(int32_t id, double value) { /* the property reads so from now on, whatever is set */
-    int p = find(id);
-    if (p < 0) return 0;
-    fake.overridden[p] = 1;
-    fake.override[p] = value;
-    return 1;
-}
-
-int fakedcam_preset(int32_t id, double value) { /* as another program left it */
-    int p = find(id);
-    if (p < 0) return 0;
-    fake.props[p].value = value;
-    return 1;
-}
-
-double fakedcam_value(int32_t id) { return get(find(id)); }
-
-int fakedcam_exposed(void) { return fake.exposed; }
-
-double fakedcam_now(void) { return now(); }
-
-void fakedcam_sleep(double seconds) { /* in virtual time */
-    pthread_mutex_lock(&lock);
-    fake.virtual_now += seconds;
-    catch_up();
-    pthread_mutex_unlock(&lock);
-}
-
-int fakedcam_pulse(double rise) { /* on the trigger input, some time from now on and after those before */
-    pthread_mutex_lock(&lock);
-    int room = fake.n_pulses < MAX_PULSES;
-    if (room) fake.pulses[fake.n_pulses++] = rise;
-    pthread_cond_broadcast(&changed);
-    pthread_mutex_unlock(&lock);
-    return room;
-}
-
-void fakedcam_stop(void) { pthread_mutex_lock(&lock); stop(); pthread_mutex_unlock(&lock); }
-
-int fakedcam_live(void) { return fake.session + fake.opened + fake.waiting_open + (fake.slots > 0); }
-
-int fakedcam_waiters(void) { return fake.waiters; }

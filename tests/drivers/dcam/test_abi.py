@@ -9,22 +9,24 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dcam import abi, codes
+from drivers.dcam import abi, codes, structures
 from drivers.errors import DeviceError
 
 STRUCTURES = {
-    "DCAMAPI_INIT": abi.ApiInit,
-    "DCAMDEV_OPEN": abi.DevOpen,
-    "DCAMDEV_STRING": abi.DevString,
-    "DCAMPROP_ATTR": abi.PropAttr,
-    "DCAM_TIMESTAMP": abi.TimeStamp,
-    "DCAMCAP_TRANSFERINFO": abi.TransferInfo,
-    "DCAMBUF_FRAME": abi.BufFrame,
-    "DCAMWAIT_OPEN": abi.WaitOpen,
-    "DCAMWAIT_START": abi.WaitStart,
+    "DCAMDEV_CAPABILITY": structures.DevCapability,
+    "DCAMAPI_INIT": structures.ApiInit,
+    "DCAMDEV_OPEN": structures.DevOpen,
+    "DCAMDEV_STRING": structures.DevString,
+    "DCAMPROP_ATTR": structures.PropAttr,
+    "DCAM_TIMESTAMP": structures.TimeStamp,
+    "DCAMCAP_TRANSFERINFO": structures.TransferInfo,
+    "DCAMBUF_FRAME": structures.BufFrame,
+    "DCAMWAIT_OPEN": structures.WaitOpen,
+    "DCAMWAIT_START": structures.WaitStart,
 }
 # Bytes on 64-bit machines, as the vendor's header and two independent bindings have them.
 SIZES = {
+    "DCAMDEV_CAPABILITY": 16,
     "DCAMAPI_INIT": 32,
     "DCAMDEV_OPEN": 16,
     "DCAMDEV_STRING": 24,
@@ -43,11 +45,14 @@ def test_size_is_the_published_one(name: str) -> None:
 
 
 def test_stamps_lie_where_the_vendor_puts_them() -> None:
-    assert (abi.BufFrame.buffer.offset, abi.BufFrame.timestamp.offset, abi.BufFrame.framestamp.offset) == (16, 48, 56)
+    frame = structures.BufFrame
+    assert (frame.buffer.offset, frame.timestamp.offset, frame.framestamp.offset) == (16, 48, 56)
 
 
 def test_layout_is_that_of_a_c_compiler(world) -> None:
     c_layout = world.layout()
+    declared = {value for value in vars(structures).values() if isinstance(value, type(ctypes.Structure))}
+    assert set(STRUCTURES.values()) == declared  # none is left out
     assert set(c_layout) == set(STRUCTURES)
     for name, structure in STRUCTURES.items():
         offsets = [getattr(structure, field).offset for field, _ in structure._fields_]
@@ -98,4 +103,4 @@ def test_a_wrong_size_field_is_seen_by_the_library(world) -> None:
     """The fake checks sizes as the real one does; that the other tests pass therefore means something."""
     library = ctypes.CDLL(str(world.path))
     library.dcamapi_init.restype = ctypes.c_int32
-    assert library.dcamapi_init(ctypes.byref(abi.ApiInit(size=8))) & 0xFFFFFFFF == codes.Error.INVALIDPARAM
+    assert library.dcamapi_init(ctypes.byref(structures.ApiInit(size=8))) & 0xFFFFFFFF == codes.Error.INVALIDPARAM

@@ -1,0 +1,68 @@
+"""Cooling: wait until the sensor is as cold as it will be, since dark counts taken before do not hold for the scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.clock import Clock
+from drivers.dcam.codes import Cooler, Property
+from drivers.dcam.properties import Properties
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+
+Progress = Callable[[float, str], None]
+"""Takes the sensor's temperature in °C and what the cooler says of itself."""
+
+POLL = 1.0  # s
+STEADY_BAND, STEADY_FOR = 0.5, 60.0
+"""°C and s: where the cooler does not say that it is done, a temperature this steady for so long counts as reached."""
+
+
+def wait_until_cold(
+    properties: Properties, device: str, clock: Clock, timeout: float, progress: Progress = lambda celsius, status: None
+) -> float:
+    """Wait for the cooler to be ready; the sensor's temperature in °C.
+
+    Raises:
+        DeviceRefused: the cooler is off.
+        DeviceTimeout: it was not ready within `timeout` s.
+        DeviceError: the cooler reports trouble.
+    """
+    deadline = clock.now() + timeout
+    history: list[tuple[float, float]] = []
+    while True:
+        now, celsius = clock.now(), properties.get(Property.SENSORTEMPERATURE)
+        status = _status(properties)
+        progress(celsius, status.name.lower())
+        history = [(time, value) for time, value in history if time >= now - STEADY_FOR - POLL] + [(now, celsius)]
+        if status is Cooler.READY or (status in (Cooler.NONE, Cooler.ALWAYS) and _steady(history)):
+            return celsius
+        if status < 0:
+            problem = f"its cooler reports {status.name} at {celsius:.1f} °C"
+            raise DeviceError(device, problem, advice="Check the camera's fan and cooling water")
+        if status is Cooler.OFF:
+            raise DeviceRefused(device, f"its cooler is off ({celsius:.1f} °C)", advice="Switch the cooler on")
+        if now >= deadline:
+            problem = f"its sensor is not cold after {timeout:g} s: {celsius:.1f} °C, cooler {status.name.lower()}"
+            raise DeviceTimeout(
+                device,
+                problem,
+                expected=_target(properties),
+                advice="Wait longer, or check the camera's fan and cooling water",
+            )
+        clock.sleep(min(POLL, deadline - now))
+
+
+def _status(properties: Properties) -> Cooler:
+    status = properties.find(Property.SENSORCOOLERSTATUS)
+    return Cooler.NONE if status is None else Cooler(round(status))
+
+
+def _target(properties: Properties) -> str:
+    target = properties.find(Property.SENSORTEMPERATURETARGET)
+    return "the cooler to be ready" if target is None else f"{target:.1f} °C"
+
+
+def _steady(history: list[tuple[float, float]]) -> bool:
+    """The temperatures span the time asked for, and little else."""
+    values = [value for _, value in history]
+    return history[-1][0] - history[0][0] >= STEADY_FOR and max(values) - min(values) <= STEADY_BAND

@@ -1,0 +1,99 @@
+"""Ring: the library's ring of buffers during one capture, drained in order with one copy out per frame."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.dcam.abi import Dcam
+from drivers.dcam.codes import CaptureMode, CaptureState
+from drivers.dcam.session import run_all
+from drivers.dcam.structures import BufFrame
+from drivers.errors import DeviceError
+
+
+class Ring:
+    """Allocated once made, until `free`. Not safe from several threads.
+
+    Args:
+        slots: frames that it holds; while it runs, the oldest one may be half overwritten at any moment.
+
+    Raises:
+        DcamError: there is no memory.
+
+    Attributes:
+        overwritten: frames that were overwritten before they were taken.
+    """
+
+    def __init__(self, dcam: Dcam, camera: int, device: str, slots: int) -> None:
+        self._dcam, self._camera, self._device, self._slots = dcam, camera, device, slots
+        self._next = 0  # number, from 0 in the order of arrival, of the frame to hand out next
+        self._told = False  # an overrun was reported, and no frame was handed out since
+        self.overwritten = 0
+        dcam.buf_alloc(camera, slots)
+
+    def start(self, mode: CaptureMode) -> None:
+        """Begin to capture; whether it has begun, `state` says."""
+        self._dcam.cap_start(self._camera, mode)
+
+    def state(self) -> CaptureState:
+        return self._dcam.cap_status(self._camera)
+
+    def arrived(self) -> int:
+        """Frames put into it so far."""
+        return self._dcam.cap_transferinfo(self._camera)
+
+    def stamps(self, slot: int) -> BufFrame:
+        """What is known of the frame in a slot, without its pixels."""
+        return self._dcam.buf_lockframe(self._camera, slot)
+
+    def take(self) -> tuple[NDArray[np.uint16], BufFrame] | None:
+        """The next frame, in memory of its own, and its stamps; None where there is none yet.
+
+        Raises:
+            DeviceError: it was overrun. Said once until a later frame is taken, so that taking goes on.
+        """
+        while True:
+            # The ring overwrites without asking. Frames older than its slots are gone, and the oldest one may go.
+            count = self.arrived()
+            self._skip(count - self._slots + 1)
+            if self._next >= count:
+                return None
+            frame = self._dcam.buf_lockframe(self._camera, self._next % self._slots)
+            counts = self._copy(frame)
+            if self.arrived() - self._slots >= self._next:
+                continue  # it may have been overwritten while it was copied
+            self._next += 1
+            self._told = False
+            return counts, frame
+
+    def free(self) -> None:
+        """Stop and release, the second even where the first fails: an unplugged camera still has memory to free."""
+        run_all(lambda: self._dcam.cap_stop(self._camera), lambda: self._dcam.buf_release(self._camera))
+
+    def _skip(self, oldest: int) -> None:
+        first, lost = self._next, oldest - self._next
+        if lost <= 0:
+            return
+        self._next = oldest
+        self.overwritten += lost
+        if not self._told:
+            self._told = True
+            raise DeviceError(
+                self._device,
+                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers {first} to "
+                f"{oldest - 1} of this run in the order of arrival",
+                advice="Take frames faster, trigger slower or give the ring more memory",
+                state="Later frames can still be taken",
+            )
+
+    def _copy(self, frame: BufFrame) -> NDArray[np.uint16]:
+        """uint16 [row, col] out of the ring; its rows may be padded."""
+        rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
+        if not frame.buffer or rows < 1 or cols < 1 or stride < 2 * cols:
+            problem = f"it gives a frame that cannot be: {rows} x {cols} pixels, {stride} bytes a row"
+            raise DeviceError(self._device, problem, request="dcambuf_lockframe")
+        memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
+        return np.ndarray((rows, cols), dtype="<u2", buffer=memoryview(memory), strides=(stride, 2)).copy()

@@ -1,0 +1,168 @@
+"""Settings of a DCAM camera: CameraSettings, DcamOptions and CameraTiming in terms of its properties."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from drivers.dcam import codes
+from drivers.dcam.codes import Property
+from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixels, TriggerActive, TriggerMode, TriggerPolarity
+from drivers.dcam.properties import Properties
+from drivers.errors import DeviceRefused
+from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
+
+_TRIGGERS = MappingProxyType(
+    {
+        TriggerSource.INTERNAL: codes.TRIGGERSOURCE_INTERNAL,
+        TriggerSource.EXTERNAL: codes.TRIGGERSOURCE_EXTERNAL,
+        TriggerSource.SOFTWARE: codes.TRIGGERSOURCE_SOFTWARE,
+    }
+)
+_ACTIVE = MappingProxyType(
+    {
+        TriggerActive.EDGE: codes.TRIGGERACTIVE_EDGE,
+        TriggerActive.LEVEL: codes.TRIGGERACTIVE_LEVEL,
+        TriggerActive.SYNC_READOUT: codes.TRIGGERACTIVE_SYNCREADOUT,
+    }
+)
+_MODES = MappingProxyType({TriggerMode.NORMAL: codes.TRIGGER_MODE_NORMAL, TriggerMode.START: codes.TRIGGER_MODE_START})
+_POLARITIES = MappingProxyType(
+    {
+        TriggerPolarity.POSITIVE: codes.TRIGGERPOLARITY_POSITIVE,
+        TriggerPolarity.NEGATIVE: codes.TRIGGERPOLARITY_NEGATIVE,
+    }
+)
+_GLOBAL = MappingProxyType(
+    {
+        GlobalExposure.DELAYED: codes.TRIGGER_GLOBALEXPOSURE_DELAYED,
+        GlobalExposure.GLOBAL_RESET: codes.TRIGGER_GLOBALEXPOSURE_GLOBALRESET,
+    }
+)
+_HOT_PIXELS = MappingProxyType(
+    {
+        HotPixels.MINIMUM: codes.HOTPIXEL_MINIMUM,
+        HotPixels.STANDARD: codes.HOTPIXEL_STANDARD,
+        HotPixels.AGGRESSIVE: codes.HOTPIXEL_AGGRESSIVE,
+    }
+)
+PHOTON_NUMBER = "photon_number"
+_READOUTS = MappingProxyType(
+    {
+        "standard": (codes.SENSORMODE_AREA, codes.READOUTSPEED_STANDARD),
+        "ultra_quiet": (codes.SENSORMODE_AREA, codes.READOUTSPEED_ULTRA_QUIET),
+        PHOTON_NUMBER: (codes.SENSORMODE_PHOTONNUMBERRESOLVING, None),  # its speed cannot be chosen
+    }
+)
+"""Sensor mode and readout speed. With photon_number, the camera itself makes photoelectrons of a pixel's charge."""
+
+
+def apply_settings(properties: Properties, device: str, settings: CameraSettings, options: DcamOptions) -> None:
+    """Write everything that a triggered scan depends on and compare it with what the camera has then.
+
+    Only the exposure may be rounded.
+
+    Raises:
+        DeviceRefused: at the first thing that the camera cannot do; those before it are set.
+    """
+    if settings.readout not in _READOUTS:
+        problem = f"there is no readout {settings.readout!r}"
+        raise DeviceRefused(device, problem, advice=f"legal: {', '.join(_READOUTS)}")
+    # Sensor mode and speed first: they change the ranges of what follows.
+    mode, speed = _READOUTS[settings.readout]
+    properties.set_exactly(Property.SENSORMODE, mode)
+    if speed is not None:
+        properties.set_exactly(Property.READOUTSPEED, speed)
+    properties.set_exactly(Property.IMAGE_PIXELTYPE, codes.PIXELTYPE_MONO16)
+    properties.set_if_there(Property.BITSPERCHANNEL, 16)
+    if options.hot_pixels is None:
+        properties.set_if_there(Property.DEFECTCORRECT_MODE, codes.OFF)
+    else:
+        properties.set_exactly(Property.DEFECTCORRECT_MODE, codes.ON)
+        properties.set_exactly(Property.HOTPIXELCORRECT_LEVEL, _HOT_PIXELS[options.hot_pixels])
+    properties.set_exactly(Property.BINNING, settings.binning)
+    _apply_roi(properties, device, settings.roi)
+    if properties.find(Property.FRAMEBUNDLE_MODE) == codes.ON:
+        problem = (
+            "the camera bundles several frames of this size into one transfer, which this driver cannot take apart"
+        )
+        raise DeviceRefused(device, problem, advice="Ask for a larger region of interest")
+    line = 2 * properties.get(Property.TIMING_READOUTTIME) / _sensor_rows(properties, settings)
+    tolerance = options.exposure_tolerance * settings.exposure + line
+    properties.set_nearly(Property.EXPOSURETIME, settings.exposure, tolerance)
+    apply_trigger_source(properties, settings.trigger)
+    properties.set_exactly(Property.TRIGGER_MODE, _MODES[options.trigger_mode])
+    properties.set_exactly(Property.TRIGGERACTIVE, _ACTIVE[options.trigger_active])
+    properties.set_exactly(Property.TRIGGERPOLARITY, _POLARITIES[options.trigger_polarity])
+    properties.set_exactly(Property.TRIGGER_GLOBALEXPOSURE, _GLOBAL[options.global_exposure])
+    properties.set_exactly(Property.TRIGGERDELAY, options.trigger_delay)
+    properties.set_exactly(Property.TRIGGERTIMES, options.trigger_times)
+
+
+def apply_trigger_source(properties: Properties, source: TriggerSource) -> None:
+    """Set it. A camera in START mode forgets it with the first pulse: before each run it must be said again."""
+    properties.set_exactly(Property.TRIGGERSOURCE, _TRIGGERS[source])
+
+
+def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSettings:
+    """The camera's present settings, as `apply_settings` left them."""
+    mode, speed = (round(properties.get(prop)) for prop in (Property.SENSORMODE, Property.READOUTSPEED))
+    readouts = {numbers: name for name, numbers in _READOUTS.items()}
+    subarray = (Property.SUBARRAYVPOS, Property.SUBARRAYHPOS, Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE)
+    row0, col0, rows, cols = (round(properties.get(prop)) for prop in subarray)
+    return CameraSettings(
+        exposure=properties.get(Property.EXPOSURETIME),
+        trigger=trigger,
+        roi=(row0, col0, rows, cols) if properties.get(Property.SUBARRAYMODE) == codes.ON else None,
+        binning=round(properties.get(Property.BINNING)),
+        readout=PHOTON_NUMBER if mode == codes.SENSORMODE_PHOTONNUMBERRESOLVING else readouts[mode, speed],
+    )
+
+
+def read_timing(properties: Properties, trigger: TriggerSource, options: DcamOptions) -> CameraTiming:
+    """The least period follows the vendor's rule for external triggers (DCAM property reference):
+
+    with exposure Tx, cyclic trigger period Tc and minimum blanking Tb, triggers are at least max(Tc, Tx + Tb) apart,
+    and never closer than the minimum trigger interval. Where pulses make the exposure, Tx is theirs and does not count;
+    where every n-th pulse makes a frame, pulses may be n times as close.
+    """
+    get = properties.get
+    rows, cols = round(get(Property.IMAGE_HEIGHT)), round(get(Property.IMAGE_WIDTH))
+    readout = get(Property.TIMING_READOUTTIME)
+    if trigger is TriggerSource.INTERNAL:
+        min_period = get(Property.INTERNAL_FRAMEINTERVAL)
+    else:
+        external = trigger is TriggerSource.EXTERNAL
+        timed = not external or options.trigger_active is TriggerActive.EDGE
+        exposure = get(Property.EXPOSURETIME) if timed else 0.0
+        min_period = max(
+            get(Property.TIMING_MINTRIGGERINTERVAL),
+            get(Property.TIMING_CYCLICTRIGGERPERIOD),
+            exposure + get(Property.TIMING_MINTRIGGERBLANKING),
+        )
+        min_period /= options.trigger_times if external else 1
+    bits = round(properties.find(Property.BITSPERCHANNEL) or 16)
+    return CameraTiming((rows, cols), min_period, readout, row_period=readout / rows, bits=bits)
+
+
+def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, int] | None) -> None:
+    properties.set_exactly(Property.SUBARRAYMODE, codes.OFF)
+    if roi is None:
+        return
+    row0, col0, rows, cols = roi
+    height, width = (properties.maximum(prop) for prop in (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE))
+    if not (0 <= row0 <= height - rows and 0 <= col0 <= width - cols):
+        problem = f"the region {roi} (row0, col0, rows, cols) does not lie on the sensor"
+        raise DeviceRefused(device, problem, expected=f"a region within {height:g} x {width:g}")
+    # Positions to 0 first: position + size must stay within the sensor at every step.
+    properties.set_exactly(Property.SUBARRAYVPOS, 0)
+    properties.set_exactly(Property.SUBARRAYHPOS, 0)
+    properties.set_exactly(Property.SUBARRAYVSIZE, rows)
+    properties.set_exactly(Property.SUBARRAYHSIZE, cols)
+    properties.set_exactly(Property.SUBARRAYVPOS, row0)
+    properties.set_exactly(Property.SUBARRAYHPOS, col0)
+    properties.set_exactly(Property.SUBARRAYMODE, codes.ON)
+
+
+def _sensor_rows(properties: Properties, settings: CameraSettings) -> float:
+    """Rows that are read, before binning."""
+    return properties.get(Property.IMAGE_HEIGHT) * settings.binning
