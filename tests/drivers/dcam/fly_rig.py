@@ -1,0 +1,74 @@
+"""A stage and a camera on one virtual clock: real drivers over a simulated controller and the fake library.
+
+The clock is the fake library's, for it is in C that waits for frames jump. The stage's pulses go over a TriggerLine
+into the fake camera's trigger input.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Set
+from types import TracebackType
+from typing import Any, Self
+from uuid import uuid4
+
+from beamline.devices import Bench
+from drivers.dcam.camera import DcamCamera
+from drivers.dcam.options import DcamOptions
+from drivers.protocols import Devices
+from drivers.stages.pm16c import PM16CStage
+from simulators.serial_url import register
+from simulators.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.trigger_line import TriggerLine
+from simulators.wires.pm16c import PM16CController
+from tests.drivers.dcam.fake import World
+
+SENSOR = (64, 64)
+COUNTS = 360_000
+
+
+class FlyRig:
+    """Closes its devices at the end of a `with` block, and then nothing of the library may be left open.
+
+    Args:
+        lost_pulses: trigger pulses (from 0) that never reach the cable.
+        stall_at: count at which the stage is stopped by its emergency stop.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        options: DcamOptions | None = None,
+        lost_pulses: Set[int] = frozenset(),
+        stall_at: int | None = None,
+    ) -> None:
+        world.reset(*SENSOR)
+        self.world, self.clock = world, world.clock
+        self.line = TriggerLine(self.clock)
+        world.plug(self.line)
+        box = PM16CController(self.clock, self.line, counts_per_turn=COUNTS, lost=lost_pulses, stall_at=stall_at)
+        settings: dict[str, Any] = {
+            "max_speed": math.radians(30),
+            "acceleration": math.radians(60),
+            "low": math.radians(-5),
+            "high": math.radians(365),
+        }
+        self.stage = PM16CStage(
+            register(f"fly-{uuid4().hex}", box), counts_per_turn=COUNTS, clock=self.clock, **settings
+        )
+        self.camera: DcamCamera = world.connect(options)
+
+    def bench(self) -> Bench:
+        devices = Devices(self.stage, self.camera, SimulatedShutter(), SimulatedSampleMover())
+        return Bench(devices, self.clock, None, self.close)
+
+    def close(self) -> None:
+        self.stage.close()
+        self.camera.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+        assert self.world.live == 0

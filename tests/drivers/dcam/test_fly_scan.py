@@ -1,0 +1,201 @@
+"""A stage's pulses into the camera driver: one frame each, none invented, and what is missing is named."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.config import Config, config_folder, load
+from beamline.ledger import LedgerError
+from beamline.run import RunResult, run_scan
+from beamline.storage.source import open_scan
+from drivers.dcam.options import DcamOptions, TriggerPolarity
+from drivers.errors import DeviceError, DeviceTimeout
+from drivers.frame import FrameKind
+from drivers.protocols import CameraFrame, CameraSettings, TriggerSource, TriggerTrain
+from tests.drivers.dcam.fly_rig import COUNTS, SENSOR, FlyRig
+
+EXTERNAL = CameraSettings(0.002, TriggerSource.EXTERNAL)
+DARKS, FLATS = 3, 2
+COUNT = 2 * math.pi / COUNTS
+
+
+def small(views: int, *overrides: str) -> Config:
+    usual = (
+        f"scan.angles.views={views}",
+        "scan.period_s=0.01",
+        "scan.exposure_s=0.005",
+        f"scan.darks.count={DARKS}",
+        f"scan.flats.count={FLATS}",
+        "scan.flats.at=start",
+        "devices.camera.roi=null",
+        "storage.flush_every=100",
+        "recon.live=false",
+    )
+    return load(config_folder() / "simulated.yaml", [*usual, *overrides], environment={})
+
+
+def fly(rig: FlyRig, interval: int, n: int, speed: float) -> list[CameraFrame]:
+    """A train of n pulses from 0.1 turns on; every frame that came of it. `speed` in counts/s."""
+    start = COUNTS // 10
+    rig.stage.start_move(rig.stage.to_angle(start - 20_000), rig.stage.limits.max_speed)
+    rig.stage.wait(60.0)
+    rig.camera.configure(EXTERNAL)
+    rig.camera.arm(n)
+    rig.stage.arm(TriggerTrain(start, interval, n))
+    rig.stage.start_move(rig.stage.to_angle(start + interval * n + 20_000), speed * COUNT)
+    frames = []
+    while rig.stage.moving() or len(frames) < rig.world.exposed:
+        try:
+            frames.append(rig.camera.next_frame(0.05))
+        except DeviceTimeout:
+            continue
+    return frames
+
+
+@pytest.mark.parametrize("polarity", TriggerPolarity)
+def test_each_pulse_of_a_turning_stage_is_a_frame_at_its_time(world, polarity: TriggerPolarity) -> None:
+    with FlyRig(world, DcamOptions(trigger_polarity=polarity)) as rig:
+        frames = fly(rig, interval=100, n=50, speed=10_000)
+        assert [frame.framestamp for frame in frames] == list(range(50))
+        assert np.diff([frame.time for frame in frames]) == pytest.approx(100 / 10_000, abs=5e-6)
+        for frame in frames:
+            angle = rig.line.angle_at(frame.time)
+            late = 10_000 * COUNT * 0.001 if polarity is TriggerPolarity.NEGATIVE else 0.0  # the fake's pulses: 1 ms
+            expected = (COUNTS // 10 + 100 * frame.framestamp) * COUNT + late
+            assert angle == pytest.approx(expected, abs=0.1 * COUNT)
+            np.testing.assert_array_equal(frame.counts, world.pattern(frame.framestamp, (0, 0, *SENSOR)))
+
+
+def test_a_stage_that_turns_too_fast_loses_every_other_pulse_without_a_word(world) -> None:
+    with FlyRig(world) as rig:
+        rig.camera.configure(EXTERNAL)
+        period = rig.camera.timing.min_period
+        frames = fly(rig, interval=15, n=40, speed=15 / (0.6 * period))
+        assert [frame.framestamp for frame in frames] == list(range(20))
+        assert np.diff([frame.time for frame in frames]) == pytest.approx(1.2 * period, abs=5e-6)
+
+
+def test_pulses_that_a_stopped_stage_takes_back_never_come(world) -> None:
+    with FlyRig(world) as rig:
+        start = COUNTS // 10
+        rig.camera.configure(EXTERNAL)
+        rig.camera.arm(1000)
+        rig.stage.arm(TriggerTrain(start, 100, 1000))
+        rig.stage.start_move(rig.stage.to_angle(start + 120_000), 10_000 * COUNT)
+        for stamp in range(5):
+            assert rig.camera.next_frame(20.0).framestamp == stamp
+        rig.stage.stop()
+        rig.clock.sleep(60.0)
+        passed = (rig.stage.to_counts(rig.stage.position()) - start) // 100 + 1
+        assert 5 < passed < 200
+        assert rig.world.exposed == passed
+
+
+class Scanned:
+    """A scan through acquisition, ledger and writer, and what it left."""
+
+    def __init__(self, rig: FlyRig, config: Config, runs: Path) -> None:
+        self.result: RunResult | None = None
+        self.error: Exception | None = None
+        began = time.monotonic()
+        try:
+            self.result = run_scan(config, runs, bench=rig.bench())
+        except Exception as error:
+            self.error = error
+        self.seconds = time.monotonic() - began
+        folders = list(runs.iterdir())
+        assert len(folders) == 1, self.error
+        self.path = folders[0] / "scan.h5"
+
+    def views(self) -> list[tuple[int, float, int]]:
+        """(trigger, angle in counts, framestamp's four bits in the pixels) of each projection in the file."""
+        with open_scan(self.path) as source, h5py.File(self.path) as file:
+            triggers = file["entry/frame_log/trigger"][()]
+            assert len(triggers) == len(source.image_key)
+            return [
+                (int(triggers[row]), frame.angle / COUNT, int(frame.counts[0, 0]) >> 12)
+                for row, frame in enumerate(source.frames())
+                if frame.kind is FrameKind.PROJECTION
+            ]
+
+
+def test_three_thousand_views_are_three_thousand_pulses_frames_and_rows(world, tmp_path: Path) -> None:
+    views = 3000
+    with FlyRig(world) as rig:
+        scanned = Scanned(rig, small(views), tmp_path)
+        assert scanned.error is None
+        assert rig.world.exposed == views  # the last capture's
+        pulses = 0
+        after = 0.0
+        while (pulse := rig.line.next_after(after)) is not None:
+            pulses, after = pulses + 1, pulse.time
+        assert pulses == views
+    assert scanned.result is not None
+    assert (scanned.result.n_frames, scanned.result.missing) == (DARKS + FLATS + views, ())
+    rows = scanned.views()
+    assert [trigger for trigger, _, _ in rows] == list(range(views))
+    assert [bits for _, _, bits in rows] == [k % 16 for k in range(views)]
+    np.testing.assert_allclose([angle for _, angle, _ in rows], np.arange(views) * COUNTS / 2 / views, atol=1e-6)
+    print(f"\n{views} views in {scanned.seconds:.2f} s")
+    assert scanned.seconds < 20
+
+
+@pytest.mark.parametrize(
+    ("break_it", "missing"),
+    [
+        (lambda rig: rig.world.lose(7, 8, 30), [7, 8, 30]),
+        (lambda rig: rig.world.lose(0), [0]),
+        (lambda rig: rig.world.lose(59), [59]),
+    ],
+    ids=["within", "first", "last"],
+)
+def test_a_scan_names_what_the_camera_lost(
+    world, tmp_path: Path, break_it: Callable[[FlyRig], None], missing: list[int]
+) -> None:
+    with FlyRig(world) as rig:
+        break_it(rig)
+        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
+    assert isinstance(scanned.error, LedgerError)
+    assert [row - DARKS - FLATS for row in scanned.error.missing] == missing
+    for trigger, angle, bits in scanned.views():
+        assert trigger not in missing
+        assert angle == pytest.approx(trigger * COUNTS / 360, abs=1e-6)
+        assert bits == trigger % 16  # each row has the angle of its own pixels
+
+
+def test_a_scan_names_pulses_that_never_reached_the_camera(world, tmp_path: Path) -> None:
+    with FlyRig(world, lost_pulses={11, 40, 41}) as rig:
+        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
+    assert isinstance(scanned.error, LedgerError)
+    assert [row - DARKS - FLATS for row in scanned.error.missing] == [11, 40, 41]
+
+
+def test_a_camera_that_is_unplugged_in_a_scan_ends_it_with_its_name(world, tmp_path: Path) -> None:
+    with FlyRig(world) as rig:
+        world.fault("unplug_at", 20)
+        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
+        assert isinstance(scanned.error, DeviceError)
+        assert "NOCONNECTION" in str(scanned.error)
+        assert not rig.stage.moving()
+    taken = [trigger for trigger, _, _ in scanned.views()]
+    assert taken == list(range(len(taken)))
+    assert 15 <= len(taken) <= 20
+    world.fault("unplug_at", 0)
+    world.fault("unplugged", 0)
+    again = world.connect()  # in the same process
+    assert again.describe()["model"] == "C15550-20UP"
+    again.close()
+
+
+def test_a_stage_that_stalls_leaves_the_frames_before_it(world, tmp_path: Path) -> None:
+    with FlyRig(world, stall_at=COUNTS // 12) as rig:
+        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
+    assert scanned.error is not None
+    assert [trigger for trigger, _, _ in scanned.views()] == list(range(31))
