@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from beamline.config_models import Config, DcamOrca, FileAngles
+from beamline.config_devices import DcamOrca
+from beamline.config_models import Config, FileAngles
+from beamline.plan import Mode
 from drivers import orca_quest
 from drivers.protocols import CameraSettings, TriggerSource
 
@@ -18,6 +20,7 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     """
     yield from _files(config, shipped)
     yield from _camera(config)
+    yield from _triggers(config)
 
 
 def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -34,6 +37,30 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
         yield (
             ("simulation", "scene"),
             f"simulation.scene: there is no file {simulation.scene}; expected one beside this file, or {scenes}",
+        )
+
+
+_ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}
+
+
+def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
+    """What keeps a fly scan from having one frame a pulse, each of the exposure that the plan reckons with."""
+    camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
+    if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
+        return
+    for key, fit in _ONE_FRAME_A_PULSE.items():
+        if (value := getattr(camera, key)) not in fit:
+            yield (
+                ("devices", "camera", key),
+                f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; expected "
+                f"{' | '.join(map(str, fit))}, or scan.mode: step",
+            )
+    width = stage.pulse_width_s
+    if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
+        yield (
+            ("devices", "camera", "trigger_active"),
+            f"devices.camera.trigger_active level exposes while the pulse lasts; set devices.stage.pulse_width_s "
+            f"({width}) to scan.exposure_s ({scan.exposure_s:g}), or trigger_active: edge",
         )
 
 

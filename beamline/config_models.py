@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
+from beamline.config_devices import DeviceSection
+from beamline.config_section import Section
 from beamline.plan import Mode, Place
-
-
-class Section(BaseModel):
-    """A frozen group of keys. Unknown keys are refused, and so is `yes` where a number belongs."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _no_truth_for_numbers(cls, data: Any) -> Any:
-        for name, field in cls.model_fields.items():
-            if isinstance(data, dict) and isinstance(data.get(name), bool) and field.annotation is not bool:
-                value = str(data[name]).lower()
-                raise ValueError(f"{name} is {value} (YAML reads yes, no, on and off as true and false)")
-        return data
 
 
 class Sample(Section):
@@ -114,78 +101,6 @@ class Scan(Section):
     flats: Fields = Fields()
 
 
-class PM16CStageConfig(Section):
-    """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated."""
-
-    kind: Literal["pm16c"]
-    port: Annotated[str, Field(min_length=1)]
-    """A serial port (COM3, /dev/ttyUSB0), socket://host:7777, or sim://pm16c."""
-    channel: Annotated[int, Field(ge=0, le=15)] = 0
-    counts_per_turn: PositiveInt
-    max_speed_deg_s: PositiveFloat
-    acceleration_deg_s2: PositiveFloat
-    low_deg: FiniteFloat = -5.0
-    high_deg: FiniteFloat = 365.0
-
-    @model_validator(mode="after")
-    def _ordered(self) -> PM16CStageConfig:
-        if not self.low_deg < self.high_deg:
-            raise ValueError(f"low_deg {self.low_deg} must lie below high_deg {self.high_deg}")
-        return self
-
-    @property
-    def simulated(self) -> bool:
-        return self.port.lower().startswith("sim://")
-
-
-Roi = Annotated[
-    tuple[
-        Annotated[int, Field(ge=0)],
-        Annotated[int, Field(ge=0)],
-        Annotated[int, Field(ge=1)],
-        Annotated[int, Field(ge=1)],
-    ],
-    Field(description="row0, col0, rows, cols on the sensor, all multiples of 4"),
-]
-
-
-class _Orca(Section):
-    """What the real and the simulated ORCA-Quest have in common."""
-
-    kind: str
-    roi: Roi | None = None
-    """null: the full sensor, 2304 x 4096."""
-    binning: Literal[1, 2, 4] = 1
-    readout: Literal["standard", "ultra_quiet"] = "standard"
-
-
-class SimulatedOrca(_Orca):
-    kind: Literal["simulated_orca"]
-
-
-class DcamOrca(_Orca):
-    kind: Literal["dcam"]
-    library: str | None = None
-    """Path of the DCAM-API library; null: the installed one."""
-    index: Annotated[int, Field(ge=0)] = 0
-    """Which camera, where DCAM finds several."""
-    link: Literal["usb3", "coaxpress"] = "usb3"
-    """USB3 carries 17.7 full frames a second, CoaXPress 120."""
-
-
-class Simple(Section):
-    """A device with nothing to set: simulated, or manual (the operator is asked to do it)."""
-
-    kind: Literal["simulated", "manual"]
-
-
-class DeviceSection(Section):
-    stage: PM16CStageConfig
-    camera: Annotated[SimulatedOrca | DcamOrca, Field(discriminator="kind")]
-    shutter: Simple
-    sample_mover: Simple
-
-
 class Optics(Section):
     pixel_size_um: PositiveFloat
     """Of an unbinned pixel at the sample."""
@@ -244,14 +159,8 @@ class Config(Section):
     simulation: Simulation | None = None
 
     @model_validator(mode="after")
-    def _all_simulated_or_none(self) -> Config:
-        devices = self.devices
-        simulated = {
-            "stage": devices.stage.simulated,
-            "camera": devices.camera.kind == "simulated_orca",
-            "shutter": devices.shutter.kind == "simulated",
-            "sample_mover": devices.sample_mover.kind == "simulated",
-        }
+    def _all_simulated_or_none(self) -> Self:
+        simulated = self.devices.simulated_or_not()
         if any(simulated.values()) and not all(simulated.values()):
             unreal = ", ".join(name for name, value in simulated.items() if value)
             real = ", ".join(name for name, value in simulated.items() if not value)

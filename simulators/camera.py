@@ -118,6 +118,8 @@ class SimulatedOrcaQuest:
         with self._lock:
             self._answer()
             problem = orca_quest.refusal(settings)
+            if settings.readout not in READ_NOISE:
+                problem = f"does not simulate the readout {settings.readout!r}; legal: {', '.join(READ_NOISE)}"
             if self._armed_for:
                 problem = "is capturing and takes no settings; disarm it first"
             if problem:

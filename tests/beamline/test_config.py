@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import yaml
 from pydantic import ValidationError
 
 from beamline import config
+from beamline.config_devices import DcamOrca, SimulatedOrca, ZaberStageConfig
 from beamline.config_models import Config
 from beamline.errors import ConfigError
 from beamline.plan import Mode, Place
@@ -74,7 +76,9 @@ def test_templates_are_complete_and_differ_only_in_devices() -> None:
         ("simulation",),
         *((("simulation", k)) for k in simulated["simulation"]),
     }
-    assert _keys(instrument) - _keys(simulated) == {("devices", "camera", key) for key in ("library", "index", "link")}
+    only_real = DcamOrca.model_fields.keys() - SimulatedOrca.model_fields.keys()
+    assert {"library", "index", "link", "trigger_polarity"} < only_real
+    assert _keys(instrument) - _keys(simulated) == {("devices", "camera", key) for key in only_real}
     kinds = {
         name: [d[k]["kind"] for k in ("camera", "shutter", "sample_mover")]
         for name, d in (("simulated", simulated["devices"]), ("instrument", instrument["devices"]))
@@ -83,6 +87,30 @@ def test_templates_are_complete_and_differ_only_in_devices() -> None:
         "simulated": ["simulated_orca", "simulated", "simulated"],
         "instrument": ["dcam", "manual", "manual"],
     }
+
+
+@pytest.mark.parametrize("name", ["simulated", "instrument"])
+def test_every_alternative_in_a_template_is_one(name: str) -> None:
+    """The commented devices, put in the place of the ones that stand there."""
+    text = (config.config_folder() / f"{name}.yaml").read_text("utf-8")
+    offered = re.findall(r"^  # (stage|shutter|beam_monitor): (\{.*?\})(?=\s|$)", text, re.MULTILINE)
+    kinds = set()
+    for key, flow in offered:
+        tree = yaml.safe_load(text)
+        mine = yaml.safe_load(flow)
+        old = {"stage": ("channel", "home_deg", "home_speed_deg_s")}.get(key, tuple(tree["devices"][key]))
+        tree["devices"][key] = {k: v for k, v in tree["devices"][key].items() if k not in old} | mine
+        if mine["kind"] == "stage_output":  # which the PM16C has not
+            stage = yaml.safe_load(next(flow for _, flow in offered if "zaber" in flow))
+            tree["devices"]["stage"] = {
+                k: v for k, v in tree["devices"]["stage"].items() if k in ZaberStageConfig.model_fields
+            } | stage
+        loaded = Config.model_validate(tree)
+        assert getattr(loaded.devices, key).kind == mine["kind"]
+        kinds.add(mine["kind"])
+    assert kinds == {"pi_gcs", "zaber", "stage_output", "electrometer"} | (
+        {"ring_current"} if name == "instrument" else set()
+    )
 
 
 def _keys(value: Any, path: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
@@ -188,6 +216,34 @@ FAULTS = {
         ('"sim://pm16c"', "COM3"),
         "my.yaml:1: the configuration: simulated devices cannot see real ones: camera, "
         "shutter, sample_mover simulated, stage real",
+    ),
+    "stage of no kind": (
+        ("kind: pm16c", "kind: pm16"),
+        "my.yaml:7: devices.stage.kind is 'pm16' (did you mean pm16c?); expected pm16c | pi_gcs | zaber",
+    ),
+    "key of another stage": (
+        ("counts_per_turn", "axis: 1, counts_per_turn"),
+        "my.yaml:7: devices.stage.axis is not a known key; legal keys there: kind, port",
+    ),
+    "counterpart of another stage": (
+        ("kind: pm16c", "kind: zaber"),
+        "my.yaml:7: devices.stage: port sim://pm16c is not the simulated counterpart of zaber, sim://zaber",
+    ),
+    "an output that the PM16C has not": (
+        ("shutter: {kind: simulated}", "shutter: {kind: stage_output, output: 2}"),
+        "my.yaml:6: devices: the PM16C has no digital output for a shutter; set shutter.kind: manual",
+    ),
+    "an electrometer that sees no simulated beam": (
+        ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),
+        "simulated devices cannot see real ones: stage, camera, shutter, sample_mover simulated, beam_monitor real",
+    ),
+    "a pattern that finds nothing": (
+        ("  shutter:", "  beam_monitor: {kind: ring_current, url: 'http://ring/', pattern: mA}\n  shutter:"),
+        "my.yaml:9: devices.beam_monitor.pattern: the pattern 'mA' has no group (...) around the number",
+    ),
+    "no page": (
+        ("  shutter:", "  beam_monitor: {kind: ring_current, url: ring, pattern: (.)}\n  shutter:"),
+        "my.yaml:9: devices.beam_monitor.url: 'ring' is no address of a page: http://host/...",
     ),
     "no simulation": (("simulation: {}\n", ""), "simulated devices need a simulation section"),
     "twice": (
@@ -332,3 +388,33 @@ def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: st
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read: Is a directory|denied"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("stage", "taken"),
+    [("{kind: pi_gcs, port: 'sim://pi_gcs', trigger_line: 3", 3), ("{kind: zaber, port: 'sim://zaber', output: 3", 3)],
+)
+def test_a_shutter_does_not_share_the_trigger_output(tmp_path: Path, stage: str, taken: int) -> None:
+    text = GOOD.replace('{kind: pm16c, port: "sim://pm16c"', stage)
+    assert text != GOOD
+    with_shutter = "devices.shutter={kind: stage_output, output: %d}"
+    assert load(write(tmp_path, text), with_shutter % (taken + 1)).devices.shutter.kind == "stage_output"
+    assert f"shutter.output {taken} is the output" in faults(tmp_path, text, with_shutter % taken)
+
+
+@pytest.mark.parametrize("option", ["trigger_mode=start", "trigger_active=sync_readout", "trigger_times=2"])
+def test_what_breaks_one_frame_a_pulse_is_not_for_fly_scans(option: str) -> None:
+    path = config.config_folder() / "instrument.yaml"
+    key = option.split("=")[0]
+    with pytest.raises(ConfigError, match=rf"devices\.camera\.{key} .* one frame a pulse"):
+        load(path, f"devices.camera.{option}")
+    load(path, f"devices.camera.{option}", "scan.mode=step")
+
+
+def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
+    path, level = config.config_folder() / "instrument.yaml", "devices.camera.trigger_active=level"
+    with pytest.raises(ConfigError, match=r"set devices\.stage\.pulse_width_s \(None\) to scan\.exposure_s \(0\.05\)"):
+        load(path, level)
+    with pytest.raises(ConfigError, match=r"pulse_width_s \(0\.001\)"):
+        load(path, level, "devices.stage.pulse_width_s=0.001")
+    load(path, level, "devices.stage.pulse_width_s=0.05")

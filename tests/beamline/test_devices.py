@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import sys
@@ -18,6 +19,7 @@ from beamline.errors import ConfigError
 from beamline.plan import Block
 from beamline.timeline import block_seconds, pass_ends
 from drivers.clock import SystemClock
+from drivers.dcam.options import DcamOptions
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.manual import ManualSampleMover, ManualShutter
 from drivers.protocols import TriggerSource
@@ -248,6 +250,7 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     bench = devices.connect(shipped("instrument", "devices.camera.index=1"), ask=asked.append)
     assert made[0][0] == (None, 1)
+    assert made[0][1]["options"] == DcamOptions(ring_bytes=1_000_000_000)
     assert isinstance(bench.devices.shutter, ManualShutter)
     assert isinstance(bench.devices.sample, ManualSampleMover)
     assert bench.truth is None
@@ -255,6 +258,76 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == ["Open the beam shutter."]
     bench.close()
     assert stage.closed == 2
+
+
+def test_every_camera_option_reaches_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values that are no default, one for each option that the driver has."""
+    waited: list[float] = []
+
+    class Camera(_Stage):
+        def __init__(self, library: Path, index: int, *, clock: object, options: DcamOptions) -> None:
+            super().__init__()
+            self.library, self.options = library, options
+            made.append(self)
+
+        def wait_until_cold(self, timeout: float) -> None:
+            waited.append(timeout)
+
+    made: list[Camera] = []
+    monkeypatch.setattr(devices, "_stage", lambda *args: _Stage())
+    monkeypatch.setattr("drivers.dcam.camera.DcamCamera", Camera)
+    said = {
+        "library": "/opt/libdcamapi.so",
+        "trigger_active": "level",
+        "trigger_mode": "start",
+        "trigger_polarity": "negative",
+        "trigger_times": 3,
+        "trigger_delay_s": 0.5,
+        "global_exposure": "global_reset",
+        "hot_pixels": "aggressive",
+        "exposure_tolerance": 0.1,
+        "ring_mb": 50,
+        "cool_s": 90,
+    }
+    changes = [f"devices.camera.{key}={value}" for key, value in said.items()]
+    devices.connect(shipped("instrument", "scan.mode=step", *changes)).close()
+    (camera,) = made
+    assert camera.library == Path("/opt/libdcamapi.so")
+    default = DcamOptions()
+    for field in dataclasses.fields(DcamOptions):
+        value = getattr(camera.options, field.name)
+        assert value != getattr(default, field.name), field.name
+        key = {"trigger_delay": "trigger_delay_s", "ring_bytes": "ring_mb"}.get(field.name, field.name)
+        assert value == said[key] * (1_000_000 if key == "ring_mb" else 1)
+    assert waited == [90]
+
+
+def test_a_beam_monitor_is_part_of_the_bench(tmp_path: Path) -> None:
+    with devices.connect(small()) as bench:
+        assert bench.beam_monitor is None
+    transcript = tmp_path / "electrometer.txt"
+    chosen = f"{{kind: electrometer, port: 'sim://electrometer', scale: 1e9, unit: nA, transcript: '{transcript}'}}"
+    with devices.connect(small(f"devices.beam_monitor={chosen}")) as bench:
+        assert bench.beam_monitor is not None
+        reading = bench.beam_monitor.reading()
+        assert (reading.value, reading.unit) == (pytest.approx(1.0), "nA")
+        assert abs(reading.time - bench.clock.now()) < 1
+    with pytest.raises(DeviceError):
+        bench.beam_monitor.reading()
+    assert b"READ?" in transcript.read_bytes()
+    page = tmp_path / "ring.txt"
+    page.write_text("I = 99.5 mA", encoding="utf-8")
+    chosen = f"{{kind: ring_current, url: '{page.as_uri()}', pattern: 'I = ([0-9.]+) mA'}}"
+    with devices.connect(small(f"devices.beam_monitor={chosen}")) as bench:
+        assert bench.beam_monitor is not None
+        assert bench.beam_monitor.reading().value == 99.5
+
+
+def test_a_stage_keeps_a_transcript_where_it_is_asked_to(tmp_path: Path) -> None:
+    file = tmp_path / "stage.txt"
+    with devices.connect(small(f"devices.stage.transcript={file}")) as bench:
+        bench.devices.stage.position()
+    assert b"PS?0" in file.read_bytes()
 
 
 def test_a_port_that_is_not_there() -> None:

@@ -156,6 +156,11 @@ def test_axis_and_pitch_follow_offset_roi_and_binning() -> None:
     ).detector.pitch == pytest.approx(6.5e-4)
 
 
+def test_photon_numbers_are_not_simulated() -> None:
+    with pytest.raises(DeviceRefused, match="does not simulate the readout 'photon_number'"):
+        _Bench().camera.configure(replace(SETTINGS, readout="photon_number"))
+
+
 @pytest.mark.parametrize(("readout", "line_time"), [("standard", 7.2e-6), ("ultra_quiet", 172.8e-6)])
 def test_timing_is_the_orca_quest_s(readout: str, line_time: float) -> None:
     bench = _Bench()

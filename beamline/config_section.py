@@ -1,0 +1,22 @@
+"""A section of a configuration: a frozen group of keys that refuses what it does not know."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, model_validator
+
+
+class Section(BaseModel):
+    """A frozen group of keys. Unknown keys are refused, and so is `yes` where a number belongs."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truth_for_numbers(cls, data: Any) -> Any:
+        for name, field in cls.model_fields.items():
+            if isinstance(data, dict) and isinstance(data.get(name), bool) and field.annotation is not bool:
+                value = str(data[name]).lower()
+                raise ValueError(f"{name} is {value} (YAML reads yes, no, on and off as true and false)")
+        return data
