@@ -18,6 +18,7 @@ import serial
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceTimeout
+from drivers.serial_port import open_port
 from drivers.transcript import Transcript
 
 LONGEST_LINE = 1024
@@ -106,9 +107,7 @@ class SerialLine:
                 state="Nothing was sent",
             ) from problem
         try:
-            self._port = serial.serial_for_url(
-                url, baudrate=baudrate, timeout=QUIET, write_timeout=timeout, exclusive=True
-            )
+            self._port = open_port(url, baudrate, QUIET, timeout)
         except (OSError, ValueError) as problem:
             self._transcript.close()
             raise DeviceError(

@@ -1,20 +1,22 @@
 """Serial URL: `sim://name` opens a simulated device through pyserial, by the code path that opens a real port.
 
 pyserial finds the scheme in `simulators.protocol_sim` once this module is imported. Names are process-wide, as the
-ports of a computer are; `sim://pm16c` without registration is a stand-alone controller on the system's clock.
+ports of a computer are. A name that nobody registered is a device by itself on the system's clock, made when it is
+first opened: `sim://pm16c`, or with options `sim://pm16c?channel=3&counts_per_turn=360000`; see `simulators.kinds`.
 """
 
 from __future__ import annotations
 
 import threading
-from typing import Protocol
 
 import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException, to_bytes
 
-from drivers.clock import Clock, SystemClock
-from simulators.trigger_line import TriggerLine
-from simulators.wires.pm16c import PM16CController
+from drivers.clock import SystemClock
+from simulators.kinds import KINDS, stand_alone
+from simulators.wire import Wire
+
+__all__ = ["SCHEME", "SimulatedSerial", "Wire", "register"]
 
 SCHEME = "sim://"
 POLL = 1e-3
@@ -22,21 +24,6 @@ POLL = 1e-3
 
 if "simulators" not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append("simulators")
-
-
-class Wire(Protocol):
-    """The far end of a serial cable."""
-
-    @property
-    def clock(self) -> Clock: ...
-
-    def receive(self, data: bytes) -> None:
-        """Bytes from the host, in pieces of any size."""
-        ...
-
-    def transmit(self) -> bytes:
-        """Bytes sent by now and not taken yet."""
-        ...
 
 
 class _Ports:
@@ -56,12 +43,14 @@ class _Ports:
         with self._lock:
             if name in self._open:
                 raise SerialException(f"could not open port {SCHEME}{name}: it is open already")
-            if name == "pm16c" and name not in self._wires:
-                clock = SystemClock()
-                self._wires[name] = PM16CController(clock, TriggerLine(clock))
-            if name not in self._wires:
-                known = ", ".join(SCHEME + known for known in sorted({*self._wires, "pm16c"}))
+            if name not in self._wires and name.partition("?")[0] not in KINDS:
+                known = ", ".join(SCHEME + known for known in sorted({*self._wires, *KINDS}))
                 raise SerialException(f"could not open port {SCHEME}{name}: no such simulated port; there are {known}")
+            if name not in self._wires:
+                try:
+                    self._wires[name] = stand_alone(name, SystemClock())
+                except ValueError as problem:
+                    raise SerialException(f"could not open port {SCHEME}{name}: {problem}") from problem
             self._open[name] = self._wires[name]
             return self._wires[name]
 
@@ -120,6 +109,10 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
         sent = to_bytes(data)
         self._wire.receive(sent)
         return len(sent)
+
+    def reset_input_buffer(self) -> None:
+        self._take()
+        self._received.clear()
 
     def _take(self) -> None:
         if not self.is_open:

@@ -132,6 +132,8 @@ class PM16CController:
         silent: Set[int] = frozenset(),
         garbled: Set[int] = frozenset(),
     ) -> None:
+        if channel not in range(16):
+            raise ValueError(f"there is no channel {channel}; there are 0 to 15")
         self.clock = clock
         self.queries = 0
         self.box = PM16CBox(

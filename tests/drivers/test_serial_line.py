@@ -1,14 +1,9 @@
-"""Serial line: framing, timeouts and finding the step again, on a wire that misbehaves; and over real port types."""
+"""Serial line: framing, timeouts and finding the step again, on a wire that misbehaves."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import os
-import socket
-import sys
 import threading
-from collections.abc import Callable, Iterator
 
 import pytest
 import serial
@@ -18,12 +13,9 @@ from hypothesis import strategies as st
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.serial_line import Probe, SerialLine
-from drivers.stages.pm16c import PM16CStage
 from drivers.transcript import TOLD_LINES
 from simulators.clock import VirtualClock
 from simulators.serial_url import register
-from simulators.trigger_line import TriggerLine
-from simulators.wires.pm16c import PM16CController
 
 NAMES = (f"line-test-{number}" for number in itertools.count())
 NUMBER = r"-?\d+"
@@ -295,65 +287,3 @@ def test_a_port_that_takes_no_bytes_is_a_timeout() -> None:
 
     with pytest.raises(DeviceTimeout, match="took no bytes"):
         connect(Stuck()).send("GO")
-
-
-def serve(read: Callable[[], bytes], write: Callable[[bytes], object]) -> threading.Thread:
-    """A controller on real time behind any pair of byte functions, until reading gives nothing or fails."""
-    clock = SystemClock()
-    controller = PM16CController(clock, TriggerLine(clock))
-
-    def run() -> None:
-        with contextlib.suppress(OSError):
-            while data := read():
-                controller.receive(data)
-                write(controller.transmit())
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    return thread
-
-
-@pytest.fixture
-def tcp() -> Iterator[str]:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        threads: list[threading.Thread] = []
-
-        def accept() -> None:
-            with server.accept()[0] as connection:
-                threads.append(serve(lambda: connection.recv(100), connection.sendall))
-                threads[0].join()
-
-        accepting = threading.Thread(target=accept, daemon=True)
-        accepting.start()
-        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-        accepting.join(5.0)
-
-
-@pytest.fixture
-def pty() -> Iterator[str]:
-    if sys.platform == "win32":
-        pytest.skip("Windows has no pseudo-terminals that pyserial opens")
-    import tty
-
-    master, slave = os.openpty()
-    tty.setraw(master)
-    serve(lambda: os.read(master, 100), lambda data: os.write(master, data))
-    yield os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
-
-
-@pytest.mark.parametrize("kind", ["tcp", "pty"])
-def test_the_same_driver_runs_over_a_socket_and_a_terminal(kind: str, request: pytest.FixtureRequest) -> None:
-    stage = PM16CStage(
-        request.getfixturevalue(kind),
-        counts_per_turn=360_000,
-        clock=SystemClock(),
-        max_speed=0.5,
-        acceleration=1.0,
-        low=-1.0,
-        high=1.0,
-    )
-    stage.start_move(stage.to_angle(100), 0.1)
-    assert stage.wait(5.0) == stage.to_angle(100)
-    stage.close()
