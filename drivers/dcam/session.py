@@ -30,7 +30,6 @@ class Session:
         self._device = device
         self._steps: list[Callable[[], None]] = []  # to undo, last first
         try:
-            self._steps.append(self._end)  # a session that failed to start must be ended too
             found = self._start()
             if index >= found:
                 raise DeviceError(
@@ -56,9 +55,12 @@ class Session:
         run_all(*steps)
 
     def _start(self) -> int:
+        self._steps.append(self._end)  # a session that failed to start must be ended too
         try:
             return self.dcam.api_init()
         except DcamError as error:
+            if error.code in (Error.BUSY, Error.EXCLUDED):
+                self._steps.clear()  # to end it would end that of another camera in this process
             if error.code != Error.NOCAMERA:
                 raise
             advice = f"Switch the camera on and check its cable. {usb.preflight().message}"

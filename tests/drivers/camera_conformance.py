@@ -103,6 +103,21 @@ class CameraConformance:
         with pytest.raises(DeviceTimeout):
             bench.camera.next_frame(timeout=0.2)
 
+    def test_an_overrun_ring_is_one_error_and_the_rest_can_be_taken(self, bench: CameraBench) -> None:
+        bench.camera.configure(SETTINGS)
+        bench.camera.arm(1)
+        times = self._pulses(bench, 200)
+        bench.clock.sleep(times[-1] - bench.clock.now() + 1.0)
+        with pytest.raises(DeviceError, match=r"ring of \d+ frames was overrun and \d+ frames are lost"):
+            bench.camera.next_frame(timeout=1.0)
+        rest = [bench.camera.next_frame(timeout=1.0)]
+        while rest[-1].framestamp < 199:
+            rest.append(bench.camera.next_frame(timeout=1.0))
+        assert [frame.framestamp for frame in rest] == list(range(200 - len(rest), 200))
+        assert [frame.time - rest[0].time for frame in rest] == pytest.approx(
+            [time - times[-len(rest)] for time in times[-len(rest) :]], abs=2e-4
+        )
+
     def test_pulses_before_arm_are_lost(self, bench: CameraBench) -> None:
         bench.camera.configure(SETTINGS)
         self._pulses(bench, 2, delay=0.0)

@@ -26,6 +26,12 @@ def test_printed_times() -> None:
     assert quiet.row_period * 2304 == pytest.approx(quiet.readout)
 
 
+def test_resolving_photon_numbers_takes_as_long_as_the_ultra_quiet_readout() -> None:
+    quiet, resolving = (orca_quest.timing(_settings(readout=name)) for name in ("ultra_quiet", "photon_number"))
+    assert resolving == quiet
+    assert "outside 0.0001728" in orca_quest.refusal(_settings(readout="photon_number", exposure=1e-4))
+
+
 def test_usb_limits_full_frames_and_not_small_ones() -> None:
     assert 1 / orca_quest.timing(_settings(exposure=0.001), "usb3").min_period == pytest.approx(17.6996)
     small = _settings(exposure=0.001, roi=(0, 0, 144, 160))
@@ -44,7 +50,7 @@ def test_binning_shrinks_the_frame_and_the_transfer_not_the_readout() -> None:
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        ({"readout": "fast"}, "'fast' is unknown; legal: standard, ultra_quiet"),
+        ({"readout": "fast"}, "'fast' is unknown; legal: standard, ultra_quiet, photon_number"),
         ({"binning": 3}, "binning 3 is not offered; legal: 1, 2, 4"),
         ({"exposure": 1e-6}, "outside 7.2e-06"),
         ({"exposure": 1e-4, "readout": "ultra_quiet"}, "outside 0.0001728"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,13 +10,14 @@ import pytest
 
 from drivers.dcam.camera import DcamCamera
 from drivers.protocols import CameraSettings, TriggerSource
-from tests.drivers.dcam.fake import World, build
+from tests.drivers.dcam.fake import READY_MADE, World, build
 
 
 @pytest.fixture(scope="session")
 def fake_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Path of the compiled library; skips where there is no compiler."""
-    return build(tmp_path_factory.mktemp("fakedcam"))
+    ready_made = os.environ.get(READY_MADE)
+    return Path(ready_made) if ready_made else build(tmp_path_factory.mktemp("fakedcam"))
 
 
 @pytest.fixture

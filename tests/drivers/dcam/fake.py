@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import shutil
 import subprocess
 import sys
@@ -23,8 +22,8 @@ SENSOR = (48, 72)
 EXPOSURETIME, TIMING_READOUTTIME = 0x001F0110, 0x00403010
 SOURCE = Path(__file__).parent / "fake_dcam.c"
 START = 1000.0
-EXTRA_FLAGS = "FAKE_DCAM_FLAGS"
-"""Environment variable with more flags for the compiler: the sanitisers of test_sanitised."""
+READY_MADE = "FAKE_DCAM_LIBRARY"
+"""Environment variable with the path of a library that is compiled already, as test_sanitised does it."""
 
 NextPulse = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)
 
@@ -37,12 +36,16 @@ def compiler() -> str:
     return found
 
 
-def build(folder: Path) -> Path:
-    """The library, compiled into a folder; skips where there is no compiler."""
+def build(folder: Path, *flags: str) -> Path:
+    """The library, compiled into a folder; skips where there is no compiler.
+
+    Raises:
+        CalledProcessError: it does not compile with these flags.
+    """
     library = folder / "libfakedcam.so"
     strict = ("-std=gnu11", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC", "-pthread")
-    flags = (*strict, *os.environ.get(EXTRA_FLAGS, "").split())
-    subprocess.run([compiler(), *flags, str(SOURCE), "-o", str(library), "-lm"], check=True)
+    command = [compiler(), *strict, *flags, str(SOURCE), "-o", str(library), "-lm"]
+    subprocess.run(command, check=True, capture_output=True)
     return library
 
 

@@ -226,7 +226,7 @@ static void stop(void) {
     if (fake.status != ST_BUSY) return;
     fake.status = ST_READY;
     fake.n_flying = 0;
-    fake.pending |= EV_STOPPED;
+    fake.pending |= EV_STOPPED & supported_events();
     pthread_cond_broadcast(&changed);
 }
 

@@ -37,7 +37,9 @@ static int slot_of(const char *call) { /* where calls of that name are counted *
 static int32_t called(const char *call) { /* the error that this call must answer with, or 0 */
     int i = slot_of(call);
     fake.calls[i].count++;
-    return fake.calls[i].fail_in > 0 && --fake.calls[i].fail_in == 0 ? fake.calls[i].code : 0;
+    if (fake.calls[i].fail_in == 0 || --fake.calls[i].fail_in > 0) return 0;
+    if (fake.calls[i].code == NOCONNECTION) fake.faults[UNPLUGGED] = 1;
+    return fake.calls[i].code;
 }
 
 static int set_failure(const char *call, int in, int32_t code) {

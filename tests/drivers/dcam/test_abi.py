@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from drivers.dcam import abi, codes, structures
 from drivers.errors import DeviceError
+from tests.drivers.dcam.fake import compiler
 
 STRUCTURES = {
     "DCAMDEV_CAPABILITY": structures.DevCapability,
@@ -64,6 +66,36 @@ def test_a_missing_library_is_named_with_what_to_do(tmp_path: Path) -> None:
         abi.Dcam(tmp_path / "nowhere.so", "camera")
 
 
+def test_the_installed_library_has_the_vendor_s_name_on_each_system() -> None:
+    assert [abi.installed_library(platform) for platform in ("win32", "linux")] == ["dcamapi.dll", "libdcamapi.so"]
+
+
+MODULE = "extern int fakedcam_live(void); int live_of_the_module(void) { return fakedcam_live(); }"
+LOADED_FIRST = """
+import ctypes, sys
+from pathlib import Path
+if sys.argv[3] == "driver":
+    from drivers.dcam.abi import Dcam
+    Dcam(Path(sys.argv[1]), "camera")
+else:
+    ctypes.CDLL(sys.argv[1])
+print(ctypes.CDLL(sys.argv[2], mode=2).live_of_the_module())  # RTLD_NOW
+"""
+
+
+@pytest.mark.parametrize(("by", "works"), [("driver", True), ("ctypes", False)])
+def test_modules_of_the_library_find_its_symbols(fake_library: Path, tmp_path: Path, by: str, works: bool) -> None:
+    """The vendor's camera modules are loaded later and want symbols of the main library; ctypes' default hides them."""
+    source, module = tmp_path / "module.c", tmp_path / "libmodule.so"
+    source.write_text(MODULE)
+    subprocess.run([compiler(), "-shared", "-fPIC", str(source), "-o", str(module)], check=True)
+    command = [sys.executable, "-c", LOADED_FIRST, str(fake_library), str(module), by]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert (ran.returncode == 0 and ran.stdout.strip() == "0") is works, ran.stderr
+    assert works or "undefined symbol: fakedcam_live" in ran.stderr
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="the installed library's name is tested on Linux")
 def test_without_a_path_the_installed_library_is_looked_for() -> None:
     try:
@@ -78,7 +110,7 @@ def test_without_a_path_the_installed_library_is_looked_for() -> None:
 def test_a_library_of_another_kind_is_refused_with_the_missing_calls(fake_library: Path, tmp_path: Path) -> None:
     source, library = tmp_path / "old.c", tmp_path / "libold.so"
     source.write_text("int dcamapi_init(void *p) { return p != 0; }\n")
-    subprocess.run(["gcc", "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    subprocess.run([compiler(), "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
     with pytest.raises(DeviceError, match=r"lacks dcamapi_uninit, dcamdev_open.*Nothing was changed"):
         abi.Dcam(library, "camera")
 

@@ -156,9 +156,14 @@ def test_arm_returns_only_when_triggers_are_taken(camera: DcamCamera, world) -> 
 
 
 @pytest.fixture
-def waiting(world):
-    """A camera in real time with a thread that waits for its first frame, and that frame's future."""
+def waiting(world, request: pytest.FixtureRequest):
+    """A camera in real time with a thread that waits for its first frame, and that frame's future.
+
+    Its parameter is a fault that the camera has from the beginning.
+    """
     world.reset(real_time=True)
+    if fault := getattr(request, "param", None):
+        world.fault(fault)
     camera = world.connect()
     camera.configure(EXTERNAL)
     camera.arm(1)
@@ -177,11 +182,23 @@ def test_an_event_that_never_comes_delays_but_does_not_lose_a_frame(waiting, wor
     assert frame.result(timeout=5.0).framestamp == 0
 
 
-def test_disarm_ends_a_wait_in_another_thread(waiting) -> None:
+@pytest.mark.parametrize("waiting", [None, "no_stopped_event"], indirect=True)
+def test_disarm_ends_a_wait_in_another_thread(waiting, world) -> None:
+    """Also where the camera cannot signal that it stopped: the wait itself is aborted."""
     camera, frame = waiting
+    aborted = world.calls("dcamwait_abort")
     camera.disarm()
     with pytest.raises(DeviceRefused, match="not armed"):
         frame.result(timeout=5.0)
+    assert world.calls("dcamwait_abort") == aborted + 1
+
+
+def test_close_waits_for_the_thread_that_is_in_the_library(waiting, world) -> None:
+    camera, frame = waiting
+    camera.close()
+    with pytest.raises(DeviceError, match="is closed"):
+        frame.result(timeout=5.0)
+    assert (world.live, world.waiters) == (0, 0)
 
 
 def test_a_camera_that_cannot_signal_its_stop(world) -> None:

@@ -97,7 +97,7 @@ def test_an_unplugged_camera_is_no_refusal(camera: DcamCamera, world) -> None:
     world.fault("unplugged", 0)
 
 
-@pytest.mark.parametrize("readout", ["standard", "ultra_quiet"])
+@pytest.mark.parametrize("readout", orca_quest.LINE_TIME)
 @pytest.mark.parametrize("trigger", [TriggerSource.EXTERNAL, TriggerSource.SOFTWARE])
 def test_full_frame_timing_is_that_of_the_data_sheet(world, readout: str, trigger: TriggerSource) -> None:
     """The fake computes times in C from the property table; the planner's figures were typed from the data sheet."""
