@@ -29,6 +29,7 @@ class _Entry:
 _COMMANDS = {
     "demo": _Entry("demo", "Simulated scan with live reconstruction, ending in a volume and a report."),
     "check": _Entry("check", "Validate a configuration; nothing moves."),
+    "doctor": _Entry("doctor", "Look at this computer: camera link, ports, disk, memory; nothing moves."),
     "scan": _Entry("scan", "Run a scan (or, with --dry-run, say what it would do)."),
     "recon": _Entry("recon", "Reconstruct a scan, finished or still growing."),
     "tradeoff": _Entry("tradeoff", "What accuracy costs in time: many reconstructions of a scan, compared."),

@@ -1,0 +1,81 @@
+"""`beamline doctor`: is this computer fit for the instrument: camera, ports, disk and memory; nothing moves."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from beamline.cli.config import OVERRIDE_HELP
+from beamline.cli.told import terminated_like_interrupted, told_as_json
+from beamline.config import load
+from beamline.doctor.check import Check, Verdict
+from beamline.doctor.examine import examine
+from beamline.events import Event
+from drivers.clock import SystemClock
+
+_STYLES = {
+    Verdict.OK: "green",
+    Verdict.WARNING: "yellow",
+    Verdict.FAILED: "bold red",
+    Verdict.NOT_APPLICABLE: "dim",
+    Verdict.CANNOT_CHECK: "dim",
+}
+_WIDTH = 120
+"""Columns where stdout is no terminal."""
+
+
+@click.command()
+@click.argument("file", metavar="[CONFIG]", required=False, type=click.Path(path_type=Path))
+@click.option("--session", is_flag=True, help="Also ask the camera itself: seconds, and no other program may have it.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=OVERRIDE_HELP)
+@click.option("--json", "as_json", is_flag=True, help="One event a check on stdout, then the counts.")
+def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Look at this computer: camera link, camera library, ports, disk and memory; nothing moves.
+
+    With CONFIG each is compared with what that scan needs. The disk is measured for a few seconds with a file of its
+    own that is gone afterwards. Exit code 1 where a check failed, 2 where CONFIG is wrong.
+    """
+    if file is None and overrides:
+        raise click.UsageError("--set belongs to a CONFIG.")
+    clock, checks = SystemClock(), list[Check]()
+    with terminated_like_interrupted(), told_as_json(as_json) as sinks:
+        config = None if file is None else load(file, overrides)
+        if not as_json:
+            click.echo("Measuring the disk takes a few seconds.", err=True)
+        for check in examine(config, clock, session=session):
+            checks.append(check)
+            for sink in sinks:
+                sink(Event("check", clock.now(), vars(check)))
+        counts = Counter(check.verdict for check in checks)
+        for sink in sinks:
+            sink(Event("done", clock.now(), {str(verdict).replace(" ", "_"): counts[verdict] for verdict in Verdict}))
+    if not as_json:
+        _show(checks)
+        click.echo(", ".join(f"{counts[verdict]} {verdict}" for verdict in Verdict if counts[verdict]))
+    if counts[Verdict.FAILED]:
+        click.get_current_context().exit(1)
+
+
+def _show(checks: Sequence[Check]) -> None:
+    console = Console(file=sys.stdout, highlight=False)
+    if not console.is_terminal:
+        console = Console(file=sys.stdout, highlight=False, width=_WIDTH)
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    for column in ("check", "verdict", "found"):
+        table.add_column(column, no_wrap=column != "found")
+    for check in checks:
+        lines = [check.found]
+        if check.verdict is not Verdict.OK and check.expected:
+            lines.append(f"Expected: {check.expected}.")
+        if check.advice:
+            lines.append(f"{check.advice}.")
+        # Text, not markup: a reply may hold square brackets.
+        table.add_row(check.name, Text(check.verdict, _STYLES[check.verdict]), Text("\n".join(lines)))
+    console.print(table)

@@ -1,0 +1,166 @@
+"""Doctor on the camera: is it on the bus, on a fast link, and is the vendor's library there? No session by default."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import sys
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from beamline.config_devices import DcamOrca
+from beamline.doctor.check import Check, Verdict, of_error
+from drivers import usb
+from drivers.dcam.abi import Dcam
+from drivers.dcam.codes import Text
+from drivers.errors import DeviceError
+
+LINK, LIBRARY = "camera link", "camera library"
+_SUPERSPEED = "one Hamamatsu camera on a SuperSpeed link (5 Gbit/s or more)"
+_LINK_ADVICE = {
+    usb.Verdict.SLOW: "Use the vendor's USB 3 cable, shorter than 3 m, in a port marked SS or blue, without a hub or "
+    "extension; then switch the camera off and on. A camera at 480 Mbit/s gives about 2 full frames a second",
+    usb.Verdict.ABSENT: "Switch the camera on, wait for its lamp, check the cable at both ends; on Linux see whether "
+    "`lsusb -d 0661:` lists it, on Windows the Device Manager",
+    usb.Verdict.AMBIGUOUS: "Set devices.camera.usb_product or usb_serial to the ids listed here",
+}
+_VERDICTS = {
+    usb.Verdict.READY: Verdict.OK,
+    usb.Verdict.SLOW: Verdict.FAILED,  # the plan reckons with the fast link: frames would be lost
+    usb.Verdict.ABSENT: Verdict.FAILED,
+    usb.Verdict.AMBIGUOUS: Verdict.WARNING,
+    usb.Verdict.UNKNOWN: Verdict.CANNOT_CHECK,
+}
+
+
+def link(camera: DcamOrca | None, backend: Any = None) -> Check:
+    """The camera on USB, as far as descriptors tell.
+
+    Args:
+        camera: as configured; None where nothing is: a camera that is absent is then no failure.
+        backend: of pyusb; None takes the installed libusb.
+    """
+    if camera is not None and camera.link == "coaxpress":
+        return Check(
+            LINK, Verdict.NOT_APPLICABLE, "A CoaXPress camera is on its frame grabber, not on USB.", _SUPERSPEED
+        )
+    product, serial = (None, None) if camera is None else (camera.usb_product, camera.usb_serial)
+    found = usb.preflight(product=product, serial=serial, backend=backend)
+    verdict = _VERDICTS[found.verdict]
+    if verdict is Verdict.FAILED and camera is None:
+        verdict = Verdict.WARNING
+    return Check(
+        LINK,
+        verdict,
+        found.message,
+        _SUPERSPEED,
+        _LINK_ADVICE.get(found.verdict, "" if verdict is Verdict.OK else _no_libusb()),
+        {"devices": [vars(device) for device in found.devices]},
+    )
+
+
+def library(camera: DcamOrca | None, session: bool = False) -> Check:
+    """The DCAM-API library: loaded, and of version 4; with `session`, also what it says of the cameras it finds.
+
+    Args:
+        session: start one, which takes seconds and fails where another program has the camera.
+    """
+    path = Path(camera.library) if camera is not None and camera.library else None
+    expected = "the DCAM-API runtime of the camera's vendor, version 4"
+    try:
+        loaded = Dcam(path, "camera")
+    except DeviceError as error:
+        return of_error(LIBRARY, error, expected, Verdict.WARNING if camera is None else Verdict.FAILED)
+    file = _loaded_file(path)
+    version = version_of(file)
+    values: dict[str, Any] = {"library": None if file is None else str(file), "version": version}
+    found = f"{file or path or 'the installed library'}, version {version or 'not told by its name'}."
+    if not session:
+        return Check(LIBRARY, Verdict.OK, found, expected, values=values)
+    index = 0 if camera is None else camera.index
+    try:
+        cameras = _cameras(loaded)
+    except DeviceError as error:
+        failure = of_error(LIBRARY, error, f"{expected}, and a camera")
+        return replace(failure, found=f"{found} {failure.found}", values=values)
+    values["cameras"] = cameras
+    told = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
+    if index >= len(cameras):
+        return Check(
+            LIBRARY,
+            Verdict.FAILED,
+            f"{found} {len(cameras)} cameras: {told}.",
+            f"a camera of index {index}",
+            "Set devices.camera.index to one that is there",
+            values,
+        )
+    return Check(LIBRARY, Verdict.OK, f"{found} {told}.", expected, values=values)
+
+
+def version_of(file: Path | None) -> str:
+    """The version that a library's file carries: behind .so on Linux, in the name; "" where it carries none."""
+    if file is None:
+        return ""
+    if sys.platform == "win32":
+        return _windows_version(file)
+    match = re.search(r"\.so\.(\d[\d.]*)$", file.resolve().name)
+    return match[1] if match else ""
+
+
+def _cameras(dcam: Dcam) -> list[dict[str, str]]:
+    """What each camera says of itself, by a session of our own that is ended again."""
+    try:
+        return [
+            {
+                which.name.lower(): dcam.dev_getstring(index, which)
+                for which in (Text.MODEL, Text.CAMERAID, Text.BUS, Text.CAMERAVERSION, Text.DCAMAPIVERSION)
+            }
+            for index in range(dcam.api_init())
+        ]
+    finally:
+        with suppress(DeviceError):  # also a session that did not start must be ended; what failed is told already
+            dcam.api_uninit()
+
+
+def _no_libusb() -> str:
+    where = {
+        "win32": "Put libusb-1.0.dll (libusb.info) in a folder of the PATH",
+        "darwin": "Install libusb (brew install libusb)",
+    }.get(sys.platform, "Install libusb 1.0 (Debian and Ubuntu: apt install libusb-1.0-0)")
+    return f"{where}; the camera itself does not need it"
+
+
+def _loaded_file(path: Path | None) -> Path | None:
+    """Where the library that this process has loaded lies; None where the system does not tell."""
+    if path is not None:
+        return path.resolve()
+    if sys.platform == "win32":
+        buffer = ctypes.create_unicode_buffer(1024)
+        kernel = ctypes.WinDLL("kernel32")
+        kernel.GetModuleHandleW.restype = ctypes.c_void_p
+        kernel.GetModuleFileNameW.argtypes = (ctypes.c_void_p, ctypes.c_wchar_p, ctypes.c_uint32)
+        size = kernel.GetModuleFileNameW(kernel.GetModuleHandleW("dcamapi.dll"), buffer, len(buffer))
+        return Path(buffer.value) if size else None
+    with suppress(OSError):
+        for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
+            if "/libdcamapi." in line:
+                return Path(line[line.index("/") :])
+    return None
+
+
+def _windows_version(file: Path) -> str:
+    """File version of the DLL's version resource (VS_FIXEDFILEINFO of verrsrc.h)."""
+    if sys.platform != "win32":
+        return ""
+    version = ctypes.WinDLL("version")
+    size = version.GetFileVersionInfoSizeW(str(file), None)
+    block = ctypes.create_string_buffer(max(size, 1))
+    at, length = ctypes.c_void_p(), ctypes.c_uint32()
+    if not size or not version.GetFileVersionInfoW(str(file), 0, size, block):
+        return ""
+    if not version.VerQueryValueW(block, "\\", ctypes.byref(at), ctypes.byref(length)) or not at.value:
+        return ""
+    fixed = (ctypes.c_uint32 * 4).from_address(at.value)
+    return ".".join(str(half) for word in (fixed[2], fixed[3]) for half in (word >> 16, word & 0xFFFF))

@@ -1,0 +1,133 @@
+"""Doctor on the disk: how fast it really takes bytes, and how much room it has, against what a scan needs."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Protocol
+
+import numpy as np
+
+from beamline.doctor.check import Check, Verdict
+from beamline.doctor.needs import Needs
+from beamline.dry_run import free_bytes
+from beamline.plan_checks import size
+from drivers.clock import Clock
+
+SECONDS, MOST = 3.0, 4 << 30
+"""How long (s on the clock) and how much (bytes) is written at most."""
+PIECE = 16 << 20
+"""Bytes that go out together and are then waited for."""
+LEAST = 4 * PIECE
+"""Bytes below which no rate is told."""
+COMFORT = 1.25
+"""A disk that is faster than the need by this has no trouble; below it, others' work may slow it too much."""
+SPEED, ROOM = "disk speed", "disk space"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Bytes that were written, and the s that they took until the disk had them."""
+
+    n_bytes: int
+    seconds: float
+
+    @property
+    def rate(self) -> float:
+        return self.n_bytes / max(self.seconds, 1e-9)  # a clock may be coarse
+
+
+class Opens(Protocol):
+    """Opens a new file in a folder that is gone once it is closed, however the process ends."""
+
+    def __call__(self, folder: Path) -> IO[bytes]: ...
+
+
+def temporary(folder: Path) -> IO[bytes]:
+    """A new file without a name, or with one that the system removes: nothing can be overwritten or left behind."""
+    return tempfile.TemporaryFile(dir=folder, prefix="beamline-doctor-", buffering=0)
+
+
+def measure(
+    folder: Path, clock: Clock, opens: Opens = temporary, most: int = MOST, seconds: float = SECONDS
+) -> Measured:
+    """Write bytes that do not compress into a file of its own in `folder`, each piece down to the disk.
+
+    Raises:
+        OSError: the folder cannot be written to, or the disk is full.
+    """
+    piece = memoryview(np.random.default_rng().bytes(PIECE))
+    written = 0
+    with opens(folder) as file:
+        began = clock.now()
+        while written + PIECE <= most and (written < LEAST or clock.now() - began < seconds):
+            at = 0
+            while at < PIECE:
+                at += file.write(piece[at:])
+            os.fsync(file.fileno())
+            written += PIECE
+        return Measured(written, clock.now() - began)
+
+
+def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = temporary) -> Check:
+    """The rate of the disk that holds `folder`, or will hold it, against what frames bring."""
+    expected = "" if needs is None else f"{size(needs.rate)}/s while frames come fastest"
+    there = existing(folder)
+    # The file leaves again, but a disk must not even be filled for a moment.
+    most = min(MOST, shutil.disk_usage(there).free // 4)
+    if most < LEAST:
+        return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} has too little room to measure in.", expected)
+    try:
+        measured = measure(there, clock, opens, most)
+    except OSError as error:
+        if error.errno == errno.EINVAL:  # a file system without fsync
+            return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} does not say when bytes are on the disk.", expected)
+        return Check(
+            SPEED,
+            Verdict.FAILED,
+            f"{there} cannot be written to ({error.strerror or error}).",
+            expected or "a folder that takes files",
+            "Choose another storage.folder, or have its permissions or its disk put right",
+        )
+    rate = measured.rate
+    found = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, down to the disk)."
+    values = {"bytes_per_s": rate, "written": measured.n_bytes, "seconds": measured.seconds}
+    if needs is None:
+        return Check(SPEED, Verdict.OK, found, values=values)
+    backlog = needs.backlog(rate)
+    values |= {"needed_bytes_per_s": needs.rate, "backlog": backlog, "waiting_bytes": needs.waiting_bytes}
+    if rate >= COMFORT * needs.rate:
+        return Check(SPEED, Verdict.OK, found, expected, values=values)
+    if backlog <= needs.waiting_bytes / 2:
+        found += f" At most {size(backlog)} will wait in memory, which has room for {size(needs.waiting_bytes)}."
+        advice = "Let nothing else write to this disk during the scan, or choose a faster one"
+        return Check(SPEED, Verdict.WARNING, found, expected, advice, values)
+    found += f" {size(backlog)} would have to wait in memory, which has room for {size(needs.waiting_bytes)}."
+    advice = "Choose a storage.folder on a faster disk, or a longer period, a smaller roi or binning"
+    return Check(SPEED, Verdict.FAILED, found, expected, advice, values)
+
+
+def room(folder: Path, needs: Needs | None) -> Check:
+    """Free space against the file's size."""
+    free = free_bytes(folder)
+    found, values = f"{size(free)} free for {folder.absolute()}.", {"free_bytes": free}
+    if needs is None:
+        return Check(ROOM, Verdict.OK, found, values=values)
+    values["needed_bytes"] = needs.file_bytes
+    expected = f"{size(needs.file_bytes)} for the scan and a tenth more; as much again for its reconstruction"
+    if free < needs.file_bytes:
+        advice = "Free some, choose another storage.folder, or reduce views, roi or binning"
+        return Check(ROOM, Verdict.FAILED, found, expected, advice, values)
+    if free < 2 * needs.file_bytes:
+        return Check(ROOM, Verdict.WARNING, found, expected, "Free some before the next scan", values)
+    return Check(ROOM, Verdict.OK, found, expected, values=values)
+
+
+def existing(folder: Path) -> Path:
+    """The folder, or the nearest one above it that is there: a scan makes its own, the doctor makes none."""
+    folder = folder.absolute()
+    return next((place for place in (folder, *folder.parents) if place.is_dir()), folder)

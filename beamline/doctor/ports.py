@@ -1,0 +1,98 @@
+"""Doctor on the ports: is the port that a device is configured on there, and may it be opened? No byte is sent."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from beamline.doctor.check import Check, Verdict
+from drivers.serial_ports import SerialPort
+
+CONNECT_TIMEOUT = 2.0
+"""s for a TCP connection."""
+
+
+def ports(found: Sequence[SerialPort]) -> Check:
+    """The serial ports that there are, without a word on which is whose."""
+    listed = "; ".join(map(str, found)) or "none"
+    return Check(
+        "serial ports",
+        Verdict.OK if found else Verdict.WARNING,
+        f"{listed}.",
+        "the adapter of a stage on a serial line (a stage on the network shows none)",
+        "" if found else "Plug the adapter in; on Linux `dmesg` says whether the system took it",
+        {"ports": [vars(port) for port in found]},
+    )
+
+
+def port(name: str, url: str, found: Sequence[SerialPort]) -> Check:
+    """One device's port.
+
+    Args:
+        name: of the check.
+        url: as configured.
+        found: the ports that there are.
+    """
+    if url.lower().startswith("sim://"):
+        return Check(name, Verdict.NOT_APPLICABLE, f"{url} is simulated.")
+    if url.lower().startswith("socket://"):
+        return _network(name, url)
+    if "://" in url:
+        return Check(name, Verdict.CANNOT_CHECK, f"{url} can only be tried by opening it.")
+    listed = "; ".join(map(str, found)) or "no serial ports"
+    known = next((one for one in found if _same(one.device, url)), None)
+    values = {"port": url, "ports": [vars(one) for one in found]}
+    if known is None and (sys.platform == "win32" or not Path(url).exists()):
+        return Check(
+            name,
+            Verdict.FAILED,
+            f"There is no port {url}; there are {listed}.",
+            f"the port {url} of the configuration",
+            "Plug the adapter in, switch the controller on, and set the port to one of those that there are; a name "
+            "under /dev/serial/by-id stays the same when adapters are plugged in another order",
+            values,
+        )
+    if sys.platform != "win32" and not os.access(url, os.R_OK | os.W_OK):
+        return Check(
+            name,
+            Verdict.FAILED,
+            f"{known or url} may not be opened by this user.",
+            f"leave to read and write {url}",
+            "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again",
+            values,
+        )
+    return Check(name, Verdict.OK, f"{known or url}.", f"the port {url} of the configuration", values=values)
+
+
+def _same(device: str, url: str) -> bool:
+    if sys.platform == "win32":
+        return device.upper() == url.upper().removeprefix("\\\\.\\")
+    return device == url or Path(device).resolve() == Path(url).resolve()
+
+
+def _network(name: str, url: str) -> Check:
+    """A connection that is made and closed again; the controller hears nothing."""
+    expected = f"a controller that takes connections at {url}"
+    try:
+        parts = urlsplit(url)
+        host, number = parts.hostname or "", parts.port
+    except ValueError:
+        host, number = "", None
+    if not host or not number:
+        return Check(name, Verdict.FAILED, f"{url} is no address.", "socket://host:port", "Correct the configuration")
+    try:
+        socket.create_connection((host, number), CONNECT_TIMEOUT).close()
+    except OSError as error:
+        return Check(
+            name,
+            Verdict.FAILED,
+            f"{host}:{number} takes no connection ({error}).",
+            expected,
+            "Check the controller's power, its address and port on its panel, the network, and that no other program "
+            "holds its connection: many controllers take one at a time",
+        )
+    return Check(name, Verdict.OK, f"{host}:{number} takes connections.", expected)
