@@ -1,0 +1,351 @@
+"""PI controller with GCS 2.0 (C-863 class) as rotation stage, with position-synchronised trigger pulses.
+
+Positions are an encoder's and hold only from a reference move on (`start_home`): before it, moves are refused. Pulses
+come from a digital output in trigger mode 0; the controller does not count them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.stages.pi_gcs_axis import AxisStatus, PiGcsAxis
+from drivers.stages.pi_gcs_errors import EVENTS, STOPPED, advice, meaning
+from drivers.stages.pi_gcs_line import GcsLine
+from drivers.stages.pi_gcs_train import FirstPulse, TriggerWindow, is_spent_by, window_of
+
+POLL = 0.02
+"""s between looks at a moving stage."""
+STOP_MARGIN = 2.0
+"""s beyond the longest deceleration after which a stop has failed."""
+SLOWEST = 1e-6
+"""degrees/s that can still be written."""
+
+
+def limits_of(counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float) -> StageLimits:
+    """What the controller makes of the figures configured for a stage (rad/s, rad/s², rad); it takes them as they are.
+
+    Raises:
+        ValueError: figures that no stage can have.
+    """
+    if not (counts_per_turn > 0 and math.degrees(max_speed) >= SLOWEST and math.degrees(acceleration) >= SLOWEST):
+        raise ValueError(f"counts a turn, speed and acceleration must be positive, from {SLOWEST:g} deg/s on")
+    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True)
+
+
+class PiGcsStage:
+    """Implements `drivers.protocols.RotationStage`. Opening switches the servo on and the trigger line off; closing
+    leaves both, and a move under way, as they are.
+
+    `stop` returns when the stage stands, `abort` at once; it stands all axes of the controller. A train is ended by a
+    move that would emit it a second time or turn back inside it.
+
+    Args:
+        url: what pyserial opens.
+        axis: identifier as SAI? lists it.
+        trigger_line: digital output that the pulses come from.
+        counts_per_turn: encoder counts for 2π.
+        timeout: s for a reply.
+        max_speed, acceleration: rad/s, rad/s².
+        low, high: soft limits in radians, within the controller's own.
+        baudrate: as set on the controller; nominal over USB.
+        pulse_width: must be None: the firmware has one.
+        active_high: polarity of the pulses. That CTO parameter 7 is 1 for it is taken from memory.
+        transcript: file to which every byte on the wire is appended; None keeps none.
+        reference: how `start_home` finds the reference: by its switch, or the negative or positive limit switch.
+        first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
+        firmware_pulse: s that the firmware holds a pulse, from memory; trains must leave as long between two.
+        tolerance: counts from the target within which a move has arrived (a servo holds to a few counts, never one).
+        settle: s after a move in which the controller may still bring the axis on target.
+
+    Raises:
+        DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        axis: str = "1",
+        trigger_line: int = 1,
+        counts_per_turn: int,
+        clock: Clock,
+        timeout: float = 1.0,
+        max_speed: float,
+        acceleration: float,
+        low: float,
+        high: float,
+        name: str = "stage",
+        baudrate: int = 115_200,
+        pulse_width: float | None = None,
+        active_high: bool = True,
+        transcript: Path | None = None,
+        reference: Literal["FRF", "FNL", "FPL"] = "FRF",
+        first_pulse: FirstPulse | str = FirstPulse.AT_THRESHOLD,
+        firmware_pulse: float = 50e-6,
+        tolerance: int = 10,
+        settle: float = 1.0,
+    ) -> None:
+        self.name = name
+        self._clock, self._url, self._axis_name, self._trigger_line = clock, url, axis, trigger_line
+        self._reference, self._active_high, self._pulse = reference, active_high, firmware_pulse
+        self._tolerance, self._settle = tolerance, settle
+        if pulse_width is not None:
+            raise DeviceRefused(
+                name,
+                f"its firmware fixes the width of trigger pulses, so {pulse_width:g} s cannot be set",
+                expected="no pulse_width",
+                advice="Leave it out; make pulses longer by a pulse stretcher, or let the camera trigger on edges",
+                state="Nothing was sent",
+            )
+        try:
+            self._first_pulse = FirstPulse(first_pulse)
+            self._limits = limits_of(counts_per_turn, max_speed, acceleration, low, high)
+        except ValueError as problem:
+            raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
+        self._per_radian = Fraction(counts_per_turn) / Fraction(2 * math.pi)
+        self._low, self._high = self.to_counts(low), self.to_counts(high)
+        self._target: int | None = None
+        self._homing = self._stopped = self._closed = False
+        self._train: TriggerTrain | None = None
+        self._line = GcsLine(
+            url, axis=axis, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
+        )
+        self._axis = PiGcsAxis(
+            self._line, axis=axis, trigger_line=trigger_line, counts_per_turn=counts_per_turn, name=name
+        )
+        try:
+            self._identity = self._axis.open(Fraction(acceleration) * self._per_radian)
+            self._check_own_limits()
+        except DeviceError:
+            self.close()
+            raise
+
+    @property
+    def limits(self) -> StageLimits:
+        return self._limits
+
+    def to_counts(self, angle: float) -> int:
+        return round(angle * self._limits.counts_per_turn / (2 * math.pi))
+
+    def to_angle(self, counts: int) -> float:
+        return counts * 2 * math.pi / self._limits.counts_per_turn
+
+    def position(self) -> float:
+        return self.to_angle(self._axis.counts())
+
+    def status(self) -> StageStatus:
+        status = self._axis.status()
+        return StageStatus(status.counts, status.moving, status.homed, self._fault(status))
+
+    def start_move(self, angle: float, speed: float) -> None:
+        if not math.isfinite(angle) or not self._low <= self.to_counts(angle) <= self._high:
+            raise DeviceRefused(
+                self.name,
+                f"a move to {math.degrees(angle):g} deg is beyond the soft limits",
+                expected=self._range(),
+                state="Nothing has moved",
+            )
+        if not SLOWEST <= math.degrees(speed) <= math.degrees(self._limits.max_speed) * (1 + 1e-12):
+            raise DeviceRefused(
+                self.name,
+                f"a speed of {math.degrees(speed):g} deg/s is not possible",
+                expected=f"{SLOWEST:g} to {math.degrees(self._limits.max_speed):g} deg/s",
+                state="Nothing has moved",
+            )
+        self._axis.standing("a move")
+        target = self.to_counts(angle)
+        if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
+            self.disarm()
+        self._stopped = self._homing = False
+        self._target = None  # what of an earlier move is left, a refusal must not leave as this one's
+        self._axis.start(target, Fraction(speed) * self._per_radian)
+        self._target = target
+
+    def start_home(self) -> None:
+        """As `drivers.protocols.Motion` has it; soft limits do not hold on the way. A train that was armed is over."""
+        self._axis.standing("a reference move")
+        self._train, self._target, self._stopped, self._homing = None, None, False, False
+        self._axis.search_reference(self._reference)
+        self._homing = True
+
+    def moving(self) -> bool:
+        return self._axis.searching() if self._homing else self._axis.moving()
+
+    def wait(self, timeout: float) -> float:
+        target, homing = self._target, self._homing
+        if self._until_standing(timeout):
+            counts = self._axis.counts()
+            raise DeviceTimeout(
+                self.name,
+                f"still moving after {timeout:g} s",
+                expected="" if target is None else f"to stand at {self._deg(target)}",
+                advice="Allow more time, or stop it",
+                state=f"It was left moving and is at {self._deg(counts)}",
+            )
+        if target is not None:
+            self._until_settled(target)
+        status = self._axis.status()
+        if homing and not status.homed:
+            error = self._stopped_short("the reference move stopped short", status, "the reference found")
+            self._homing = False
+            raise error
+        if homing:
+            self._homing = False
+        elif target is not None and self._away(status.counts):
+            wanted = f"{self._deg(target)}, {target} counts"
+            raise self._stopped_short(f"it stopped short of {self._deg(target)}", status, wanted)
+        return self.to_angle(status.counts)
+
+    def arm(self, train: TriggerTrain) -> None:
+        window = self._window(train)
+        sign = 1 if train.interval > 0 else -1
+        self._axis.standing("arming")
+        counts = self._axis.counts()
+        if sign * (train.start - counts) <= 0:
+            raise DeviceRefused(
+                self.name,
+                f"it stands at {self._deg(counts)}, at or past the first pulse at {self._deg(train.start)}",
+                advice="Move to before the first pulse, then arm",
+                state="Nothing has moved and this train is not armed",
+            )
+        if sign * (window.start - counts) <= 0:
+            raise DeviceRefused(
+                self.name,
+                f"it stands at {self._deg(counts)}, at or past {self._deg(window.start)}, where pulses are let through",
+                advice=f"Move back by {self._deg(abs(train.interval))} at least, then arm",
+                state="Nothing has moved and this train is not armed",
+            )
+        self._train = None
+        self._axis.arm(window, self._active_high)
+        self._train = train
+
+    def disarm(self) -> None:
+        """In any state, also while it moves."""
+        self._axis.disarm()
+        self._train = None
+
+    def remaining_pulses(self) -> None:
+        """None: the controller does not count its pulses."""
+
+    def stop(self) -> None:
+        self._stopped = True
+        command = self._axis.brake()
+        longest = self._limits.max_speed / self._limits.acceleration + STOP_MARGIN
+        if self._until_standing(longest):
+            raise DeviceTimeout(
+                self.name,
+                f"still moving {longest:.1f} s after the stop command",
+                request=command,
+                advice="Abort, or use the emergency stop",
+                state=f"It is moving, at {self._deg(self._axis.counts())}",
+            )
+
+    def abort(self) -> None:
+        self._stopped = True
+        self._axis.stop_all()
+
+    def describe(self) -> dict[str, str | int | float]:
+        return {
+            "model": "PI GCS 2.0",
+            "identity": self._identity,
+            "port": self._url,
+            "axis": self._axis_name,
+            "trigger_output": f"digital output {self._trigger_line}",
+            "trigger_polarity": "active high" if self._active_high else "active low",
+            "first_pulse": self._first_pulse.value,
+            "pulse_width_s": "fixed by the firmware",
+            "counts_per_turn": self._limits.counts_per_turn,
+            "max_speed_rad_s": self._limits.max_speed,
+            "acceleration_rad_s2": self._limits.acceleration,
+            "low_rad": self._limits.low,
+            "high_rad": self._limits.high,
+        }
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with contextlib.suppress(DeviceError):  # closing a dead line is no news to whoever closes
+                self._line.close()
+
+    def _window(self, train: TriggerTrain) -> TriggerWindow:
+        """Refuses what cannot be emitted."""
+        pitch = math.inf if train.n == 1 else abs(self.to_angle(train.interval)) / self._limits.max_speed
+        within = all(self._low <= at <= self._high for at in (train.start, train.end))
+        why = ""
+        try:
+            if train.n >= 1 and train.interval and 2 * self._pulse <= pitch and within:
+                return window_of(train, self._first_pulse)
+        except ValueError as problem:
+            why = f": {problem}"
+        raise DeviceRefused(
+            self.name,
+            f"{train.n} pulses every {train.interval} counts from {self._deg(train.start)} cannot be emitted{why}",
+            expected=f"one or more, not closer than {2 * self._pulse:g} s at full speed, all within {self._range()}",
+            state="Nothing has moved and nothing was sent",
+        )
+
+    def _check_own_limits(self) -> None:
+        low, high = self._axis.own_limits()
+        if self._low < low or self._high > high:
+            raise DeviceRefused(
+                self.name,
+                f"the controller itself is limited to {self._deg(low)} to {self._deg(high)}",
+                expected=f"room for the configured {self._range()}",
+                advice="Narrow low and high in the configuration, or widen the travel range in the controller",
+                state="Nothing has moved",
+            )
+
+    def _until_standing(self, timeout: float) -> bool:
+        """Whether it still moves when the time is over."""
+        deadline = self._clock.now() + timeout
+        while (moving := self.moving()) and (left := deadline - self._clock.now()) > 0:
+            self._clock.sleep(min(POLL, left))
+        return moving
+
+    def _until_settled(self, target: int) -> None:
+        """Let the servo bring it on target, where it is near it."""
+        deadline = self._clock.now() + self._settle
+        while self._clock.now() < deadline and not self._axis.on_target() and not self._away(self._axis.counts()):
+            self._clock.sleep(POLL)
+
+    def _away(self, counts: int) -> bool:
+        return self._target is not None and abs(counts - self._target) > self._tolerance
+
+    def _fault(self, status: AxisStatus) -> str:
+        """Why the last move ended early, or what stands, in words; "" for nothing."""
+        code, words = self._line.fault, []
+        early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
+        if code and code != STOPPED:
+            words.append(meaning(code))
+        elif early and (code == STOPPED or self._stopped):
+            words.append(meaning(STOPPED))
+        elif early:
+            words.append(self._axis.limit_switch() or "no reason given")
+        if not status.servo:
+            words.append("the servo is off")
+        return ", ".join(words)
+
+    def _stopped_short(self, problem: str, status: AxisStatus, expected: str) -> DeviceError:
+        code, why = self._line.fault, self._fault(status) or "no reason given"
+        return DeviceError(
+            self.name,
+            f"{problem} ({why})",
+            reply=status.raw,
+            expected=expected,
+            advice=advice(code) if code in EVENTS else "Find what stopped it (limit switch, person) before moving on",
+            state=f"It stands at {self._deg(status.counts)}, {status.counts} counts"
+            + ("" if status.homed else ", which are not those of the reference"),
+        )
+
+    def _range(self) -> str:
+        return f"{math.degrees(self._limits.low):g} to {math.degrees(self._limits.high):g} deg"
+
+    def _deg(self, counts: Fraction | int) -> str:
+        return f"{float(counts) * 360 / self._limits.counts_per_turn:.4f} deg"

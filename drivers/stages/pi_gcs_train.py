@@ -1,0 +1,62 @@
+"""Trigger trains by PI GCS 2.0's mode 0 (PositionDistance): step and window for a train, and when a train is spent.
+
+The controller gives a pulse each step travelled while it is between the thresholds and came in by the start one. The
+stop threshold lies half an interval behind the last pulse, so that it does not matter whether the threshold itself
+fires. Where the first pulse comes no manual says; taken from memory as being at the start threshold, see `FirstPulse`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from fractions import Fraction
+
+from drivers.protocols import TriggerTrain
+
+
+class FirstPulse(StrEnum):
+    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
+
+    AT_THRESHOLD = "at_threshold"
+    """At the start threshold: it is put on the first pulse."""
+    STEP_AFTER = "step_after"
+    """One step behind the start threshold: it is put one interval before the first pulse."""
+    GRID = "grid"
+    """Where whole steps from position 0 lie inside the window: it begins half an interval before the first pulse, and
+    only trains that lie on whole intervals are possible."""
+
+
+@dataclass(frozen=True)
+class TriggerWindow:
+    """In counts: the distance of pulses, where the window begins (which the stage must stand before) and ends."""
+
+    step: Fraction
+    start: Fraction
+    stop: Fraction
+
+
+def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
+    """The window for a train of at least one pulse and an interval that is not 0.
+
+    Raises:
+        ValueError: this firmware cannot put pulses there.
+    """
+    sign = 1 if train.interval > 0 else -1
+    # Thresholds that a controller rounds to the same count would switch the window of a single pulse off.
+    alone = train.n == 1 and first_pulse is not FirstPulse.GRID
+    step = max(abs(train.interval), 2) if alone else abs(train.interval)
+    if first_pulse is FirstPulse.GRID and train.start % step:
+        raise ValueError(
+            f"this controller gives pulses at whole multiples of {step} counts only, which {train.start} is not"
+        )
+    before = {FirstPulse.AT_THRESHOLD: Fraction(0), FirstPulse.STEP_AFTER: Fraction(step)}
+    lead = before.get(first_pulse, Fraction(step, 2))
+    return TriggerWindow(Fraction(step), train.start - sign * lead, train.end + Fraction(sign * step, 2))
+
+
+def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
+    """Whether a move from `here` to `target` (counts) must not find the train armed: it was emitted, and passing it
+    again would emit it again; or it has begun, and on the way back pulses would come too."""
+    sign = 1 if train.interval > 0 else -1
+    begun, whole = sign * (here - train.start) >= 0, sign * (here - train.end) >= 0
+    return whole or (begun and sign * (target - here) < 0)

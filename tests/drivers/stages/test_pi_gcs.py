@@ -1,0 +1,445 @@
+"""PI GCS 2.0 driver: the shared conformance suite over the simulated wire, and what is this controller's own."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import RotationStage, TriggerTrain
+from drivers.stages.pi_gcs import limits_of
+from simulators.wires.pi_gcs_trigger import FirstPulse
+from tests.drivers.stage_conformance import LONG, SPEED, Build, StageConformance
+from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+class TestConformance(StageConformance):
+    WIDTH = None
+    INVERTS = True
+
+    @pytest.fixture
+    def build(self) -> Build:
+        return lambda **settings: Rig(wire={"latency": 0.0}).bench(**settings)
+
+
+class TestConformanceByLimitSwitch(StageConformance):
+    """Another axis, reference by the negative limit switch, a servo that looks once in 50 µs and no ACC and DEC."""
+
+    WIDTH = None
+    INVERTS = True
+
+    @pytest.fixture
+    def build(self) -> Build:
+        wire = {"axis": "ROT_A", "output": 1, "latency": 0.0, "unknown": {"ACC", "DEC"}}
+        build = {"low": -5.0, "reference_switch": False, "servo_period": 50e-6}
+        usual = {"axis": "ROT_A", "trigger_line": 1, "reference": "FNL"}
+        return lambda **settings: Rig(wire=wire, **build).bench(**(usual | settings))
+
+
+# opening and closing
+
+
+def test_it_is_a_rotation_stage_and_says_what_it_found(rig: Rig) -> None:
+    stage: RotationStage = rig.open()
+    described = stage.describe()
+    assert "C-863.12" in str(described["identity"])
+    assert (described["axis"], described["trigger_output"]) == ("1", "digital output 2")
+
+
+def test_opening_asks_who_it_is_switches_the_servo_on_and_the_trigger_off(rig: Rig) -> None:
+    rig.say("TRO 2 1")
+    rig.open()
+    assert rig.sent() == [
+        "*IDN?", "CSV?", "SAI?", "#5", "SPA? 1 0xE", "SPA? 1 0xF", "TRO 2 0", "TRO? 2", "SVO? 1", "SVO 1 1", "SVO? 1",
+        "ACC 1 60", "ACC? 1", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
+    ]  # fmt: skip
+    assert (rig.say("SVO?"), rig.say("TRO? 2")) == ("1=1", "2=0")
+
+
+def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) -> None:
+    rig.say("XYZ", b"MOV 1 5")
+    stage = rig.open()
+    assert stage.status().fault == ""
+    assert stage.position() == 0.0
+
+
+def test_opening_a_moving_stage_is_refused_and_lets_it_move(rig: Rig) -> None:
+    rig.say("SVO 1 1", "MOV 1 60")
+    with pytest.raises(DeviceRefused, match="opening is not possible while it moves"):
+        rig.open()
+    assert rig.say(b"\x05") == "1"
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"axis": "2"}, r"no axis '2', but 1"),
+        ({"trigger_line": 7}, r"error 36.*trigger_line"),
+        ({"acceleration": 1e4}, r"error 17.*acceleration"),
+        ({"counts_per_turn": 100_000}, r"counts 90000 a turn, which is no multiple of the configured 100000"),
+        ({"counts_per_turn": 0}, "must be positive"),
+        ({"max_speed": 0.0}, "must be positive"),
+        ({"acceleration": math.nan}, "must be positive"),
+        ({"pulse_width": 1e-3}, "Nothing was sent"),
+        ({"first_pulse": "some time"}, "some time"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_with_what_would(rig: Rig, settings: dict[str, object], says: str) -> None:
+    with pytest.raises(DeviceRefused, match=says):
+        rig.open(**settings)
+    rig.open().close()
+
+
+def test_counts_that_are_whole_counts_of_the_controllers_will_do(rig: Rig) -> None:
+    rig.open(counts_per_turn=COUNTS // 3).close()
+    rig = Rig(wire={"unknown": {"SPA?"}})
+    rig.open().close()
+
+
+def test_limits_in_the_controller_that_leave_no_room_are_respected() -> None:
+    rig = Rig(low=-4.0, high=1e9)
+    with pytest.raises(DeviceRefused, match=re.escape("limited to -4.0000 deg to 1000000000.0000 deg")):
+        rig.open()
+    rig.open(low=math.radians(-4)).close()
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "says"),
+    [
+        ((b"(c)2026 Physik Instrumente", b"(c)2026 Somebody"), "identity of a PI controller"),
+        ((b"2.0\n", b"1.1\n"), "does not talk GCS 2.0"),
+    ],
+)
+def test_another_controller_on_the_port_is_named(rig: Rig, spoilt: tuple[bytes, bytes], says: str) -> None:
+    rig.spoil = lambda reply: reply.replace(*spoilt)
+    with pytest.raises(DeviceError, match=says):
+        rig.open()
+    rig.spoil = lambda reply: reply
+    rig.open().close()
+
+
+def test_limits_are_what_was_configured(rig: Rig) -> None:
+    stage = rig.open()
+    figures = (COUNTS, math.radians(30), math.radians(60), math.radians(-5), math.radians(100))
+    assert stage.limits == limits_of(*figures)
+
+
+def test_a_transcript_has_the_dialogue(rig: Rig, tmp_path: Path) -> None:
+    stage = rig.open(transcript=tmp_path / "wire.txt")
+    stage.close()
+    assert "ACC 1 60" in (tmp_path / "wire.txt").read_text()
+
+
+def test_where_acc_and_dec_are_missing_parameters_do() -> None:
+    rig = Rig(wire={"unknown": {"ACC", "DEC"}})
+    stage = rig.open()
+    assert (rig.say("SPA? 1 0xB"), rig.say("SPA? 1 0xC")) == ("1 0xB=60.000000", "1 0xC=60.000000")
+    assert stage.status().fault == ""
+
+
+# moves and the reference
+
+
+def test_a_move_on_the_wire(rig: Rig) -> None:
+    stage = rig.open()
+    rig.sent()
+    stage.start_move(math.radians(10.5), math.radians(20))
+    assert rig.sent() == ["#5", "VEL 1 20", "VEL? 1", "MOV 1 10.5", "MOV? 1"]
+    stage.stop()
+    assert rig.sent()[:2] == ["HLT 1", "#5"]
+    stage.abort()
+    assert rig.sent() == ["#24"]
+
+
+def test_an_unreferenced_axis_does_not_move_until_it_has_searched() -> None:
+    rig = Rig(referenced=False, found_at=3.0)
+    stage = rig.open()
+    assert stage.status().homed is False
+    with pytest.raises(DeviceRefused, match=r"no reference yet.*'MOV 1 10'.*start_home.*Nothing has moved"):
+        stage.start_move(math.radians(10), SPEED)
+    stage.start_home()
+    assert stage.wait(LONG) == 0.0
+    assert stage.status().homed is True
+    stage.start_move(math.radians(10), SPEED)
+    stage.wait(LONG)
+    assert math.degrees(rig.line.angle_at(rig.clock.now())) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(("reference", "has"), [("FRF", "reference sensor"), ("FNL", "limit switches")])
+def test_a_search_for_a_switch_that_is_not_there_is_refused(reference: str, has: str) -> None:
+    rig = Rig(reference_switch=False, limit_switches=False)
+    stage = rig.open(reference=reference)
+    with pytest.raises(DeviceRefused, match=f"{reference} is not possible.*{has}.*Nothing has moved"):
+        stage.start_home()
+    assert not stage.moving()
+
+
+def test_a_search_by_the_positive_limit_switch_ends_there() -> None:
+    rig = Rig(high=110.0)
+    stage = rig.open(reference="FPL")
+    stage.start_home()
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(110.0)
+
+
+def test_a_search_that_fails_says_so_and_leaves_the_axis_unreferenced() -> None:
+    rig = Rig(reference_fails=True, found_at=3.0)
+    stage = rig.open()
+    stage.start_home()
+    with pytest.raises(DeviceError, match=r"error 45.*not those of the reference"):
+        stage.wait(LONG)
+    assert stage.status().homed is False
+
+
+def test_a_search_ends_a_train(rig: Rig) -> None:
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.stage.start_home()
+    bench.stage.wait(LONG)
+    bench.go(10.0)
+    assert bench.pulses() == []
+
+
+def test_a_servo_that_needs_its_time_is_waited_for() -> None:
+    rig = Rig(settle=0.4)
+    stage = rig.open()
+    stage.start_move(math.radians(10), SPEED)
+    begun = rig.clock.now()
+    stage.wait(LONG)
+    assert rig.clock.now() - begun == pytest.approx(10 / 10 + 10 / 60 + 0.4, abs=0.06)
+    assert rig.say("ONT?") == "1=1"
+
+
+def test_a_servo_that_never_settles_but_is_near_has_arrived() -> None:
+    rig = Rig(settle=1e9)
+    stage = rig.open()
+    stage.start_move(math.radians(10), SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(10.0)
+
+
+# what stops a move
+
+
+def test_a_motion_error_is_named_with_where_it_stands_and_no_move_follows_before_it_was_looked_at() -> None:
+    rig = Rig(stall_at=2500)
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(
+        DeviceError, match=r"stopped short of 30\.0000 deg \(error 1024, motion error.*servo is off"
+    ) as e:
+        stage.wait(LONG)
+    assert "stands at 10.0000 deg, 2500 counts" in str(e.value)
+    assert not isinstance(e.value, DeviceTimeout | DeviceRefused)
+    assert "1024" in stage.status().fault
+    with pytest.raises(DeviceRefused, match=r"servo is off.*Nothing has moved"):
+        stage.start_move(math.radians(5), SPEED)
+    stage.close()
+    stage = rig.open()
+    stage.start_move(math.radians(5), SPEED)
+    stage.wait(LONG)
+    assert stage.status().fault == ""
+
+
+def test_a_servo_that_is_switched_off_on_the_way_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.say("SVO 1 0")
+    with pytest.raises(DeviceError, match=r"stopped short.*the servo is off"):
+        stage.wait(LONG)
+
+
+@pytest.mark.parametrize(("degrees", "side"), [(30.0, "positive"), (-4.0, "negative")])
+def test_a_limit_switch_is_named(degrees: float, side: str) -> None:
+    rig = Rig(switch_at=round(math.copysign(500, degrees)))
+    stage = rig.open()
+    stage.start_move(math.radians(degrees), SPEED)
+    with pytest.raises(DeviceError, match=rf"stopped short.*\({side} limit switch\)"):
+        stage.wait(LONG)
+    assert stage.status().fault == f"{side} limit switch"
+
+
+def test_a_stop_from_another_program_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.say("STP")
+    with pytest.raises(DeviceError, match="error 10, stopped by command"):
+        stage.wait(LONG)
+
+
+def test_a_stop_from_another_thread_ends_the_wait_with_an_error(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(90), math.radians(1))
+    rig.clock.sleep(5.0)
+    stopper = threading.Thread(target=stage.stop)
+    stopper.start()
+    with pytest.raises(DeviceError, match="stopped short"):
+        stage.wait(1e4)
+    stopper.join()
+    assert not stage.moving()
+
+
+def test_limits_that_another_program_narrowed_are_the_controllers_to_name() -> None:
+    rig = Rig(low=-5.0, high=200.0)
+    stage = rig.open(low=math.radians(-5), high=math.radians(200))
+    object.__setattr__(rig.controller.box.axis.build, "high", 50.0)
+    with pytest.raises(DeviceRefused, match=r"error 7, position out of limits.*TMX\?"):
+        stage.start_move(math.radians(60), SPEED)
+    assert not stage.moving()
+
+
+def test_two_drivers_cannot_hold_one_port(rig: Rig) -> None:
+    stage = rig.open()
+    with pytest.raises(DeviceError, match="does not open"):
+        rig.open()
+    stage.close()
+    rig.open().close()
+
+
+# triggers
+
+
+def test_arming_on_the_wire(rig: Rig) -> None:
+    """One item a line, each read back; the stop threshold half a step behind the last pulse at 1.9."""
+    stage = rig.open()
+    rig.sent()
+    stage.arm(TriggerTrain(250, 25, 10))
+    assert [line for line in rig.sent() if line[:4] not in ("CTO?", "POS?")] == [
+        "#5", "TRO 2 0", "TRO? 2", "CTO 2 2 1", "CTO 2 3 0", "CTO 2 7 1", "CTO 2 1 0.1", "CTO 2 8 1", "CTO 2 9 1.95",
+        "TRO 2 1", "TRO? 2",
+    ]  # fmt: skip
+    stage.disarm()
+    assert rig.sent() == ["TRO 2 0", "TRO? 2"]
+    assert stage.remaining_pulses() is None
+
+
+@pytest.mark.parametrize("rule", list(FirstPulse))
+@pytest.mark.parametrize(("first", "step", "n"), [(250, 25, 10), (500, 5, 1), (-500, -100, 6), (375, 125, 30)])
+def test_wherever_the_firmware_puts_the_first_pulse_a_train_is_at_its_counts(
+    rule: FirstPulse, first: int, step: int, n: int
+) -> None:
+    bench = Rig(first_pulse=rule).bench(first_pulse=rule.value, low=math.radians(-20))
+    bench.stage.arm(TriggerTrain(first, step, n))
+    bench.go(math.copysign(18.0, step) if step < 0 else 40.0)
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [first + k * step for k in range(n)]
+
+
+@pytest.mark.parametrize(
+    ("rule", "says", "expected"),
+    [("at_threshold", "step_after", 4), ("step_after", "at_threshold", 2)],
+)
+def test_the_wrong_rule_shows_in_the_number_of_pulses(rule: str, says: str, expected: int) -> None:
+    """That is how it is found out at an instrument: one too many, or one too few."""
+    bench = Rig(first_pulse=FirstPulse(rule)).bench(first_pulse=says)
+    bench.stage.arm(bench.train(2.0, 1.0, 3))
+    bench.go(20.0)
+    assert len(bench.pulses()) == expected
+
+
+def test_a_train_off_the_grid_is_refused_where_the_firmware_has_one() -> None:
+    stage = Rig(first_pulse=FirstPulse.GRID).open(first_pulse="grid")
+    with pytest.raises(DeviceRefused, match="whole multiples of 100 counts only"):
+        stage.arm(TriggerTrain(250, 100, 3))
+
+
+def test_arming_too_near_before_the_first_pulse_is_refused_where_a_step_goes_before_it() -> None:
+    rig = Rig(first_pulse=FirstPulse.STEP_AFTER)
+    bench = rig.bench(first_pulse="step_after")
+    bench.go(3.0)
+    with pytest.raises(DeviceRefused, match=r"at or past 2\.5000 deg.*Move back by 1\.0000 deg"):
+        bench.stage.arm(bench.train(3.5, 1.0, 3))
+    with pytest.raises(DeviceRefused, match="at or past the first pulse"):
+        bench.stage.arm(bench.train(3.0, 1.0, 3))
+    bench.go(2.0)
+    bench.stage.arm(bench.train(3.5, 1.0, 3))
+    bench.go(10.0)
+    assert [round(math.degrees(pulse.angle), 3) for pulse in bench.pulses()] == [3.5, 4.5, 5.5]
+
+
+def test_the_pulses_on_the_cable_come_at_the_times_of_a_trapezoid(rig: Rig) -> None:
+    """Ramp of v/a = 1/6 s over v²/2a = 5/6 degree, then 10 degrees/s."""
+    bench = rig.bench()
+    bench.stage.arm(bench.train(0.2, 0.2, 50))
+    bench.stage.start_move(math.radians(20), SPEED)
+    begun = rig.controller.box.axis.move.begin
+    bench.stage.wait(LONG)
+    expected = [
+        begun + (math.sqrt(2 * at / 60) if at < 5 / 6 else 1 / 6 + (at - 5 / 6) / 10)
+        for at in (0.2 * (k + 1) for k in range(50))
+    ]
+    assert [pulse.time for pulse in bench.pulses()] == pytest.approx(expected, abs=1e-6, rel=0)
+
+
+def test_pulses_a_servo_cycle_late_still_belong_to_their_counts() -> None:
+    """At 10 degrees/s a cycle of 50 µs is an eighth of a count."""
+    bench = Rig(servo_period=50e-6).bench()
+    train = bench.train(1.0, 0.5, 30)
+    bench.stage.arm(train)
+    bench.go(20.0)
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [250 + 125 * k for k in range(30)]
+
+
+def test_pulses_that_would_merge_are_refused() -> None:
+    """At 30 degrees/s a count of 0.004 degrees lasts 133 µs."""
+    stage = Rig().open(firmware_pulse=60e-6)
+    stage.arm(TriggerTrain(100, 1, 3))
+    stage.close()
+    with pytest.raises(DeviceRefused, match="cannot be emitted"):
+        Rig().open(firmware_pulse=70e-6).arm(TriggerTrain(100, 1, 3))
+
+
+def test_after_a_stop_on_the_way_going_on_gives_the_rest(rig: Rig) -> None:
+    bench = rig.bench()
+    train = bench.train(1.0, 1.0, 30)
+    bench.stage.arm(train)
+    bench.stage.start_move(math.radians(40), SPEED)
+    rig.clock.sleep(1.6)
+    bench.stage.stop()
+    assert 10 < len(bench.pulses()) < 20
+    bench.go(40.0)
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [250 + 250 * k for k in range(30)]
+
+
+def test_turning_back_inside_a_train_ends_it_though_the_controller_would_go_on(rig: Rig) -> None:
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 1.0, 30))
+    bench.go(10.5)
+    bench.go(3.0)
+    bench.go(40.0)
+    assert len(bench.pulses()) == 10
+
+
+def test_moving_back_and_forth_before_a_train_leaves_it_armed(rig: Rig) -> None:
+    bench = rig.bench()
+    bench.stage.arm(bench.train(5.0, 1.0, 3))
+    bench.go(2.0)
+    bench.go(-3.0)
+    bench.go(20.0)
+    assert len(bench.pulses()) == 3
+
+
+def test_disarming_on_the_way_ends_the_pulses_and_lets_it_move(rig: Rig) -> None:
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 1.0, 30))
+    bench.stage.start_move(math.radians(40), SPEED)
+    rig.clock.sleep(1.5)
+    bench.stage.disarm()
+    assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(40.0)
+    assert 10 < len(bench.pulses()) < 20
+
+
+def test_lost_pulses_are_missing_and_no_others() -> None:
+    bench = Rig(lost={0, 7}).bench()
+    bench.stage.arm(bench.train(1.0, 0.5, 10))
+    bench.go(10.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [250 + 125 * k for k in range(10) if k not in {0, 7}]
