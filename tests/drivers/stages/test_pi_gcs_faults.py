@@ -1,0 +1,246 @@
+"""PI GCS 2.0 driver on a disturbed line: what got lost is noticed, and what (has not) moved is said."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import TriggerTrain
+from drivers.stages.pi_gcs import PiGcsStage
+from tests.drivers.stage_conformance import LONG, SPEED
+from tests.drivers.stages.pi_gcs_rig import Rig
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+# commands that do not arrive, or arrive otherwise
+
+
+@pytest.mark.parametrize("lost", ["ACC 1 60", "DEC 1 60", "SVO 1 1"])
+def test_a_setting_lost_on_the_way_is_noticed_at_opening(rig: Rig, lost: str) -> None:
+    rig.replace(lost)
+    with pytest.raises(DeviceError, match=f"a setting was not taken.*{lost}.*Nothing has moved"):
+        rig.open()
+
+
+@pytest.mark.parametrize("lost", ["VEL 1 20", "MOV 1 30"])
+def test_a_command_lost_on_the_way_is_noticed_before_a_move_counts_as_begun(rig: Rig, lost: str) -> None:
+    stage = rig.open()
+    rig.replace(lost)
+    with pytest.raises(DeviceError, match=f"a setting was not taken.*{lost}"):
+        stage.start_move(math.radians(30), math.radians(20))
+    assert not stage.moving()
+    assert stage.position() == 0.0
+
+
+def test_a_target_that_lost_a_digit_is_noticed(rig: Rig) -> None:
+    stage = rig.open()
+    rig.replace("MOV 1 30", "MOV 1 3")
+    with pytest.raises(DeviceError, match=r"'MOV 1 30'.*'3\.000000'.*may be turning"):
+        stage.start_move(math.radians(30), SPEED)
+
+
+@pytest.mark.parametrize(
+    ("sent", "arrives"),
+    [
+        ("CTO 2 3 0", ""), ("CTO 2 7 1", "CTO 2 7 0"), ("CTO 2 1 0.5", "CTO 2 1 0."), ("CTO 2 1 0.5", "CTO 2 1 0.51"),
+        ("CTO 2 8 1", ""), ("CTO 2 9 10.75", "CTO 2 9 10.7"), ("TRO 2 1", ""), ("CTO 2 8 1", "CTO 1 8 1"),
+    ],
+)  # fmt: skip
+def test_a_trigger_setting_that_arrives_otherwise_is_noticed_and_nothing_is_emitted(
+    rig: Rig, sent: str, arrives: str
+) -> None:
+    bench = rig.bench()
+    rig.say("CTO 2 3 2", "CTO 2 8 77", "CTO 2 1 9")
+    rig.replace(sent, arrives)
+    with pytest.raises(DeviceError, match=rf"{sent}.*Nothing has moved"):
+        bench.stage.arm(bench.train(1.0, 0.5, 20))
+    bench.go(20.0)
+    assert bench.pulses() == []
+
+
+def test_a_disarm_lost_on_the_way_is_noticed(rig: Rig) -> None:
+    stage = rig.open()
+    stage.arm(TriggerTrain(100, 10, 3))
+    rig.replace("TRO 2 0")
+    with pytest.raises(DeviceError, match="TRO 2 0"):
+        stage.disarm()
+
+
+def test_a_reference_search_lost_on_the_way_does_not_count_as_done() -> None:
+    rig = Rig(referenced=False)
+    stage = rig.open()
+    rig.replace("FRF 1")
+    stage.start_home()
+    with pytest.raises(DeviceError, match=r"reference move stopped short \(no reason given\).*not those"):
+        stage.wait(LONG)
+
+
+def test_a_stop_that_is_not_understood_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(60), SPEED)
+    rig.replace("HLT 1", "HXT 1")
+    with pytest.raises(DeviceRefused, match=r"HLT ended with error 2.*That command did nothing"):
+        stage.stop()
+    stage.abort()
+    assert not stage.moving()
+
+
+@pytest.mark.parametrize("code", [1, 17, 54, 333, 4711])
+def test_a_code_after_a_command_is_given_in_words(rig: Rig, code: int) -> None:
+    stage = rig.open()
+    rig.spoil = lambda reply: b"%d\n" % code if reply == b"0\n" else reply
+    with pytest.raises(DeviceError, match=f"error {code}, "):
+        stage.disarm()
+
+
+# replies
+
+
+@pytest.mark.parametrize(
+    ("reply", "says"),
+    [
+        (b"", "no whole reply within 1 s"),
+        (b"1=0.00", "no whole reply within 1 s"),
+        (b"\xff\x00\xfe\n", "does not have the form"),
+        (b"2=0.000000\n", "does not have the form"),
+        (b"1=nan\n", "does not have the form"),
+        (b"\n", "does not have the form"),
+        (b"POS? 1\n1=0.000000\n", "does not have the form"),
+        (b"1=0.000000 \n", "no whole reply within 1 s"),
+        (b"1=0.000000 \n2=0.000000\n", "does not have the form"),
+        (b"x" * 5000, "no whole reply"),
+    ],
+)
+def test_a_spoilt_reply_is_named_and_the_next_request_is_in_step_again(rig: Rig, reply: bytes, says: str) -> None:
+    """Silence, truncation, garbage, another axis, echo, a line that promises another."""
+    stage = rig.open()
+    spoilt = [reply]
+    rig.spoil = lambda sound: spoilt.pop() if spoilt else sound
+    before = rig.clock.now()
+    with pytest.raises(DeviceError, match=rf"{says}.*Asked 'POS\? 1'.*Nothing has moved"):
+        stage.position()
+    assert rig.clock.now() - before < 1.2
+    assert stage.position() == 0.0
+    stage.start_move(math.radians(10), SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(10.0)
+
+
+def test_lines_sent_unasked_are_passed_over(rig: Rig) -> None:
+    stage = rig.open()
+    rig.unasked += b"1=77.000000\n12\n"
+    assert stage.position() == 0.0
+
+
+def test_a_device_that_echoes_is_named_at_opening(rig: Rig) -> None:
+    rig.spoil = lambda reply: b"*IDN?\n" + reply if b"Physik" in reply else reply
+    with pytest.raises(DeviceError, match="identity of a PI controller"):
+        rig.open()
+
+
+def test_a_lost_error_reply_after_a_move_says_that_the_stage_may_be_turning(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(5), SPEED)
+    stage.wait(LONG)
+    zeros = iter([b"0\n", b"0\n", b"0\n"])  # #5, ERR? before, ERR? after VEL
+    rig.spoil = lambda reply: next(zeros, b"") if reply == b"0\n" else reply
+    with pytest.raises(DeviceTimeout, match=r"'ERR\?'.*may be turning"):
+        stage.start_move(math.radians(60), math.radians(1))
+    rig.spoil = lambda reply: reply
+    assert stage.moving()
+    stage.stop()
+    assert not stage.moving()
+
+
+def test_a_dead_line_lets_a_stop_out_and_does_not_keep_the_port(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(60), math.radians(1))
+    rig.spoil = lambda reply: b""
+    with pytest.raises(DeviceTimeout, match="may be turning"):
+        stage.wait(LONG)
+    rig.clock.sleep(1.0)
+    for stop in (stage.stop, stage.abort):
+        with pytest.raises(DeviceTimeout):
+            stop()
+    rig.spoil = lambda reply: reply
+    rig.clock.sleep(2.0)
+    assert rig.say(b"\x05") == "0"
+    stage.close()
+    rig.open().close()
+
+
+OPERATIONS: dict[str, Callable[[PiGcsStage], object]] = {
+    "position": PiGcsStage.position,
+    "status": PiGcsStage.status,
+    "moving": PiGcsStage.moving,
+    "move": lambda stage: stage.start_move(math.radians(20), SPEED),
+    "home": PiGcsStage.start_home,
+    "wait": lambda stage: stage.wait(3.0),
+    "arm": lambda stage: stage.arm(TriggerTrain(20_000, 10, 3)),
+    "disarm": PiGcsStage.disarm,
+    "stop": PiGcsStage.stop,
+    "abort": PiGcsStage.abort,
+}
+LINE_NOISE = st.one_of(
+    st.binary(max_size=30),
+    st.from_regex(rb"1( ?[0-9]{1,2})?=[+-]?[0-9a-f.x]{0,9}( )?\n", fullmatch=True),
+    st.sampled_from(
+        [b"", b"\n", b" \n", b"0\n", b"1\n", b"10\n", b"1024\n", b"1=\n", b"\xb0\n", b"0x\n", b"2.0\n", b"9" * 400]
+    ),
+)
+
+
+@settings(max_examples=150)
+@given(st.lists(st.tuples(st.sampled_from(sorted(OPERATIONS)), st.integers(0, 9), LINE_NOISE), min_size=1, max_size=6))
+def test_whatever_arrives_instead_of_a_reply_is_a_device_error_and_the_stage_comes_back(
+    story: list[tuple[str, int, bytes]],
+) -> None:
+    """In each operation the reply of that number is replaced."""
+    rig = Rig()
+    stage = rig.open()
+    for operation, number, noise in story:
+        at = itertools.count()
+        rig.spoil = lambda reply, at=at, number=number, noise=noise: noise if next(at) == number else reply
+        with contextlib.suppress(DeviceError):
+            OPERATIONS[operation](stage)
+    rig.spoil = lambda reply: reply
+    stage.abort()
+    rig.clock.sleep(1.0)
+    rig.say("SVO 1 1")
+    stage.disarm()
+    stage.start_home()
+    stage.wait(LONG)
+    stage.start_move(math.radians(7), SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(7.0)
+    stage.close()
+
+
+@settings(max_examples=100)
+@given(st.lists(LINE_NOISE, min_size=1, max_size=20))
+def test_whatever_arrives_at_opening_is_a_device_error_and_the_port_is_free_again(noise: list[bytes]) -> None:
+    rig = Rig()
+    sequence = iter(noise)
+    rig.spoil = lambda reply: next(sequence, reply)
+    with contextlib.suppress(DeviceError):
+        rig.open().close()
+    rig.spoil = lambda reply: reply
+    rig.open().close()
+
+
+def test_a_motion_error_that_came_before_a_command_is_not_laid_at_its_door() -> None:
+    rig = Rig(stall_at=2500)
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(10.0)
+    stage.arm(TriggerTrain(3000, 10, 3))
+    assert "1024" in stage.status().fault
