@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import settings
 
-# A busy machine makes an example slow now and then; that is no fault of the code.
-settings.register_profile("no deadline", deadline=None)
-settings.load_profile("no deadline")
+# How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
+# No deadline: a busy machine makes an example slow now and then; that is no fault of the code.
+settings.register_profile("few", deadline=None)
+settings.register_profile("ci", deadline=None, max_examples=500, print_blob=True)
+settings.register_profile("thorough", deadline=None, max_examples=10_000, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
