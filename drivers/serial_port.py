@@ -20,4 +20,5 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
         # Each request at once: gathering small packets (Nagle) costs 40 to 200 ms for every command and its read-back.
         with contextlib.suppress(OSError), socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as twin:
             twin.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            port.reset_input_buffer()  # other ports do it as they open
     return port

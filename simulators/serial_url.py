@@ -80,6 +80,7 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
             raise SerialException("port is already open")
         self._name = self.port[len(SCHEME) :]
         self._wire = _PORTS.open(self._name)
+        self._wire.transmit()  # a port that is opened forgets what had come before, as an operating system's does
         self._received = bytearray()
         self.is_open = True
 

@@ -17,6 +17,8 @@ from simulators.wires.pm16c_home import HomeSwitch
 
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
+MAX_PULSES = 200_000
+"""Of a train; a limit of this stand-in, which works all of them out when a move begins."""
 MODES = (
     (Output.OFF, 0.0),
     (Output.GATE, 0.0),
@@ -220,7 +222,8 @@ class PM16CBox:
 
     def arm(self, c: str) -> None:
         motor = self.standing(c).motor
-        if c not in self.mapped or motor.trigger.refusal(motor.position()):
+        too_many = len(motor.trigger.settings.points) > MAX_PULSES
+        if c not in self.mapped or motor.trigger.refusal(motor.position()) or too_many:
             raise Refused(Error.COMMAND)
         motor.trigger.arm()
 

@@ -145,3 +145,10 @@ def test_a_fast_stop_takes_away_the_pulses_to_come_and_lost_ones_never_come() ->
     wire.clock.sleep(5.0)
     wire.run("ESTP0")
     assert wire.counts() == [10_000, 30_000, 40_000]
+
+
+def test_more_pulses_than_it_can_work_out_are_refused_at_once(wire: Wire) -> None:
+    wire.train(1, 200_001, 1)
+    assert (wire.ask("TMGR?0"), wire.ask("ERRF?")) == ("NO", "01")
+    wire.train(1, 200_000, 1)
+    assert wire.ask("TMGR?0") == "YES"
