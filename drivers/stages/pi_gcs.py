@@ -6,7 +6,6 @@ come from a digital output in trigger mode 0; the controller does not count them
 
 from __future__ import annotations
 
-import contextlib
 import math
 from fractions import Fraction
 from pathlib import Path
@@ -16,6 +15,7 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.pi_gcs_axis import AxisStatus, PiGcsAxis
+from drivers.stages.pi_gcs_digital import GcsOutput
 from drivers.stages.pi_gcs_errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs_line import GcsLine
 from drivers.stages.pi_gcs_train import FirstPulse, TriggerWindow, is_spent_by, window_of
@@ -28,15 +28,24 @@ SLOWEST = 1e-6
 """degrees/s that can still be written."""
 
 
-def limits_of(counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float) -> StageLimits:
+def limits_of(
+    counts_per_turn: int,
+    max_speed: float,
+    acceleration: float,
+    low: float,
+    high: float,
+    first_pulse: FirstPulse = FirstPulse.AT_THRESHOLD,
+) -> StageLimits:
     """What the controller makes of the figures configured for a stage (rad/s, rad/s², rad); it takes them as they are.
+    Where the first pulse comes a step after the threshold, the stage must stand more than a step before it.
 
     Raises:
         ValueError: figures that no stage can have.
     """
     if not (counts_per_turn > 0 and math.degrees(max_speed) >= SLOWEST and math.degrees(acceleration) >= SLOWEST):
         raise ValueError(f"counts a turn, speed and acceleration must be positive, from {SLOWEST:g} deg/s on")
-    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True)
+    run_up = 2 if first_pulse is FirstPulse.STEP_AFTER else 1
+    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True, run_up=run_up)
 
 
 class PiGcsStage:
@@ -106,13 +115,13 @@ class PiGcsStage:
             )
         try:
             self._first_pulse = FirstPulse(first_pulse)
-            self._limits = limits_of(counts_per_turn, max_speed, acceleration, low, high)
+            self._limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
         self._per_radian = Fraction(counts_per_turn) / Fraction(2 * math.pi)
         self._low, self._high = self.to_counts(low), self.to_counts(high)
         self._target: int | None = None
-        self._homing = self._stopped = self._closed = False
+        self._homing = self._stopped = False
         self._train: TriggerTrain | None = None
         self._line = GcsLine(
             url, axis=axis, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
@@ -268,11 +277,18 @@ class PiGcsStage:
             "high_rad": self._limits.high,
         }
 
+    def digital_output(self, number: int) -> GcsOutput:
+        """Another output of the controller, such as one that opens a shutter.
+
+        Raises:
+            DeviceRefused: it is the one of the trigger pulses.
+        """
+        if number == self._trigger_line:
+            raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
+        return GcsOutput(self._line, number, f"{self.name} output {number}")
+
     def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            with contextlib.suppress(DeviceError):  # closing a dead line is no news to whoever closes
-                self._line.close()
+        self._line.close()
 
     def _window(self, train: TriggerTrain) -> TriggerWindow:
         """Refuses what cannot be emitted."""

@@ -61,7 +61,8 @@ class GcsLine:
         """A move was begun: what is said of a failure depends on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
-        self._line = SerialLine(
+        self._closed = False
+        self._serial = SerialLine(
             url,
             device=name,
             probe=PROBE,
@@ -79,16 +80,16 @@ class GcsLine:
     def tell(self, command: str) -> int:
         """Send a set command; the code that the register then has."""
         with self._register:
-            self._line.send(command)
+            self._line().send(command)
             return self.read_error()
 
     def stop(self, command: str | bytes) -> None:
         """Send a stop, as a command or a control byte, whoever else is asking; then see that it was understood. It sets
         a code of its own, and what else went wrong before does not speak against it."""
         if isinstance(command, str):
-            self._line.send(command)
+            self._line().send(command)
         else:
-            self._line.send_raw(command)
+            self._line().send_raw(command)
         with self._register:
             code = self.read_error()
         if code in REFUSALS:
@@ -118,8 +119,8 @@ class GcsLine:
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
         """A query as text, or as a control byte; the match of its whole reply with `form`."""
         if isinstance(request, bytes):
-            return self._line.query_raw(request, form, meant, self._state())
-        return self._line.query(request, form, meant, self._state())
+            return self._line().query_raw(request, form, meant, self._state())
+        return self._line().query(request, form, meant, self._state())
 
     def flag(self, query: str) -> bool:
         """A query of the axis that is answered by 0 or 1."""
@@ -154,10 +155,17 @@ class GcsLine:
 
     def wake(self) -> None:
         """End what another program may have left half said."""
-        self._line.send("")
+        self._line().send("")
 
     def close(self) -> None:
-        self._line.close()
+        """Free the port; a second time does nothing."""
+        self._closed = True
+        self._serial.close()
+
+    def _line(self) -> SerialLine:
+        if self._closed:  # what a closed port raises differs from system to system
+            raise DeviceError(self._name, "it was closed", advice="Open it again", state="Nothing was sent")
+        return self._serial
 
     def _state(self) -> str:
         return "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
