@@ -149,13 +149,13 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     if roi is None:
         return
     row0, col0, rows, cols = roi
+    # Positions to 0 first: position + size must stay within the sensor at every step, and ranges may follow that.
+    properties.set_exactly(Property.SUBARRAYVPOS, 0)
+    properties.set_exactly(Property.SUBARRAYHPOS, 0)
     height, width = (properties.maximum(prop) for prop in (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE))
     if not (0 <= row0 <= height - rows and 0 <= col0 <= width - cols):
         problem = f"the region {roi} (row0, col0, rows, cols) does not lie on the sensor"
         raise DeviceRefused(device, problem, expected=f"a region within {height:g} x {width:g}")
-    # Positions to 0 first: position + size must stay within the sensor at every step.
-    properties.set_exactly(Property.SUBARRAYVPOS, 0)
-    properties.set_exactly(Property.SUBARRAYHPOS, 0)
     properties.set_exactly(Property.SUBARRAYVSIZE, rows)
     properties.set_exactly(Property.SUBARRAYHSIZE, cols)
     properties.set_exactly(Property.SUBARRAYVPOS, row0)

@@ -159,6 +159,11 @@ class World:
         """Exposures of the present or last capture."""
         return self._fake.fakedcam_exposed()
 
+    @property
+    def delivered(self) -> int:
+        """Frames that reached the ring in the present or last capture."""
+        return self._fake.fakedcam_delivered()
+
     def layout(self) -> dict[str, tuple[int, list[int]]]:
         """C's sizeof and offsets of every structure."""
         text = ctypes.create_string_buffer(4096)

@@ -67,9 +67,9 @@ static const Property TABLE[N_PROPS] = {
 /* What the outside can do to the camera and its library. */
 static const char *const FAULTS[] = {"no_camera", "unplugged", "unplug_at", "report_loss", "pad", "first_stamp", "start_polls",
                                      "overrun_in_lock", "swallow_events", "refuse", "unsupported", "no_memory",
-                                     "no_stopped_event", "no_stamps", "short_ring", "drop"};
+                                     "no_stopped_event", "no_stamps", "short_ring", "drop", "slow_to_wake"};
 enum { NO_CAMERA, UNPLUGGED, UNPLUG_AT, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, UNSUPPORTED,
-       NO_MEMORY, NO_STOPPED_EVENT, NO_STAMPS, SHORT_RING, DROP, N_FAULTS };
+       NO_MEMORY, NO_STOPPED_EVENT, NO_STAMPS, SHORT_RING, DROP, SLOW_TO_WAKE, N_FAULTS };
 
 enum { MAX_PULSES = 4096, MAX_HANDLES = 4096, MAX_CALLS = 64 };
 static char handles[MAX_HANDLES]; /* their addresses are the handles; none is given out twice, so that old ones are known */
@@ -127,6 +127,16 @@ static double get(int p) {
     case COEFF: return counts_photons() ? 1 : fake.props[p].value;
     case OFFSET: return counts_photons() ? 0 : fake.props[p].value;
     default: return fake.props[p].value;
+    }
+}
+
+static double highest(int p) { /* strict: a position leaves less room for the size, and the other way round */
+    switch (p) {
+    case HPOS: return fake.sensor_cols - fake.props[HSIZE].value;
+    case VPOS: return fake.sensor_rows - fake.props[VSIZE].value;
+    case HSIZE: return fake.sensor_cols - fake.props[HPOS].value;
+    case VSIZE: return fake.sensor_rows - fake.props[VPOS].value;
+    default: return fake.props[p].max;
     }
 }
 

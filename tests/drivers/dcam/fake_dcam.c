@@ -77,7 +77,7 @@ int32_t dcamprop_getattr(void *h, DCAMPROP_ATTR *a) {
     a->attribute = (int32_t)((ranged ? 0xC0000000u : 0u) | 0x10000u | (uint32_t)q->access | (uint32_t)q->type);
     a->iUnit = p == TEMPERATURE ? 2 : (q->type & 15) == REAL; /* Celsius, second */
     a->valuemin = p == EXPOSURETIME && slow() ? 172.8e-6 : q->min;
-    a->valuemax = q->max; a->valuestep = q->step; a->valuedefault = q->initial;
+    a->valuemax = highest(p); a->valuestep = q->step; a->valuedefault = q->initial;
     return leave(SUCCESS);
 }
 
@@ -104,8 +104,8 @@ int32_t dcamprop_setvalue(void *h, int32_t id, double value) {
         if (!legal || (p == DEFECT && value == 2 && counts_photons())) return leave(INVALIDVALUE);
     } else {
         double min = p == EXPOSURETIME && slow() ? 172.8e-6 : q->min;
-        if (!(q->type & ROUNDS) && (value < min || value > q->max)) return leave(OUTOFRANGE);
-        if (q->type & ROUNDS) value = fmin(fmax(ceil(value / q->step - 1e-6) * q->step, min), q->max);
+        if (!(q->type & ROUNDS) && (value < min || value > highest(p))) return leave(OUTOFRANGE);
+        if (q->type & ROUNDS) value = fmin(fmax(ceil(value / q->step - 1e-6) * q->step, min), highest(p));
     }
     double before = q->value;
     q->value = value;
@@ -165,7 +165,7 @@ int32_t dcambuf_lockframe(void *h, DCAMBUF_FRAME *f) {
     for (; fake.faults[OVERRUN_IN_LOCK] > 0; fake.faults[OVERRUN_IN_LOCK]--) {
         fake.last_edge += get(MININTERVAL);
         expose(fake.last_edge, get(EXPOSURETIME));
-        deliver();
+        if (fake.n_flying) deliver(); /* it may have been lost on its way */
     }
     return leave(SUCCESS);
 }
@@ -259,6 +259,11 @@ int32_t dcamwait_start(void *w, DCAMWAIT_START *p) {
             if (fake.virtual_now > 0) fake.virtual_now = fmax(until, fake.virtual_now);
             else pthread_cond_timedwait(&changed, &lock, &t);
         }
+    }
+    for (int ms = answer == TIMEOUT ? 0 : fake.faults[SLOW_TO_WAKE]; ms > 0; ms--) { /* woken, but still in here */
+        pthread_mutex_unlock(&lock);
+        nanosleep(&(struct timespec){0, 1000000}, NULL);
+        pthread_mutex_lock(&lock);
     }
     fake.waiters--;
     return leave(answer);

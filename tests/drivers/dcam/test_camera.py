@@ -10,6 +10,7 @@ import pytest
 
 from drivers.dcam.abi import DcamError
 from drivers.dcam.camera import DcamCamera
+from drivers.dcam.codes import Error
 from drivers.dcam.options import DcamOptions
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import Camera, CameraSettings, TriggerSource
@@ -195,6 +196,7 @@ def test_disarm_ends_a_wait_in_another_thread(waiting, world) -> None:
 
 def test_close_waits_for_the_thread_that_is_in_the_library(waiting, world) -> None:
     camera, frame = waiting
+    world.fault("slow_to_wake", 50)  # ms; the fake refuses to close a wait handle that somebody waits with
     camera.close()
     with pytest.raises(DeviceError, match="is closed"):
         frame.result(timeout=5.0)
@@ -252,6 +254,15 @@ def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera
     with pytest.raises(DeviceError, match=r"ended by itself \(state READY\)"):
         camera.next_frame(1.0)
     camera.disarm()  # the library answers "nothing to do", which is no failure
+
+
+def test_a_ring_is_freed_though_the_stop_fails(camera: DcamCamera, world) -> None:
+    camera.arm(1)
+    world.stop()  # by itself, so that the ring can be freed
+    world.fail("dcamcap_stop", Error.FAILWRITECAMERA)
+    with pytest.raises(DcamError, match="dcamcap_stop"):
+        camera.disarm()
+    assert world.live == 3  # session, camera, wait
 
 
 def test_unplugged_in_a_scan(camera: DcamCamera, world) -> None:

@@ -15,7 +15,7 @@ from tests.drivers.dcam.fake import READY_MADE, build, compiler
 FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
-SUITE = ("test_abi.py", "test_camera.py", "test_options.py", "test_conformance.py")
+SUITE = ("test_abi.py", "test_camera.py", "test_options.py", "test_faults.py", "test_ring_law.py")
 OVERFLOW = """
 import sys
 from pathlib import Path
@@ -59,7 +59,7 @@ def test_the_suite_passes_under_sanitisers(environment: dict[str, str]) -> None:
     assert ran.returncode == 0, (ran.stdout + ran.stderr)[-4000:]
     assert "ERROR: AddressSanitizer" not in ran.stderr
     passed = re.search(r"(\d+) passed", ran.stdout)
-    assert passed is not None and int(passed[1]) > 80
+    assert passed is not None and int(passed[1]) > 120
 
 
 def test_the_sanitiser_sees_what_it_should(environment: dict[str, str]) -> None:
