@@ -32,8 +32,8 @@ class ZaberStage:
     train away and leaves speed, acceleration and checksums as they were found.
 
     `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
-    move against an armed train that has begun ends the train: the controller counts distance both ways. With `chained`
-    false `arm` itself turns the stage to one step before the first pulse and waits for it.
+    move against a train under way ends the train: the controller counts distance both ways. With `pulses.chained` false
+    `arm` itself turns the stage to one step before the first pulse and waits; it then speeds up over the first pulses.
 
     Args:
         url: what pyserial opens; a controller's LAN port is "socket://host:55550".
@@ -231,7 +231,7 @@ class ZaberStage:
                 advice="Move to before the first pulse, then arm",
                 state="Nothing has moved and this train is not armed",
             )
-        self._pulses.arm(train, self._stand_at)
+        self._pulses.arm(train, counts, self._stand_at)
 
     def disarm(self) -> None:
         """Legal in every state. The output is put at rest."""
@@ -298,7 +298,7 @@ class ZaberStage:
 
     def _start(self, status: AxisStatus, target: int, native: int) -> None:
         """Begin a move from standing."""
-        self._pulses.end_if_against(target - status.counts)
+        self._pulses.before_move(status.counts, target)
         if status.flags:
             self._axis.forget_flags()
         self._axis.set("maxspeed", native)
@@ -306,11 +306,10 @@ class ZaberStage:
         self._target, self._homing = target, False
 
     def _stand_at(self, counts: int) -> None:
-        """Turn there and wait, if it is not there."""
-        way = abs(counts - self._axis.standing("arming").counts)
-        if way:
-            self.start_move(self.to_angle(counts), self._limits.max_speed)
-            self.wait(2 * self.to_angle(way) / self._limits.max_speed + STANDING_IN_PLACE)
+        """Turn there and wait."""
+        way = abs(self.to_angle(counts - self._axis.standing("arming").counts))
+        self.start_move(self.to_angle(counts), self._limits.max_speed)
+        self.wait(2 * way / self._limits.max_speed + STANDING_IN_PLACE)
 
     def _check_turn_and_travel(self) -> None:
         own = self._axis.cycle()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceRefused
-from drivers.serial_line import Framing, Probe, SerialLine
+from drivers.serial_line import Probe, SerialLine
 from drivers.stages.zaber_packet import (
     REASONS,
     UNREFERENCED,
@@ -127,7 +127,6 @@ class ZaberAxis:
             timeout=timeout,
             baudrate=baudrate,
             unsolicited=passed_over_form(STOP_ID),
-            framing=Framing(command_end=b"\n", line_end=b"\r\n"),
             check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
             transcript=transcript,
         )

@@ -129,9 +129,9 @@ def reply_form(device: int, axis: int, identity: int, data: str) -> str:
 
 
 def passed_over_form(identity: int) -> str:
-    """Regular expression of lines that no command waits for: alerts, information, an echo of what was sent, and replies
-    to commands with this id."""
-    return rf"[!#/].*|@\d\d \d {identity:02d} .*"
+    """Regular expression of lines that no command waits for: alerts, information, an echo of what was sent, empty ones,
+    and replies to commands with this id."""
+    return rf"|[!#/].*|@\d\d \d {identity:02d} .*"
 
 
 def reply_of(match: re.Match[str]) -> Reply:

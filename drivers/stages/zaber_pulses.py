@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.errors import DeviceError, DeviceRefused
+from drivers.errors import DeviceRefused
 from drivers.protocols import TriggerTrain
 from drivers.stages.zaber_axis import ZaberAxis
-from drivers.stages.zaber_train import PulseSettings, remaining, set_up
+from drivers.stages.zaber_train import PulseSettings, begun, remaining, set_up
 
 ADVICE = (
     "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
@@ -28,14 +28,19 @@ class ZaberPulses:
         self._train: TriggerTrain | None = None
         self._touched = True
 
-    def arm(self, train: TriggerTrain, stand_at: Callable[[int], None]) -> None:
-        """Set up the triggers for a train and enable the first; `stand_at(counts)` brings the stage to a place."""
-        setup = set_up(self.settings, train, self._axis.number)
+    def arm(self, train: TriggerTrain, counts: int, stand_at: Callable[[int], None]) -> None:
+        """Set up the triggers for a train and enable the first one.
+
+        Args:
+            counts: where the stage stands.
+            stand_at: brings it to another place.
+        """
+        setup = set_up(self.settings, train, self._axis.number, counts)
         self._train, self._touched = None, True
         try:
             for command in setup.commands:
                 self._axis.ask(command)
-            if setup.stand is not None:
+            if setup.stand not in (None, counts):
                 stand_at(setup.stand)
             self._axis.ask(setup.enable)
         except DeviceRefused as problem:
@@ -60,22 +65,27 @@ class ZaberPulses:
         """Pulses still to come."""
         if self._train is None:
             return 0
-        reply = self._axis.ask("trigger show")
-        try:
-            return remaining(self.settings, self._train, reply.data)
-        except ValueError as problem:
-            raise DeviceError(
-                self._name,
-                str(problem),
-                reply=reply.raw,
-                expected="a state for each trigger",
-                state="The train stays armed",
-            ) from problem
+        return remaining(self.settings, self._train, self._shown())
 
-    def end_if_against(self, way: int) -> None:
-        """Take a train away that has begun, if a move by `way` counts goes against it."""
-        if self._train is not None and self._train.interval * way < 0 and self.remaining() < self._train.n:
+    def before_move(self, counts: int, target: int) -> None:
+        """Keep a train right when a move from `counts` goes against it: distance counts both ways. One that is under
+        way ends; one whose first pulse is still to come is set up anew, or ends where that takes standing elsewhere."""
+        train = self._train
+        if train is None or train.interval * (target - counts) >= 0 or not begun(self.settings, self._shown()):
+            return
+        if self.settings.chained and self.remaining() == train.n:
+            self.arm(train, counts, _nowhere)
+        else:
             self.disarm()
+
+    def _shown(self) -> str:
+        """What `trigger show` tells, for this many triggers at least."""
+        needed = max(self.settings.starter, self.settings.repeater)
+        return self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").data
+
+
+def _nowhere(counts: int) -> None:
+    """A chained train is set up wherever the stage stands."""
 
 
 class ZaberOutput:

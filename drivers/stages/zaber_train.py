@@ -1,8 +1,8 @@
-"""A pulse train as Zaber triggers: one gives the first pulse at its count, and from there another the rest.
+"""A pulse train as Zaber triggers: one fires once, at the right place, and enables another that counts distance there.
 
-The starter fires once, when the position passes the first pulse. It gives that pulse and enables the repeater, which
-counts distance from there. So the stage may stand anywhere before the train, and the time that firmware needs to act
-(0.1 to 1 ms, undocumented) delays all pulses alike: they stay equally spaced. Where an action cannot enable a trigger
+The starter fires one step before the first pulse, the repeater then each step: so the stage may stand anywhere before
+the train, and the time that firmware needs to act (0.1 to 1 ms, undocumented) delays all pulses alike. Where the stage
+stands within that step already, the starter gives the first pulse itself. Where an action cannot enable a trigger
 (`chained` false), the repeater alone gives the train; then the stage must stand one step before the first pulse.
 """
 
@@ -83,13 +83,11 @@ class TriggerSetup:
         commands: set both triggers up, with the output at rest; nothing is enabled.
         enable: the last command; from then on the train is armed.
         stand: count where the stage must stand when that is sent; None where any before the first pulse does.
-        fires: of the repeater; half of them, rounded down, are pulses where it toggles.
     """
 
     commands: tuple[str, ...]
     enable: str
     stand: int | None
-    fires: int
 
 
 def refusal(settings: PulseSettings, train: TriggerTrain, full_speed: float) -> str:
@@ -111,14 +109,20 @@ def step_of(settings: PulseSettings, train: TriggerTrain) -> int:
     return interval if settings.width is not None else interval // 2
 
 
-def set_up(settings: PulseSettings, train: TriggerTrain, axis: int) -> TriggerSetup:
-    """The triggers for a train that can be emitted."""
-    sign, step, toggles = (1 if train.interval > 0 else -1), step_of(settings, train), settings.width is None
+def set_up(settings: PulseSettings, train: TriggerTrain, axis: int, counts: int) -> TriggerSetup:
+    """The triggers for a train that can be emitted, with the stage standing at `counts`, before the first pulse."""
+    sign, step = (1 if train.interval > 0 else -1), step_of(settings, train)
     starter, repeater = f"trigger {settings.starter}", f"trigger {settings.repeater}"
     distance, position = ("encoder dist", "encoder.pos") if settings.measured else ("dist", "pos")
-    fires = 2 * train.n if toggles else train.n
-    first_by_starter = settings.chained and not settings.fires_when_enabled
-    fires -= first_by_starter
+    before = train.start - sign * step
+    fires = 2 * train.n if settings.width is None else train.n
+    by_starter = False
+    if settings.fires_when_enabled:
+        begin = train.start
+    elif sign * (before - counts) > 0:
+        begin = before
+    else:
+        begin, by_starter, fires = train.start, True, fires - 1
     commands = [
         *settings.disable,
         settings.rest,
@@ -127,14 +131,19 @@ def set_up(settings: PulseSettings, train: TriggerTrain, axis: int) -> TriggerSe
         f"{repeater} action b none",
     ]
     if not settings.chained:
-        return TriggerSetup(tuple(commands), f"{repeater} enable {fires}", train.start - sign * step, fires)
-    goes_on = f"trigger {settings.repeater} enable {fires}" if fires else "none"
+        fires += by_starter
+        return TriggerSetup(tuple(commands), f"{repeater} enable {fires}", before)
     commands += [
-        f"{starter} when {axis} {position} {'>=' if sign > 0 else '<='} {train.start}",
-        f"{starter} action a {settings.pulse if first_by_starter else 'none'}",
-        f"{starter} action b {goes_on}",
+        f"{starter} when {axis} {position} {'>=' if sign > 0 else '<='} {begin}",
+        f"{starter} action a {settings.pulse if by_starter else 'none'}",
+        f"{starter} action b {f'{repeater} enable {fires}' if fires else 'none'}",
     ]
-    return TriggerSetup(tuple(commands), f"{starter} enable 1", None, fires)
+    return TriggerSetup(tuple(commands), f"{starter} enable 1", None)
+
+
+def begun(settings: PulseSettings, shown: str) -> bool:
+    """Distance is being counted, as `trigger show` tells."""
+    return not settings.chained or _state(shown, settings.starter) == "d"
 
 
 def remaining(settings: PulseSettings, train: TriggerTrain, shown: str) -> int:
@@ -143,11 +152,15 @@ def remaining(settings: PulseSettings, train: TriggerTrain, shown: str) -> int:
     Raises:
         ValueError: it does not tell of these triggers.
     """
-    states = shown.split()
-    if max(settings.starter, settings.repeater) > len(states):
-        raise ValueError(f"{shown!r} does not tell of triggers {settings.starter} and {settings.repeater}")
-    if settings.chained and states[settings.starter - 1] != "d":
+    if not begun(settings, shown):
         return train.n
-    left = states[settings.repeater - 1]
+    left = _state(shown, settings.repeater)
     fires = int(left) if left.isdigit() else 0
     return fires // 2 if settings.width is None else fires
+
+
+def _state(shown: str, number: int) -> str:
+    states = shown.split()
+    if number > len(states):
+        raise ValueError(f"{shown!r} does not tell of trigger {number}")
+    return states[number - 1]

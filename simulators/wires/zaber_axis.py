@@ -127,13 +127,13 @@ class ZaberAxis:
         elif move.direction * (move.target - last) > 0:  # otherwise it stands by itself before that
             braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
             self._moves[-1] = TrapezoidMove(braked.begin, braked.start, last, braked.phases)
-        self._at_end = self._interrupted
+        self._interrupt()
 
     def halt(self, now: float) -> None:
         """Stand at once, at the last microstep done."""
         if self.moving(now):
             self._moves[-1] = self.move.halted(self.position(now))
-            self._at_end = self._interrupted
+            self._interrupt()
 
     def _ready(self, now: float) -> None:
         if self.moving(now):
@@ -156,5 +156,7 @@ class ZaberAxis:
     def _found_home(self) -> None:
         self.homed = True
 
-    def _interrupted(self) -> None:
+    def _interrupt(self) -> None:
+        """The flag stands at once, also in the reply to what interrupts: the vendor's library clears it there."""
+        self._at_end = self._nothing
         self.flags.add("NI")
