@@ -10,6 +10,7 @@ from beamline.config_section import Section
 from drivers.beam_monitor import pattern_problem
 from drivers.beam_monitor_page import url_problem
 from drivers.beam_monitor_serial import PATTERN, QUERY
+from drivers.stages.zaber_train import PulseSettings
 
 
 class _Stage(Section):
@@ -59,6 +60,12 @@ class PM16CStageConfig(_Stage):
     home_speed_deg_s: PositiveFloat | None = None
     """For the search; null: a tenth of max_speed_deg_s."""
 
+    @model_validator(mode="after")
+    def _polarity_is_fixed(self) -> Self:
+        if not self.active_high:
+            raise ValueError("active_high cannot be false: the PM16C's trigger output has one polarity")
+        return self
+
 
 class PiGcsStageConfig(_Stage):
     """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863."""
@@ -68,6 +75,22 @@ class PiGcsStageConfig(_Stage):
     trigger_line: PositiveInt = 1
     """Digital output that the trigger pulses come from."""
     baudrate: PositiveInt = 115_200
+    reference: Literal["switch", "negative_limit", "positive_limit"] = "switch"
+    """What the search for the reference goes to."""
+    first_pulse: Literal["at_threshold", "step_after", "grid"] = "at_threshold"
+    """Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md)."""
+    firmware_pulse_s: PositiveFloat = 50e-6
+    """How long the firmware holds a pulse."""
+    tolerance_counts: Annotated[int, Field(ge=0)] = 10
+    """From the target, within which a move has arrived."""
+    settle_s: Annotated[float, Field(ge=0)] = 1.0
+    """After a move, in which the controller may still bring the axis on target."""
+
+    @model_validator(mode="after")
+    def _width_is_the_firmware_s(self) -> Self:
+        if self.pulse_width_s is not None:
+            raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
+        return self
 
 
 class ZaberStageConfig(_Stage):
@@ -79,6 +102,39 @@ class ZaberStageConfig(_Stage):
     output: PositiveInt = 1
     """Digital output that the trigger pulses come from."""
     baudrate: PositiveInt = 115_200
+    toggle: bool = False
+    """Each fire toggles the output (firmware without `schedule`): every second one is a pulse, intervals are even."""
+    speed_unit: PositiveFloat = 1.6384
+    """Native speed per microstep/s; the vendor's convention, from memory."""
+    measured: bool = False
+    """Pulses by the encoder, not by the commanded position."""
+    chained: bool = True
+    """An action may enable another trigger; false: arming turns the stage to one step before the first pulse."""
+    fires_when_enabled: bool = False
+    """A distance trigger fires where it is enabled, too."""
+    starter: PositiveInt = 1
+    repeater: PositiveInt = 2
+    """The numbers of the two triggers used."""
+    shortest_s: PositiveFloat = 1e-3
+    """Between two fires at full speed."""
+
+    @model_validator(mode="after")
+    def _possible_pulses(self) -> Self:
+        width = self.pulse_width_s
+        if self.toggle and width is not None:
+            raise ValueError("a toggled output has no pulse width of its own; set pulse_width_s null or toggle false")
+        try:
+            PulseSettings(
+                self.output,
+                1e-3 if width is None else width,
+                chained=self.chained,
+                fires_when_enabled=self.fires_when_enabled,
+                starter=self.starter,
+                repeater=self.repeater,
+            )
+        except ValueError as problem:
+            raise ValueError(str(problem)) from None
+        return self
 
 
 StageConfig = PM16CStageConfig | PiGcsStageConfig | ZaberStageConfig

@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypedDict
+from typing import TYPE_CHECKING, Self
 from uuid import uuid4
 
 import click
@@ -23,12 +23,16 @@ from beamline.config_devices import (
     DcamOrca,
     ElectrometerConfig,
     NoBeamMonitor,
+    PiGcsStageConfig,
     PM16CStageConfig,
     RingCurrentConfig,
     StageConfig,
+    StageOutputShutter,
+    ZaberStageConfig,
 )
 from beamline.config_models import Simulation, Speed
 from beamline.errors import ConfigError
+from beamline.stages import make_stage, output_of, stage_limits
 from drivers import orca_quest
 from drivers.beam_monitor import TextBeamMonitor, TextSource
 from drivers.beam_monitor_page import PageSource
@@ -42,11 +46,11 @@ from drivers.protocols import (
     CameraTiming,
     Devices,
     RotationStage,
+    Shutter,
     StageLimits,
     TriggerSource,
 )
-from drivers.stages.pm16c import PM16CStage
-from drivers.stages.pm16c import limits_of as limits_of_pm16c
+from drivers.shutter import OutputShutter
 
 if TYPE_CHECKING:
     from drivers.dcam.options import DcamOptions
@@ -55,27 +59,6 @@ if TYPE_CHECKING:
     from simulators.scene import Scene
     from simulators.serial_url import Wire
     from simulators.trigger_line import TriggerLine
-
-
-class _Figures(TypedDict):
-    """What a stage is limited to, as every driver takes it: counts, rad/s, rad/s², rad."""
-
-    counts_per_turn: int
-    max_speed: float
-    acceleration: float
-    low: float
-    high: float
-
-
-class _Wiring(TypedDict):
-    """How a stage is connected, as every driver takes it; s."""
-
-    clock: Clock
-    timeout: float
-    baudrate: int
-    pulse_width: float | None
-    active_high: bool
-    transcript: Path | None
 
 
 @dataclass(frozen=True)
@@ -143,7 +126,7 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     if config.simulation is not None:
         _scene(config)
     try:
-        limits = _limits(stage)
+        limits = stage_limits(stage)
     except ValueError as error:
         raise ConfigError(f"devices.stage: {error}. Nothing was started.") from None
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
@@ -219,14 +202,24 @@ def _instrument(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> De
     settings = config.devices.camera
     if not isinstance(settings, DcamOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
-    stage = _stage(config.devices.stage, config.devices.stage.port, clock)
+    stage = make_stage(config.devices.stage, config.devices.stage.port, clock)
     opened.callback(stage.close)
     camera = DcamCamera(_path(settings.library), settings.index, clock=clock, options=_options(settings))
     opened.callback(camera.close)
     if settings.cool_s:
         click.echo(f"Waiting for a cold sensor, at most {settings.cool_s:g} s.", err=True)
         camera.wait_until_cold(settings.cool_s)
-    return Devices(stage, camera, ManualShutter(ask), ManualSampleMover(ask))
+    shutter: Shutter
+    if isinstance(config.devices.shutter, StageOutputShutter):
+        shutter = _output_shutter(config, config.devices.shutter, stage, clock)
+    else:
+        shutter = ManualShutter(ask)
+    return Devices(stage, camera, shutter, ManualSampleMover(ask))
+
+
+def _output_shutter(config: Config, shutter: StageOutputShutter, stage: RotationStage, clock: Clock) -> OutputShutter:
+    output = output_of(config.devices.stage, stage, shutter.output)
+    return OutputShutter(output, clock, open_high=shutter.open_high, settle=shutter.settle_s)
 
 
 def _options(camera: DcamOrca) -> DcamOptions:
@@ -250,30 +243,67 @@ def _simulated(
 ) -> tuple[Devices, Callable[[Grid], Volume]]:
     from simulators.camera import SimulatedOrcaQuest
     from simulators.serial_url import register
-    from simulators.shutter import SimulatedSampleMover, SimulatedShutter
+    from simulators.shutter import BeamGate, SimulatedSampleMover, SimulatedShutter, WiredShutter
     from simulators.trigger_line import TriggerLine
 
     scene = _scene(config)
     line = TriggerLine(clock)
-    settings = config.devices.stage
+    settings, wanted = config.devices.stage, config.devices.shutter
+    wire, high = _wire(settings, clock, line)
     # A name of its own for every bench: two in one process must not share a controller.
-    stage = _stage(settings, register(f"{settings.kind}-{uuid4().hex}", _wire(settings, clock, line)), clock)
+    stage = make_stage(settings, register(f"{settings.kind}-{uuid4().hex}", wire), clock)
     opened.callback(stage.close)
-    shutter, sample = SimulatedShutter(), SimulatedSampleMover()
+    shutter: Shutter = SimulatedShutter()
+    blade: BeamGate = shutter
+    if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
+        output = wanted.output
+        shutter = _output_shutter(config, wanted, stage, clock)
+        blade = WiredShutter(lambda: high(output), wanted.open_high)
+    sample = SimulatedSampleMover()
     pitch = config.optics.pixel_size_um * 1e-3
-    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, shutter, sample, pixel_pitch=pitch)
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
     opened.callback(camera.close)
     return Devices(stage, camera, shutter, sample), _truth(scene, camera)
 
 
-def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> Wire:
-    """The simulated controller, set up as the configuration says of the real one."""
+def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, Callable[[int], bool]]:
+    """The simulated controller, built as the configuration says of the real one, and the levels of its outputs."""
+    counts = config.counts_per_turn
     match config:
         case PM16CStageConfig():
             from simulators.wires.pm16c import PM16CController
 
-            return PM16CController(clock, line, channel=config.channel, counts_per_turn=config.counts_per_turn)
-    raise ConfigError(f"devices.stage: {config.kind} has no simulated counterpart yet")
+            return PM16CController(clock, line, channel=config.channel, counts_per_turn=counts), lambda number: False
+        case PiGcsStageConfig():
+            from simulators.wires.pi_gcs import PiGcsController
+            from simulators.wires.pi_gcs_axis import Build
+            from simulators.wires.pi_gcs_trigger import FirstPulse
+
+            build = Build(
+                counts_per_turn=counts,
+                low=config.low_deg - 1,
+                high=config.high_deg + 1,
+                first_pulse=FirstPulse(config.first_pulse),
+                max_velocity=config.max_speed_deg_s,
+                max_acceleration=config.acceleration_deg_s2,
+            )
+            pi = PiGcsController(clock, line, axis=config.axis, output=config.trigger_line, build=build)
+            return pi, lambda number: pi.box.levels.get(number, False)
+        case ZaberStageConfig():
+            from simulators.wires.zaber import ZaberController
+
+            zaber = ZaberController(
+                clock,
+                line,
+                counts_per_turn=counts,
+                output=config.output,
+                active_high=config.active_high,
+                address=config.device,
+                can_schedule=not config.toggle,
+                can_chain=config.chained,
+                fires_when_enabled=config.fires_when_enabled,
+            )
+            return zaber, lambda number: bool(zaber.device.triggers.outputs[number - 1])
 
 
 def _electrometer(clock: Clock, end: bytes) -> str:
@@ -291,49 +321,6 @@ def _scene(config: Config) -> Scene:
         return load_scene(scene_mapping(config))
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
-
-
-def _stage(config: StageConfig, url: str, clock: Clock) -> RotationStage:
-    """The driver for the configured controller at `url`; each is imported where it is asked for."""
-    wiring, figures = _wiring(config, clock), _figures(config)
-    match config:
-        case PM16CStageConfig():
-            home, home_speed = _radians(config.home_deg), _radians(config.home_speed_deg_s)
-            return PM16CStage(url, channel=config.channel, home=home, home_speed=home_speed, **wiring, **figures)
-    raise ConfigError(f"devices.stage: {config.kind} has no driver yet")
-
-
-def _limits(config: StageConfig) -> StageLimits:
-    """What the driver will say of the stage, as far as that is known without it. Raises ValueError."""
-    figures = _figures(config)
-    if isinstance(config, PM16CStageConfig):
-        return limits_of_pm16c(**figures)
-    return StageLimits(**figures, trigger_output=True)
-
-
-def _figures(config: StageConfig) -> _Figures:
-    return {
-        "counts_per_turn": config.counts_per_turn,
-        "max_speed": math.radians(config.max_speed_deg_s),
-        "acceleration": math.radians(config.acceleration_deg_s2),
-        "low": math.radians(config.low_deg),
-        "high": math.radians(config.high_deg),
-    }
-
-
-def _wiring(config: StageConfig, clock: Clock) -> _Wiring:
-    return {
-        "clock": clock,
-        "timeout": config.timeout_s,
-        "baudrate": config.baudrate,
-        "pulse_width": config.pulse_width_s,
-        "active_high": config.active_high,
-        "transcript": _path(config.transcript),
-    }
-
-
-def _radians(degrees: float | None) -> float | None:
-    return None if degrees is None else math.radians(degrees)
 
 
 def _path(text: str | None) -> Path | None:

@@ -162,7 +162,8 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     # A pulse generator's speed is a whole number of counts a second, so the period becomes one that this gives.
     rate = max(1, round(flight.interval / plan.period))
     speed, period = rate * abs(scale.per_count), flight.interval / rate
-    taxi = taxi_angle(speed, stage.acceleration, flight.step * abs(scale.per_count))
+    step, before = (n * abs(scale.per_count) for n in (flight.step, stage.run_up * flight.interval + flight.step))
+    taxi = max(taxi_angle(speed, stage.acceleration, step), before)
     return Block(
         FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, period, flight.trains, speed=speed, taxi=taxi
     )

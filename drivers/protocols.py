@@ -20,6 +20,7 @@ class StageLimits:
         max_speed, acceleration: rad/s, rad/s².
         low, high: soft limits in radians.
         trigger_output: it can emit position-synchronised trigger pulses.
+        run_up: intervals of a train before its first pulse within which the stage cannot be armed.
     """
 
     counts_per_turn: int
@@ -28,6 +29,7 @@ class StageLimits:
     low: float
     high: float
     trigger_output: bool
+    run_up: int = 0
 
 
 @dataclass(frozen=True)

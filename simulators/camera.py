@@ -17,13 +17,13 @@ import numpy as np
 from drivers import orca_quest
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, Shutter, TriggerSource
+from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.effects.chain import Shot
 from simulators.exposure import expose
 from simulators.phantom import Detector
 from simulators.scene import Scene
 from simulators.sensor import CONVERSION, OFFSET, READ_NOISE
-from simulators.shutter import SimulatedSampleMover
+from simulators.shutter import BeamGate, SimulatedSampleMover
 from simulators.trigger_line import TriggerLine
 
 POLL = 0.02
@@ -70,7 +70,7 @@ class SimulatedOrcaQuest:
         line: TriggerLine,
         clock: Clock,
         seed: int,
-        shutter: Shutter,
+        shutter: BeamGate,
         sample: SimulatedSampleMover,
         *,
         pixel_pitch: float = orca_quest.PITCH_MM,

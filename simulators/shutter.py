@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Protocol
+
+
+class BeamGate(Protocol):
+    """What lets the beam through or not: all that a simulated camera asks of a shutter."""
+
+    def is_open(self) -> bool: ...
+
 
 class SimulatedShutter:
     """Implements `drivers.protocols.Shutter`; it starts closed, as a beamline does."""
@@ -18,6 +27,16 @@ class SimulatedShutter:
 
     def is_open(self) -> bool:
         return self._open
+
+
+class WiredShutter:
+    """A shutter that follows the level of a cable; the camera looks at it, the driver at the cable's other end."""
+
+    def __init__(self, high: Callable[[], bool], open_high: bool = True) -> None:
+        self._high, self._open_high = high, open_high
+
+    def is_open(self) -> bool:
+        return self._high() is self._open_high
 
 
 class SimulatedSampleMover:

@@ -44,7 +44,7 @@ def limits_of(
     """
     if not (counts_per_turn > 0 and math.degrees(max_speed) >= SLOWEST and math.degrees(acceleration) >= SLOWEST):
         raise ValueError(f"counts a turn, speed and acceleration must be positive, from {SLOWEST:g} deg/s on")
-    run_up = 2 if first_pulse is FirstPulse.STEP_AFTER else 1
+    run_up = 1 if first_pulse is FirstPulse.STEP_AFTER else 0
     return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True, run_up=run_up)
 
 

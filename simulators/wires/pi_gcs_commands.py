@@ -22,6 +22,8 @@ class PiGcsBox:
 
     def __init__(self, name: str, axis: GcsAxis, outputs: dict[int, Output]) -> None:
         self.name, self.axis, self.outputs = name, axis, outputs
+        self.levels = dict.fromkeys(outputs, False)
+        """As DIO has put the output lines."""
 
     def axis_of(self, arguments: list[str], more: int = 0) -> list[str]:
         """The arguments after the axis' name; it may be left out where nothing else follows."""
@@ -208,6 +210,13 @@ def _switch_trigger(box: PiGcsBox, arguments: list[str]) -> None:
     box.axis.switch_trigger(output, bool(_number(value, 0, 1)))
 
 
+def _put_output(box: PiGcsBox, arguments: list[str]) -> None:
+    _, (level,) = box.output_of(arguments, 1)
+    if level not in ("0", "1"):
+        raise GcsError(17)
+    box.levels[int(arguments[0])] = level == "1"
+
+
 def _trigger_is_on(box: PiGcsBox, arguments: list[str]) -> list[str]:
     if not arguments:
         return [f"{number}={output.on:d}" for number, output in box.outputs.items()]
@@ -257,6 +266,7 @@ COMMANDS: dict[str, Action] = {
     "HLT": _brake,
     "STP": _halt,
     "TIO?": lambda box, arguments: [f"I={len(box.outputs)}", f"O={len(box.outputs)}"],
+    "DIO": _put_output,
     "CTO": _set_trigger,
     "CTO?": _tell_trigger,
     "TRO": _switch_trigger,

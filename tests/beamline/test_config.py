@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from beamline import config
-from beamline.config_devices import DcamOrca, SimulatedOrca, ZaberStageConfig
+from beamline.config_devices import DcamOrca, PiGcsStageConfig, SimulatedOrca, ZaberStageConfig
 from beamline.config_models import Config
 from beamline.errors import ConfigError
 from beamline.plan import Mode, Place
@@ -418,3 +418,35 @@ def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
     with pytest.raises(ConfigError, match=r"pulse_width_s \(0\.001\)"):
         load(path, level, "devices.stage.pulse_width_s=0.001")
     load(path, level, "devices.stage.pulse_width_s=0.05")
+
+
+@pytest.mark.parametrize(("model", "kind"), [(PiGcsStageConfig, "pi_gcs"), (ZaberStageConfig, "zaber")])
+@pytest.mark.parametrize("name", ["simulated", "instrument"])
+def test_a_template_names_every_key_of_the_other_stages(name: str, model: type[BaseModel], kind: str) -> None:
+    """With its default, so that the comment cannot drift from the model."""
+    text = (config.config_folder() / f"{name}.yaml").read_text("utf-8")
+    comment = text[text.index(f"# stage: {{kind: {kind}") :]
+    comment = comment[: re.search(r"\n  # (?!  )|\n   ", comment).start()]  # type: ignore[union-attr]
+    here = dict(re.findall(r"(\w+): ([^\s,}]+)", comment))
+    below = yaml.safe_load(text)["devices"]["stage"]
+    for key, field in model.model_fields.items():
+        if key in ("kind", "port"):
+            continue
+        assert key in here or key in below, key
+        if key in here:
+            assert yaml.safe_load(here[key]) == field.default, key
+    assert here.keys() - {"stage", "kind", "port"} <= model.model_fields.keys()
+
+
+def test_what_a_controller_cannot_is_refused_at_once(tmp_path: Path) -> None:
+    for stage, message in (
+        ("{kind: pm16c, port: 'sim://pm16c', active_high: false", "the PM16C's trigger output has one polarity"),
+        ("{kind: pi_gcs, port: 'sim://pi_gcs', pulse_width_s: 1.0e-3", "the firmware of a pi_gcs controller fixes it"),
+        ("{kind: zaber, port: 'sim://zaber', pulse_width_s: 1.5e-3", "it is whole milliseconds"),
+        (
+            "{kind: zaber, port: 'sim://zaber', pulse_width_s: 1.0e-3, toggle: true",
+            "a toggled output has no pulse width",
+        ),
+        ("{kind: zaber, port: 'sim://zaber', starter: 2", "two different triggers"),
+    ):
+        assert message in faults(tmp_path, GOOD.replace('{kind: pm16c, port: "sim://pm16c"', stage))

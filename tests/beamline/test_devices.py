@@ -17,6 +17,7 @@ from beamline.config_models import Config
 from beamline.dry_run import dry_run
 from beamline.errors import ConfigError
 from beamline.plan import Block
+from beamline.stages import output_of
 from beamline.timeline import block_seconds, pass_ends
 from drivers.clock import SystemClock
 from drivers.dcam.options import DcamOptions
@@ -70,6 +71,77 @@ def fly(bench: devices.Bench, block: Block, settings: Config) -> tuple[list[int]
         stage.wait(60.0)
     camera.disarm()
     return stamps, np.array(images)
+
+
+COMMON = "counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60, low_deg: -20"
+STAGES = {
+    "pm16c": f"{{kind: pm16c, port: 'sim://pm16c', channel: 3, {COMMON}}}",
+    "pm16c, 10 us": f"{{kind: pm16c, port: 'sim://pm16c', pulse_width_s: 1.0e-5, {COMMON}}}",
+    "pi_gcs": f"{{kind: pi_gcs, port: 'sim://pi_gcs', axis: A, trigger_line: 2, {COMMON}}}",
+    "pi_gcs, a step after": f"{{kind: pi_gcs, port: 'sim://pi_gcs', first_pulse: step_after, {COMMON}}}",
+    "zaber": f"{{kind: zaber, port: 'sim://zaber', device: 2, output: 3, {COMMON}}}",
+    "zaber, falling": f"{{kind: zaber, port: 'sim://zaber', active_high: false, {COMMON}}}",
+    "zaber, toggled": f"{{kind: zaber, port: 'sim://zaber', toggle: true, {COMMON}}}",
+    "zaber, unchained": f"{{kind: zaber, port: 'sim://zaber', chained: false, {COMMON}}}",
+}
+
+
+@pytest.mark.parametrize("stage", STAGES.values(), ids=STAGES)
+@pytest.mark.parametrize("angles", ["{scheme: fixed, views: 24}", "{scheme: interlaced, views: 24, passes: 3}"])
+def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
+    """The stand-in of each controller behind the same configuration: as many frames as pulses, each at its count."""
+    settings = small(f"devices.stage={stage}", "devices.stage.low_deg=-60", f"scan.angles={angles}", "scan.period_s=2")
+    worked = dry_run(settings)
+    assert worked.timeline.violations == ()
+    block = worked.timeline.views
+    with devices.connect(settings) as bench:
+        assert bench.devices.stage.limits == worked.stage
+        bench.devices.shutter.open()
+        stamps, images = fly(bench, block, settings)
+        assert bench.devices.stage.remaining_pulses() in (0, None)
+    assert stamps == list(range(block.n))
+    scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
+    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.line_integrals(a, detector)) for a in block.angles])
+    assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
+
+
+@pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
+@pytest.mark.parametrize("open_high", [True, False])
+def test_a_shutter_on_the_stage_s_output_lets_the_beam_through(kind: str, open_high: bool) -> None:
+    """The driver sets the controller's output; the simulated blade follows the cable, and the camera sees it."""
+    settings = small(
+        f"devices.stage={STAGES[kind]}",
+        f"devices.shutter={{kind: stage_output, output: 4, open_high: {str(open_high).lower()}, settle_s: 0.25}}",
+    )
+    with devices.connect(settings) as bench:
+        camera, shutter = bench.devices.camera, bench.devices.shutter
+        camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
+        camera.arm(4)
+
+        def brightest() -> int:
+            bench.clock.sleep(camera.timing.min_period)
+            camera.software_trigger()
+            return int(camera.next_frame(1.0).counts.max())
+
+        shutter.close()
+        assert (shutter.is_open(), brightest()) == (False, 0)
+        before = bench.clock.now()
+        shutter.open()
+        assert bench.clock.now() - before == pytest.approx(0.25, abs=0.05)
+        assert (shutter.is_open(), brightest()) == (True, round(1e5 * 0.05 / 0.107))
+        shutter.close()
+        assert (shutter.is_open(), brightest()) == (False, 0)
+
+
+@pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
+def test_a_shutter_never_sits_on_the_trigger_output(kind: str) -> None:
+    settings = small(f"devices.stage={STAGES[kind]}")
+    taken = {"pi_gcs": 2, "zaber": 3}[kind]
+    with devices.connect(settings) as bench, pytest.raises(DeviceRefused, match=f"output {taken} gives the trigger"):
+        output_of(settings.devices.stage, bench.devices.stage, taken)
+    pm16c = small()
+    with devices.connect(pm16c) as bench, pytest.raises(ConfigError, match="has no digital output"):
+        output_of(pm16c.devices.stage, bench.devices.stage, 1)
 
 
 @pytest.mark.parametrize(
@@ -134,10 +206,17 @@ def test_step_darks_and_flats() -> None:
     assert view.min() < 0.5 * flat.min()
 
 
-@pytest.mark.parametrize("name", ["simulated", "demo"])
-def test_dry_run_figures_are_what_the_devices_say(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "stage"), [("simulated", "pm16c"), ("demo", "pm16c"), ("demo", "pi_gcs"), ("demo", "zaber")]
+)
+def test_dry_run_figures_are_what_the_devices_say(name: str, stage: str) -> None:
     """`describe` asks nobody, yet must agree with the stage and the camera once they are there."""
-    settings = shipped(name, "simulation.clock=virtual", "devices.stage.acceleration_deg_s2=55")
+    settings = shipped(
+        name,
+        "simulation.clock=virtual",
+        f"devices.stage={STAGES[stage]}",
+        "devices.stage.acceleration_deg_s2=55",
+    )
     limits, timing, to_counts = devices.describe(settings)
     with devices.connect(settings) as bench:
         stage, camera = bench.devices.stage, bench.devices.camera
@@ -206,6 +285,9 @@ def test_settings_that_a_device_would_refuse() -> None:
         ("devices.stage.acceleration_deg_s2=0.001", "devices.stage: .*gentl"),
         ("devices.stage.max_speed_deg_s=5001", r"devices.stage: 5001 deg/s are 5001000 pulses/s, .* 1 to 5000000"),
         ("devices.stage.max_speed_deg_s=0.0001", "devices.stage: 0.0001 deg/s are 0 pulses/s"),
+        ("devices.stage.pulse_width_s=0.005", "devices.stage: the trigger output has no pulses of 0.005 s; it has"),
+        (f"devices.stage={STAGES['zaber'].replace('60,', '1e-9,')}", "devices.stage: 30 deg/s and 1e-09 deg/s² are"),
+        (f"devices.stage={STAGES['pi_gcs'].replace('60,', '1e-9,')}", "devices.stage: .* must be positive"),
     ):
         with pytest.raises(ConfigError, match=message):
             devices.describe(small(change))
@@ -236,7 +318,7 @@ class _Stage:
 def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage is freed where the camera does not open; shutter and sample are the operator's."""
     stage, made = _Stage(), []
-    monkeypatch.setattr(devices, "_stage", lambda *args: stage)
+    monkeypatch.setattr(devices, "make_stage", lambda *args: stage)
     with pytest.raises(DeviceError, match="camera"):
         devices.connect(shipped("instrument", "devices.camera.library=/nowhere/libdcamapi.so"))
     assert stage.closed == 1
@@ -274,7 +356,7 @@ def test_every_camera_option_reaches_the_driver(monkeypatch: pytest.MonkeyPatch)
             waited.append(timeout)
 
     made: list[Camera] = []
-    monkeypatch.setattr(devices, "_stage", lambda *args: _Stage())
+    monkeypatch.setattr(devices, "make_stage", lambda *args: _Stage())
     monkeypatch.setattr("drivers.dcam.camera.DcamCamera", Camera)
     said = {
         "library": "/opt/libdcamapi.so",

@@ -142,6 +142,17 @@ def test_rows_are_contiguous_and_every_view_has_its_pulse(
     assert timeline.step == pytest.approx(timeline.step_counts * math.pi / 180_000)
 
 
+@pytest.mark.parametrize("passes", [1, 4])
+def test_a_stage_that_needs_room_before_a_train_gets_it(passes: int) -> None:
+    plan = replace(PLAN, angles=angles.interlaced(180, passes), period=2.0)
+    slow = worked(plan).views
+    roomy = worked(plan, replace(STAGE, run_up=1)).views
+    (train, *_), lattice = roomy.trains, math.pi / 180
+    interval = train.interval * math.pi / 180_000
+    assert slow.taxi == pytest.approx(lattice)  # the run-up of a slow scan
+    assert roomy.taxi == pytest.approx(interval + lattice)  # more than an interval, and still whole steps
+
+
 @given(distance=st.floats(0, 400), speed=st.floats(0.5, 60), acceleration=st.floats(1, 200))
 def test_move_time_against_integration(distance: float, speed: float, acceleration: float) -> None:
     """Distance run in the computed time, by integrating the trapezoid, is the distance."""
