@@ -129,7 +129,8 @@ class ZaberDevice:
             case ["trigger", number, "print"] if self._has_triggers and number_in(number, TRIGGERS):
                 trigger = self.triggers.triggers[int(number) - 1]
                 actions = [f"action {letter} {text}" for letter, text in zip("ab", trigger.actions, strict=True)]
-                return [f"when {trigger.text}", *actions, f"enable {_shown(trigger.left)}"]
+                enabled = f"enable {trigger.total if trigger.total > 0 else ''}".rstrip() if trigger.left else "disable"
+                return [f"when {trigger.text}", *actions, enabled]
         return []
 
     def _get(self, axis: int, setting: str) -> str:

@@ -78,7 +78,7 @@ def test_moves_arrive_and_the_library_sees_it(vendor: Vendor, checksums: int) ->
     assert vendor.axis.is_busy()
     vendor.axis.stop()
     assert not vendor.axis.is_busy()
-    assert 3000 < vendor.axis.get_position(NATIVE) < 200_000
+    assert 3000 <= vendor.axis.get_position(NATIVE) < 200_000
 
 
 def test_alerts_end_its_waiting(vendor: Vendor) -> None:
@@ -136,6 +136,12 @@ def test_triggers_give_a_train_and_tell_what_is_left(vendor: Vendor) -> None:
         (False, 0),
         (True, 8),
     ]
+    state = repeater.get_state()
+    assert (state.condition, state.actions) == (
+        "when 1 dist 300",
+        ["action a io set do 1 1 schedule 1 0", "action b none"],
+    )
+    assert (state.enabled, state.fires_total, state.fires_remaining) == (True, 9, 8)
     vendor.axis.move_absolute(9000, NATIVE)
     assert vendor.pulses() == [1000 + 300 * k for k in range(10)]
     assert not any(state.enabled for state in triggers.get_enabled_states())
