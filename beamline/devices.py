@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -109,6 +109,21 @@ def connect(config: Config, clock: Clock | None = None, ask: Ask | None = None) 
             monitor = beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
         return Bench(devices, clock, truth, opened.pop_all().close, monitor)
+
+
+@contextmanager
+def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
+    """The configured stage without the rest of the instrument. Nothing moves.
+
+    Raises:
+        DeviceError: it does not answer.
+    """
+    if config.simulation is not None:
+        with connect(config, clock) as bench:
+            yield bench.devices.stage
+        return
+    with closing(make_stage(config.devices.stage, config.devices.stage.port, clock or SystemClock())) as stage:
+        yield stage
 
 
 def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:

@@ -30,6 +30,7 @@ _COMMANDS = {
     "demo": _Entry("demo", "Simulated scan with live reconstruction, ending in a volume and a report."),
     "check": _Entry("check", "Validate a configuration; nothing moves."),
     "doctor": _Entry("doctor", "Look at this computer: camera link, ports, disk, memory; nothing moves."),
+    "home": _Entry("home", "Search the stage's reference; the stage turns."),
     "scan": _Entry("scan", "Run a scan (or, with --dry-run, say what it would do)."),
     "recon": _Entry("recon", "Reconstruct a scan, finished or still growing."),
     "tradeoff": _Entry("tradeoff", "What accuracy costs in time: many reconstructions of a scan, compared."),
