@@ -121,6 +121,20 @@ def test_a_stop_button_during_the_search_is_named(rig: Rig) -> None:
         stage.wait(LONG)
 
 
+def test_a_stop_button_after_the_switch_was_found_is_no_less_a_stop(rig: Rig) -> None:
+    """Between the switch and where the search stands: the way back must not begin."""
+    stage = rig.open()
+    stage.start_home()
+    while rig.say("SHP?B") == "NO H.P":
+        rig.clock.sleep(0.01)
+    rig.say("ASSTP")
+    with pytest.raises(DeviceError, match="stop command"):
+        stage.wait(LONG)
+    where = stage.status().counts
+    rig.clock.sleep(10.0)
+    assert stage.status().counts == where > SWITCH
+
+
 def test_a_stop_that_crosses_the_way_back_to_the_switch_stops_it(rig: Rig) -> None:
     """The search has passed the switch; `wait` sends GTHP, and the stop was sent just before."""
     stage = rig.open()
