@@ -1,0 +1,45 @@
+"""docs/hardware.md names commands, keys and values; each of them must exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from beamline import config_devices as models
+from beamline.cli.main import main
+
+TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
+DEVICES: dict[str, tuple[type[BaseModel], ...]] = {
+    "stage": (models.PM16CStageConfig, models.PiGcsStageConfig, models.ZaberStageConfig),
+    "camera": (models.DcamOrca,),
+    "shutter": (models.StageOutputShutter,),
+}
+
+
+@pytest.mark.parametrize("command", sorted(set(re.findall(r"`beamline (\w+)", TEXT))))
+def test_commands(command: str) -> None:
+    assert main.get_command(None, command) is not None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("device", "key"), sorted(set(re.findall(r"devices\.(stage|camera)\.(\w+)", TEXT))))
+def test_keys_with_their_path(device: str, key: str) -> None:
+    assert any(key in model.model_fields for model in DEVICES[device])
+
+
+def test_every_setting_from_memory_is_on_the_page() -> None:
+    """What can only be found out at the instrument is a key, and the key is explained here."""
+    for key in (
+        "first_pulse",
+        "firmware_pulse_s",
+        "active_high",
+        "speed_unit",
+        "chained",
+        "fires_when_enabled",
+        "toggle",
+    ):
+        assert f"`{key}" in TEXT, key
+        assert any(key in model.model_fields for model in DEVICES["stage"]), key
+
