@@ -100,7 +100,11 @@ def refusal(settings: PulseSettings, train: TriggerTrain, full_speed: float) -> 
         return "an even number of counts between pulses of a toggled output; or give pulses a width"
     seconds = 2 * settings.shortest if settings.width is None else max(settings.shortest, 2 * settings.width)
     nearest = math.ceil(seconds * full_speed)
-    return f"pulses not closer than {nearest} counts at full speed" if abs(train.interval) < nearest else ""
+    return (
+        f"pulses not closer than {nearest} counts at full speed, or a lower max_speed"
+        if abs(train.interval) < nearest
+        else ""
+    )
 
 
 def step_of(settings: PulseSettings, train: TriggerTrain) -> int:
