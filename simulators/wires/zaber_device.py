@@ -246,8 +246,9 @@ class ZaberDevice:
 
     def _emit(self, now: float, pulses: list[Pulse]) -> None:
         """Put pulses on the line but for those of the past that it has already."""
-        self._line.schedule(pulse for pulse in pulses if pulse.time > now or pulse not in self._sent)
-        self._sent.update(pulses)
+        if new := [pulse for pulse in pulses if pulse.time > now or pulse not in self._sent]:
+            self._line.schedule(new)
+            self._sent.update(new)
 
     def _pulses(self, edges: Sequence[Edge], first: int) -> list[Pulse]:
         """The pulses that do not get lost, the first one having the number `first` since power-on."""
