@@ -42,4 +42,3 @@ def test_every_setting_from_memory_is_on_the_page() -> None:
     ):
         assert f"`{key}" in TEXT, key
         assert any(key in model.model_fields for model in DEVICES["stage"]), key
-
