@@ -11,7 +11,7 @@ from fractions import Fraction
 
 from drivers.errors import DeviceRefused
 from drivers.stages.pi_gcs_errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
-from drivers.stages.pi_gcs_line import NUMBER, GcsLine, is_rounding_of, plain
+from drivers.stages.pi_gcs_line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
 from drivers.stages.pi_gcs_train import TriggerWindow
 
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
@@ -70,8 +70,10 @@ class PiGcsAxis:
         return self._identity
 
     def own_limits(self) -> tuple[int, int]:
-        """The controller's own travel range in counts."""
-        return self.to_counts(self._line.number("TMN?")), self.to_counts(self._line.number("TMX?"))
+        """The controller's own travel range in counts, a thousand million turns at most."""
+        most = 10**9 * self._counts_per_turn
+        low, high = (self.to_counts(self._line.number(query, ANY_NUMBER)) for query in ("TMN?", "TMX?"))
+        return max(low, -most), min(high, most)
 
     def moving(self) -> bool:
         form = r"(?:0[xX])?([0-9A-Fa-f]{1,8})"

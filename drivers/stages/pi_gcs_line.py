@@ -17,7 +17,8 @@ from drivers.stages.pi_gcs_errors import REFUSALS, advice, meaning
 
 FRAMING = Framing(command_end=b"\n", line_end=b"\n", continued=" ")
 PROBE = Probe("CSV?", r"\d+\.\d+")
-NUMBER = r"([+-]?\d{1,320}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,3})?)"
+NUMBER = r"([+-]?\d{1,12}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,2})?)"
+ANY_NUMBER = r"([+-]?\d{1,320}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,3})?)"
 """Endless stages give limits as large as a number can be."""
 DECIMALS = 12
 
@@ -126,9 +127,9 @@ class GcsLine:
         """A query of the axis that is answered by 0 or 1."""
         return self.ask(f"{query} {self._axis}", self._key + "([01])", f"{self._axis}=0 or {self._axis}=1")[1] == "1"
 
-    def number(self, query: str) -> str:
+    def number(self, query: str, form: str = NUMBER) -> str:
         """A query of the axis that is answered by a number, as it is written."""
-        return self.ask(f"{query} {self._axis}", self._key + NUMBER, f"{self._axis}=number")[1]
+        return self.ask(f"{query} {self._axis}", self._key + form, f"{self._axis}=number")[1]
 
     def parameter(self, number: str) -> str | None:
         """SPA?; None where the controller does not know it: then it does not answer, and the register says why."""

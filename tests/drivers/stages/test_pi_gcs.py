@@ -112,6 +112,15 @@ def test_limits_in_the_controller_that_leave_no_room_are_respected() -> None:
     rig.open(low=math.radians(-4)).close()
 
 
+@pytest.mark.parametrize("vast", ["1.79769e+308", f"{1.7e308:.6f}"])
+def test_the_limits_of_an_endless_stage_may_be_as_large_as_numbers_are(rig: Rig, vast: str) -> None:
+    rig.spoil = lambda reply: reply.replace(b"720.000000", vast.encode())
+    rig.open().close()
+    rig.spoil = lambda reply: reply.replace(b"=720.000000", b"=50.0").replace(b"720.000000", vast.encode())
+    with pytest.raises(DeviceRefused, match=r"limited to -360000000000\.0000 deg to 50\.0000 deg"):
+        rig.open()
+
+
 @pytest.mark.parametrize(
     ("spoilt", "says"),
     [

@@ -109,6 +109,7 @@ def test_a_code_after_a_command_is_given_in_words(rig: Rig, code: int) -> None:
         (b"\xff\x00\xfe\n", "does not have the form"),
         (b"2=0.000000\n", "does not have the form"),
         (b"1=nan\n", "does not have the form"),
+        (b"1=1.79769e+308\n", "does not have the form"),
         (b"\n", "does not have the form"),
         (b"POS? 1\n1=0.000000\n", "does not have the form"),
         (b"1=0.000000 \n", "no whole reply within 1 s"),

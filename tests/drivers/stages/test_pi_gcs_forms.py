@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from drivers.protocols import TriggerTrain
 from drivers.stages.pi_gcs_errors import EVENTS, REFUSALS, advice, meaning
-from drivers.stages.pi_gcs_line import NUMBER, is_rounding_of, plain
+from drivers.stages.pi_gcs_line import ANY_NUMBER, NUMBER, is_rounding_of, plain
 from drivers.stages.pi_gcs_train import FirstPulse, is_spent_by, window_of
 from tests.drivers.stages.pi_gcs_rig import Rig
 
@@ -78,15 +78,18 @@ def test_plain_numbers_are_the_nearest_with_twelve_decimals(value: Fraction) -> 
     st.floats(allow_nan=False, allow_infinity=False), st.sampled_from(["{:.6f}", "{:g}", "{:.12g}", "{:e}", "{:+.3f}"])
 )
 def test_every_way_to_write_a_number_is_read(value: float, form: str) -> None:
+    """Limits as large as a number can be; places up to a million million, for more nothing can turn."""
     text = form.format(value)
-    match = re.fullmatch(NUMBER, text)
+    match = re.fullmatch(ANY_NUMBER, text)
     assert match is not None
     assert float(Fraction(match[1])) == float(text)
+    assert abs(value) >= 1e11 or abs(value) < 1e-90 or re.fullmatch(NUMBER, text)
 
 
 @pytest.mark.parametrize("text", ["", ".", "nan", "inf", "1,5", "1_0", "0x10", "--1", "1.5.2", "1e", "1 2", "1e1000"])
 def test_what_is_no_number_is_not_read(text: str) -> None:
     assert re.fullmatch(NUMBER, text) is None
+    assert re.fullmatch(ANY_NUMBER, text) is None
 
 
 @pytest.mark.parametrize(
