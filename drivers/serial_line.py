@@ -96,6 +96,7 @@ class SerialLine:
         self._unsolicited, self._framing, self._check = re.compile(unsolicited), framing, check
         self._asking, self._writing = threading.RLock(), threading.Lock()
         self._received = bytearray()
+        self._asked = ""  # what the present reply is awaited for, for errors
         self._in_step = True
         try:
             self._transcript = Transcript(clock, transcript)
@@ -157,6 +158,7 @@ class SerialLine:
 
     def _query(self, data: bytes, request: str, reply: str, meaning: str, state: str) -> re.Match[str]:
         with self._asking:
+            self._asked = request
             if not self._in_step:
                 self._find_step(state)
             self._in_step = False
@@ -228,6 +230,8 @@ class SerialLine:
                 raise self._error(
                     DeviceTimeout,
                     "it sends without pause and was not asked",
+                    request=self._asked,
+                    expected="a quiet line before the next request",
                     advice="Check the baud rate and that the port is this device's",
                     state=state,
                 )
@@ -252,10 +256,12 @@ class SerialLine:
                     DeviceTimeout,
                     f"it took no bytes for {self._timeout:g} s",
                     request=text,
+                    expected="a device that takes what is sent",
                     advice="Check power, cable and flow control (none is expected)",
+                    state="What the device was doing it may still be doing",
                 ) from problem
             except OSError as problem:
-                raise self._port_gone(problem) from problem
+                raise self._port_gone(problem, text) from problem
 
     def _read_reply(self) -> str | _Damaged | None:
         """The lines of the reply, joined; None where they are not whole within the timeout or never end."""
@@ -293,7 +299,7 @@ class SerialLine:
         try:
             data = bytes(self._port.read(max(1, waiting)))
         except OSError as problem:
-            raise self._port_gone(problem) from problem
+            raise self._port_gone(problem, self._asked) from problem
         self._transcript.keep("<", data)
         return data
 
@@ -302,12 +308,14 @@ class SerialLine:
         try:
             return int(self._port.in_waiting)
         except OSError as problem:
-            raise self._port_gone(problem) from problem
+            raise self._port_gone(problem, self._asked) from problem
 
-    def _port_gone(self, problem: OSError) -> DeviceError:
+    def _port_gone(self, problem: OSError, request: str) -> DeviceError:
         return self._error(
             DeviceError,
             f"the port failed: {problem}",
+            request=request,
+            expected="a port that stays there",
             advice="Check that the cable or adapter is still plugged in, then start again",
             state="What the device was doing it may still be doing",
         )
