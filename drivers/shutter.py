@@ -71,9 +71,12 @@ class OutputShutter:
     def _put(self, opened: bool) -> None:
         self._open = None
         level = opened is self._open_high
-        self._output.set(level)
-        self._clock.sleep(self._settle)
-        held = self._output.get()
+        try:
+            self._output.set(level)
+            self._clock.sleep(self._settle)
+            held = self._output.get()
+        except DeviceError as cause:
+            raise self._unheard(opened, level, cause) from cause
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
@@ -85,3 +88,16 @@ class OutputShutter:
                 state="Whether the shutter is open is not known: look before anybody goes near the beam",
             )
         self._open = opened
+
+    def _unheard(self, opened: bool, level: bool, cause: DeviceError) -> DeviceError:
+        """The output's own failure does not say that a shutter hangs on it."""
+        return DeviceError(
+            self.name,
+            f"it could not be {'opened' if opened else 'closed'}: {cause.device}: {cause.problem}",
+            request=cause.request or f"{self._output.name} {'high' if level else 'low'}",
+            reply=cause.reply,
+            expected=cause.expected or f"{'high' if level else 'low'} on {self._output.name}",
+            advice=cause.advice or "Check the controller's power and cable",
+            state="Whether the shutter is open is not known: look before anybody goes near the beam",
+            wire=cause.wire,
+        )
