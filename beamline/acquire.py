@@ -51,6 +51,8 @@ class Acquisition:
         self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
         self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit)
         self._done: list[Done] = []
+        self.unsafe: tuple[Exception, ...] = ()
+        """What could not be made safe at the end: stage, camera or shutter may be as the scan left them."""
 
     @property
     def n_frames(self) -> int:
@@ -76,21 +78,21 @@ class Acquisition:
             InstrumentError, DeviceError: a device failed.
         """
         home = self._devices.stage.position()
-        calm = False
+        calm = whole = False
         try:
             yield from self._blocks()
-            calm = True
+            calm = whole = True
         except ScanAborted as aborted:
             raise ScanAborted(f"{aborted}{self._unbalanced()}") from None
         except GeneratorExit:  # the caller gave up; the devices are well
             calm = True
             raise
         finally:
-            problems = self._make_safe(home if calm and not self._stop.aborting else None)
-            for problem in problems:
-                self._emit("warning", {"message": problem})
-        if problems:
-            raise InstrumentError(" ".join(problems))
+            self.unsafe = self._make_safe(home if calm and not self._stop.aborting else None)
+            for error in self.unsafe[1:] if whole else self.unsafe:
+                self._emit("warning", {"message": _in_words(error)})
+        if self.unsafe:
+            raise self.unsafe[0]
         self._verdict()
 
     def _blocks(self) -> Iterator[Frame]:
@@ -143,29 +145,39 @@ class Acquisition:
                 "What was taken before is in the file."
             )
 
-    def _make_safe(self, home: float | None) -> list[str]:
-        """Every step is tried, whatever became of the one before; what did not work, in sentences."""
-        stage, camera = self._devices.stage, self._devices.camera
-        problems: list[str] = []
+    def _make_safe(self, home: float | None) -> tuple[Exception, ...]:
+        """Every step is tried, whatever became of the one before; the first failure of each that did not work."""
+        stage, camera, shutter = self._devices.stage, self._devices.camera, self._devices.shutter
+        unsafe: list[Exception] = []
 
-        def attempt(action: Callable[[], object]) -> None:
-            try:
-                action()
-            except ScanAborted:  # it came while the stage was moving here
-                attempt(stage.abort)
-            except (DeviceError, BeamlineError) as error:
-                problems.append(str(error))
-            except Exception as error:  # a defect in one device must not leave the others unsafe
-                problems.append(f"{type(error).__name__}: {error}")
+        def attempt(*ways: Callable[[], object]) -> bool:
+            """One way after the other until one works: a line that was disturbed once often works again."""
+            failures: list[Exception] = []
+            for way in ways:
+                try:
+                    way()
+                except ScanAborted:  # it came while the stage was moving here
+                    return attempt(stage.abort, stage.abort)
+                except Exception as error:  # a defect in one device must not leave the others unsafe
+                    failures.append(error)
+                else:
+                    for error in failures:
+                        self._emit("warning", {"message": _in_words(error)})
+                    return True
+            unsafe.append(failures[0])
+            return False
 
-        attempt(stage.abort if self._stop.aborting else self._exposures.stand)
-        attempt(camera.disarm)
-        attempt(self._devices.shutter.close)
-        attempt(stage.disarm)
-        if home is not None and not problems and not self._stop.aborting:
-            attempt(self._devices.sample.back)
-            attempt(lambda: self._exposures.go_home(home))
-        return problems
+        stop = (self._exposures.stand, self._exposures.stand, stage.abort)
+        attempt(*((stage.abort, stage.abort) if self._stop.aborting else stop))
+        attempt(camera.disarm, camera.disarm)
+        attempt(shutter.close, shutter.close)
+        attempt(stage.disarm, stage.disarm)
+        if home is None or unsafe or self._stop.aborting:
+            return tuple(unsafe)
+        attempt(self._devices.sample.back)
+        if not attempt(lambda: self._exposures.go_home(home)):
+            attempt(*stop)
+        return tuple(unsafe)
 
     def _verdict(self) -> None:
         views = sum(done.taken.frames for done in self._done if done.block.kind is FrameKind.PROJECTION)
@@ -189,6 +201,11 @@ class Acquisition:
     def _unbalanced(self) -> str:
         """What is missing, extra or doubtful so far, a sentence after another, each after a space."""
         return "".join(f" {text}" for done in self._done if (text := _account(done)))
+
+
+def _in_words(error: Exception) -> str:
+    """Failures of devices speak for themselves; of a defect its kind matters."""
+    return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"
 
 
 def _account(done: Done) -> str:

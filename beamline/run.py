@@ -45,10 +45,17 @@ class State(StrEnum):
 MESSAGES: Mapping[State, str] = {
     State.PREPARING: "Preparing",
     State.ACQUIRING: "Acquiring",
-    State.STOPPING: "The instrument is safe; the last frames are being written",
+    State.STOPPING: "Stage stopped, shutter closed; the last frames are being written",
     State.DONE: "Finished",
     State.FAILED: "Ended early",
 }
+
+
+UNSAFE = (
+    "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
+    "the last frames are being written"
+)
+"""What `stopping` says where making the instrument safe failed; the warnings or the error say what of it."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +184,7 @@ class _Run:
         acquisition = self._acquisition()
         self._enter(State.ACQUIRING)
         error = _failure_of(lambda: _acquire(acquisition, recorder))
-        self._enter(State.STOPPING)
+        self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
         disk = _failure_of(recorder.finish)
         error = self._graver(error, disk)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
@@ -218,8 +225,8 @@ class _Run:
         self.emit("warning", {"message": str(after)})
         return error
 
-    def _enter(self, state: State) -> None:
-        self.emit("state", {"state": state, "message": MESSAGES[state]})
+    def _enter(self, state: State, message: str | None = None) -> None:
+        self.emit("state", {"state": state, "message": message or MESSAGES[state]})
 
     def _writer(self, path: Path) -> NXtomoWriter:
         storage = self.config.storage

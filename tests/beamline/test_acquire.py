@@ -16,7 +16,7 @@ from beamline.errors import InstrumentError, ScanStopped
 from beamline.ledger import LedgerError
 from beamline.plan import Mode, Place, Timeline
 from beamline.stop import ScanAborted, StopRequest
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
 from tests.beamline.fakes import COUNT, HOME, Camera, Faults, Instrument, seen
@@ -391,11 +391,66 @@ def test_a_stage_that_cannot_be_made_safe_is_said_though_the_data_are_good() -> 
 
     bench.devices.shutter.close = fail  # type: ignore[method-assign]
     run = Run(bench, bench.timeline(at=Place.NONE))
-    assert isinstance(run.error, InstrumentError)
-    assert "shutter: does not answer" in str(run.error)
+    assert isinstance(run.error, DeviceError)  # the device's own, with its parts
+    assert run.error.device == "shutter"
+    assert [data for event, data in run.events if event == "warning"] == []  # it is told once
+    assert run.scan.unsafe == (run.error,)
     assert len(run.frames) == 12
     assert not bench.camera.armed
     assert f"move {HOME}" not in bench.log
+
+
+def test_a_shutter_that_closes_at_the_second_try_is_told_and_the_scan_is_good() -> None:
+    bench = Instrument()
+    tries: list[int] = []
+    close = bench.devices.shutter.close
+
+    def at_the_second_try() -> None:
+        tries.append(len(tries))
+        if len(tries) == 1:
+            raise DeviceError("shutter", "does not answer")
+        close()
+
+    bench.devices.shutter.close = at_the_second_try  # type: ignore[method-assign]
+    bench.is_open = True
+    run = Run(bench, bench.timeline(at=Place.NONE))
+    assert run.error is None
+    assert [data["message"] for event, data in run.events if event == "warning"] == ["shutter: does not answer."]
+    assert run.scan.unsafe == ()
+    assert_safe(bench)
+
+
+def test_a_stage_that_does_not_obey_a_stop_is_aborted() -> None:
+    bench = Instrument(Faults(errors={10: 99}))
+
+    def deaf() -> None:
+        raise DeviceTimeout("stage", "no reply")
+
+    bench.devices.stage.stop = deaf  # type: ignore[method-assign]
+    run = Run(bench, bench.timeline())
+    assert isinstance(run.error, DeviceError)
+    assert run.error.device == "camera"
+    assert [data["message"] for event, data in run.events if event == "warning"][1:] == ["stage: no reply."] * 2
+    assert bench.log.count("abort stage") == 1
+    assert_safe(bench, home=False)
+
+
+def test_a_way_home_that_fails_leaves_a_stage_that_stands() -> None:
+    bench = Instrument()
+    moving = bench.devices.stage.moving
+
+    def dies_on_the_way_home() -> bool:
+        if bench.log[-1] == f"move {HOME}":
+            raise DeviceTimeout("stage", "no reply")
+        return moving()
+
+    bench.devices.stage.moving = dies_on_the_way_home  # type: ignore[method-assign]
+    run = Run(bench, bench.timeline())
+    assert isinstance(run.error, DeviceTimeout)
+    assert len(run.frames) == 17
+    assert bench.log[-1] == "stop stage"
+    assert not moving()
+    assert not bench.is_open
 
 
 def test_a_defect_in_one_driver_does_not_leave_the_other_devices_unsafe() -> None:
