@@ -161,8 +161,8 @@ class Acquisition:
                 except Exception as error:  # a defect in one device must not leave the others unsafe
                     failures.append(error)
                 else:
-                    for error in failures:
-                        self._emit("warning", {"message": _in_words(error)})
+                    for failure in failures:
+                        self._emit("warning", {"message": _in_words(failure)})
                     return True
             unsafe.append(failures[0])
             return False
