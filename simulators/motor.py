@@ -137,6 +137,9 @@ class PulseMotor:
         counts_per_turn: pulses for 2π of true angle.
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
         stall_at: a move that would pass this count stops there at once (EMERGENCY), as when an interlock trips.
+        switch_at: a move that would pass this count stops there at once (LIMIT), as by a limit switch.
+
+    Both may be changed while it stands, as by a person who clears the way.
     """
 
     def __init__(
@@ -147,11 +150,13 @@ class PulseMotor:
         counts_per_turn: int,
         lost: Set[int] = frozenset(),
         stall_at: int | None = None,
+        switch_at: int | None = None,
     ) -> None:
+        self.stall_at, self.switch_at = stall_at, switch_at
         self.trigger = TriggerOutput(lost)
         self.limits: tuple[int, int] | None = None
         self.ended = Ended(0)
-        self._clock, self._line, self._stall_at = clock, line, stall_at
+        self._clock, self._line = clock, line
         self._angle_of_count = 2 * math.pi / counts_per_turn
         self.zero = 0
         """Count of the place where it stood at power-on."""
@@ -187,7 +192,8 @@ class PulseMotor:
         move = TrapezoidMove.between(here, target, speed, acceleration, begin=now)
         self.ended = Ended(0)
         low, high = self.limits or (-math.inf, math.inf)
-        for stop, why in ((high, Ended.LIMIT), (low, Ended.LIMIT), (self._stall_at, Ended.EMERGENCY)):
+        faults = ((self.switch_at, Ended.LIMIT), (self.stall_at, Ended.EMERGENCY))
+        for stop, why in ((high, Ended.LIMIT), (low, Ended.LIMIT), *faults):
             if stop is not None and min(here, move.target) < stop < max(here, move.target):
                 move, self.ended = move.halted(stop), why
         if (here >= high and move.direction > 0) or (here <= low and move.direction < 0):

@@ -115,7 +115,8 @@ class PM16CController:
         counts_per_turn: its pulses for 2π.
         home_at: where the sample's home switch is, in pulses since power-on; None plugs none in.
         lost: trigger pulses (from 0, since power-on) that never reach the line.
-        stall_at: count at which a move of the sample's motor that would pass stops short, as by an interlock.
+        stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
+            interlock or a limit switch.
         silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
     """
 
@@ -129,6 +130,7 @@ class PM16CController:
         home_at: int | None = 0,
         lost: Set[int] = frozenset(),
         stall_at: int | None = None,
+        switch_at: int | None = None,
         silent: Set[int] = frozenset(),
         garbled: Set[int] = frozenset(),
     ) -> None:
@@ -143,6 +145,7 @@ class PM16CController:
             counts_per_turn=counts_per_turn,
             lost=lost,
             stall_at=stall_at,
+            switch_at=switch_at,
             home_at=home_at,
         )
         self._silent, self._garbled = silent, garbled

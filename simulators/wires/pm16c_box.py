@@ -91,7 +91,7 @@ class PM16CBox:
         channel: the motor that turns the sample; the others turn nothing.
         line: what the TP0 connector, the output of position controller A, is wired to.
         home_at: where its home switch is, in pulses since power-on; None plugs none in.
-        lost, stall_at: faults of the sample's motor, see `PulseMotor`.
+        lost, stall_at, switch_at: faults of the sample's motor, see `PulseMotor`.
     """
 
     def __init__(
@@ -103,6 +103,7 @@ class PM16CBox:
         counts_per_turn: int,
         lost: Set[int],
         stall_at: int | None,
+        switch_at: int | None,
         home_at: int | None,
     ) -> None:
         self.clock = clock
@@ -117,7 +118,9 @@ class PM16CBox:
         def tp0() -> TriggerLine | None:
             return line if self.mapped[0] == sample else None
 
-        self.sample = PulseMotor(clock, tp0, counts_per_turn=counts_per_turn, lost=lost, stall_at=stall_at)
+        self.sample = PulseMotor(
+            clock, tp0, counts_per_turn=counts_per_turn, lost=lost, stall_at=stall_at, switch_at=switch_at
+        )
         self.channels[sample] = Channel(self.sample, home_at)
 
     def moving(self) -> int:

@@ -37,6 +37,8 @@ class ZaberAxis:
         homed: it knows its reference since power-on.
         stall_at: a move that would pass this count stops there (FS), as when something blocks it.
         switch_at: a move that would pass this count runs into a limit there (WL, FE).
+
+    Both may be changed while it stands, as by a person who clears the way.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class ZaberAxis:
         }
         self.homed, self.enabled = homed, True
         self.flags: set[str] = set()
-        self._stall_at, self._switch_at = stall_at, switch_at
+        self.stall_at, self.switch_at = stall_at, switch_at
         self._angle_of_count = 2 * math.pi / counts_per_turn
         self._moves = deque([TrapezoidMove(now, 0.0, 0.0, ())], maxlen=MOVES_REMEMBERED)
         self._at_end: Callable[[], None] | None = None
@@ -100,7 +102,7 @@ class ZaberAxis:
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
             raise Rejected("BADDATA")
         move, ending = self._planned(now, target, speed), self._nothing
-        for blocked, flags in ((self._stall_at, {"FS"}), (self._switch_at, {"WL", "FE"})):
+        for blocked, flags in ((self.stall_at, {"FS"}), (self.switch_at, {"WL", "FE"})):
             if blocked is not None and min(move.start, move.target) < blocked < max(move.start, move.target):
                 move, ending = move.halted(blocked), partial(self.flags.update, flags)
         self._begin(move, ending)

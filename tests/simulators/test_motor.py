@@ -75,3 +75,17 @@ def test_far_from_zero_a_stop_still_ends_at_the_target_or_before() -> None:
     clock.sleep(motor.move.end - 1e-5)
     motor.stop(6e7)
     assert motor.move.target <= 2_000_000_000
+
+
+@pytest.mark.parametrize(("fault", "why"), [("stall_at", Ended.EMERGENCY), ("switch_at", Ended.LIMIT)])
+def test_what_blocks_a_move_says_so_until_somebody_clears_the_way(fault: str, why: Ended) -> None:
+    clock = VirtualClock(start=0.0)
+    motor = PulseMotor(clock, lambda: None, counts_per_turn=360)
+    setattr(motor, fault, 40)
+    motor.start(90, 100.0, 100.0)
+    clock.sleep(60.0)
+    assert (motor.position(), motor.moving(), motor.ended) == (40, False, why)
+    setattr(motor, fault, None)
+    motor.start(90, 100.0, 100.0)
+    clock.sleep(60.0)
+    assert (motor.position(), motor.ended) == (90, Ended(0))
