@@ -114,7 +114,7 @@ def run(
     if trial.group == "precision":
         found = compare(data.projections, data.geometry, seed, now)
         return {"seconds": found["seconds_float32"], "peak_bytes": peak_memory(), "details": found}
-    views = parse_views(f"fixed:{trial.views}", data.geometry.angles)
+    views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)
     warm_up(trial, data.geometry)
@@ -145,7 +145,7 @@ def run(
 
 def half_set_resolution(trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int) -> float:
     """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
-    order = np.argsort(np.mod(geometry.angles, np.pi), kind="stable")
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
 
     def half(views: NDArray[np.int64]) -> F32:
         made = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None)

@@ -117,6 +117,6 @@ def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians
 
 def _around(geometry: Geometry, most: int) -> NDArray[np.int64]:
     """Some views from all around, so that they need the same kind of first volume as all of them."""
-    n, turn = geometry.n_views, 2 * np.pi if geometry.is_cone else np.pi
-    order = np.argsort(np.mod(geometry.angles, turn), kind="stable")
+    n = geometry.n_views
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     return np.sort(order[np.arange(min(n, most)) * n // min(n, most)])

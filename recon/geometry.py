@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 F64 = NDArray[np.float64]
 
+_OFF_MIDDLE = 0.05  # of the detector's width: an axis farther from the middle leaves a tenth of the field to one side
 _SHORT_OF_SOURCE = 0.7  # of sod: the corners of a box that reaches so far still lie before the source
 
 
@@ -120,6 +121,17 @@ class Geometry:
     def is_straight(self) -> bool:
         """Rows run along u and columns along the rotation axis: no roll, no tilt (views may be shifted)."""
         return not (self.roll.any() or self.tilt.any())
+
+    @property
+    def period(self) -> float:
+        """Radians after which a view brings nothing new: π where its rays are those of the view half a turn before.
+
+        2π for a cone, for an axis that leans along the beam, and for one so far off the detector's middle that views
+        half a turn apart complete each other (by more than a tenth of the field).
+        """
+        cols = self.detector_shape[1]
+        off = abs(float((self.axis_col + self.shifts[:, 0]).mean()) - (cols - 1) / 2)
+        return 2 * math.pi if self.is_cone or self.tilt.any() or off > _OFF_MIDDLE * cols else math.pi
 
     @property
     def middle_height(self) -> float:

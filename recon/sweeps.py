@@ -25,8 +25,7 @@ _LEAST = 1e-3
 
 def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
     """View indices of each subset: neighbours in angle lie in different subsets, so each looks from all sides."""
-    turn = 2 * np.pi if projector.geometry.is_cone else np.pi
-    order = np.argsort(np.mod(projector.geometry.angles, turn), kind="stable")
+    order = np.argsort(np.mod(projector.geometry.angles, projector.geometry.period), kind="stable")
     count = min(subsets, order.size)
     return [order[start::count] for start in range(count)]
 

@@ -15,11 +15,11 @@ _RANDOM = re.compile(r"(\d+)(?::(\d+))?")
 _COUNT = re.compile(r"\d+")
 
 
-def parse_views(spec: str, angles: ArrayLike, seed: int = 0) -> NDArray[np.int64]:
+def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = np.pi) -> NDArray[np.int64]:
     """Indices of the views that a selection names, ascending, none twice.
 
     - `all`: every view.
-    - `fixed:N`: N views spread evenly in angle. Views half a turn apart see the same rays, so they count as one place
+    - `fixed:N`: N views spread evenly in angle. Views one `period` apart see the same rays, so they count as one place
       as long as there are N places.
     - `sector:A-B[:N]`: views with A <= angle <= B degrees (modulo 360); of these, N spread evenly.
     - `random:N[:seed]`: N views drawn without replacement.
@@ -29,6 +29,8 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0) -> NDArray[np.int64
         spec: the selection.
         angles: [view], radians, in the order taken.
         seed: for `random:N` without a seed of its own.
+        period: radians after which views see the same rays, see `Geometry.period`; by default those of a parallel beam
+            with the axis in the middle.
 
     Raises:
         ValueError: for a selection that is not one of these forms, or that asks for more views than there are; for
@@ -45,13 +47,13 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0) -> NDArray[np.int64
         return everything
     if name in ("fixed", "first") and _COUNT.fullmatch(rest):
         n = _enough(int(rest), theta.size, spec)
-        return everything[:n] if name == "first" else _even(everything, theta, n)
+        return everything[:n] if name == "first" else _even(everything, theta, n, period)
     if name == "random" and (match := _RANDOM.fullmatch(rest)):
         n = _enough(int(match[1]), theta.size, spec)
         rng = np.random.default_rng(seed if match[2] is None else int(match[2]))
         return np.sort(rng.choice(everything, n, replace=False))
     if name == "sector" and (match := _SECTOR.fullmatch(rest)):
-        return _sector(theta, float(match[1]), float(match[2]), match[3], spec)
+        return _sector(theta, float(match[1]), float(match[2]), match[3], spec, period)
     raise ValueError(f"unknown selection of views {spec!r}; use one of: {FORMS}")
 
 
@@ -61,7 +63,9 @@ def _enough(n: int, available: int, spec: str) -> int:
     return n
 
 
-def _sector(theta: NDArray[np.float64], low: float, high: float, count: str | None, spec: str) -> NDArray[np.int64]:
+def _sector(
+    theta: NDArray[np.float64], low: float, high: float, count: str | None, spec: str, period: float
+) -> NDArray[np.int64]:
     if not high > low:
         raise ValueError(f"{spec!r}: the sector must end after it begins, {high:g} is not above {low:g} degrees")
     slack = 1e-6  # degrees, so that an end that is a view's own angle takes that view
@@ -75,15 +79,15 @@ def _sector(theta: NDArray[np.float64], low: float, high: float, count: str | No
         )
     if count is None:
         return inside
-    return _even(inside, theta, _enough(int(count), inside.size, spec))
+    return _even(inside, theta, _enough(int(count), inside.size, spec), period)
 
 
-def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int) -> NDArray[np.int64]:
-    """n of the views, spread evenly over their places on the half circle, or over themselves if places are too few."""
-    half_turn = np.sort(np.mod(theta[views], np.pi))
-    gaps = np.diff(half_turn, append=half_turn[0] + np.pi)
+def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: float) -> NDArray[np.int64]:
+    """n of the views, spread evenly over their places within a period, or over themselves if places are too few."""
+    once = np.sort(np.mod(theta[views], period))
+    gaps = np.diff(once, append=once[0] + period)
     step = float(np.median(gaps[gaps > 1e-9]))
-    place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, np.pi)  # counted from the first view
+    place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first view
     order = np.argsort(place, kind="stable")
     starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
     distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # of views at one place the earliest

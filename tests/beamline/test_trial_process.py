@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from beamline import trial_process as module
 from beamline.trial_process import Data, main, on_grid, run
@@ -158,6 +159,21 @@ def test_trials_of_a_cone(data: Data) -> None:
     views = cone.geometry.n_views
     for trial in (Trial("method", "fbp", views), Trial("method", "r2", views, steps=5, gaussians=50)):
         assert np.isfinite(run(trial, cone, 0, _silent)["metrics"]["psnr"])
+
+
+def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: Data, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views half a turn apart are not the same ones of a cone: neither may one half of them be half the circle."""
+    cone = _cone(data)
+    around = replace(cone, geometry=cone.geometry.at(np.linspace(0, 2 * np.pi, 27, endpoint=False)))
+    seen: list[NDArray[np.float64]] = []
+    plain = module.reconstruct
+    monkeypatch.setattr(module, "warm_up", lambda *_: None)
+    monkeypatch.setattr(module, "reconstruct", lambda *said: seen.append(said[2].angles) or plain(*said))
+    run(Trial("method", "fbp", 8, halves=True), around, 0, _silent)
+    for angles in seen:
+        gaps = np.diff(np.sort(angles), append=angles.min() + 2 * np.pi)
+        assert gaps.max() < 1.6 * 2 * np.pi / angles.size
+    assert [angles.size for angles in seen] == [8, 4, 4]
 
 
 def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str]) -> None:

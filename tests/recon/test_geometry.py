@@ -264,3 +264,16 @@ def test_voxels_may_be_longer_along_z() -> None:
     np.testing.assert_allclose(grid.edges[:, 2], [-4, 4])
     with pytest.raises(ValueError, match="slice_pitch"):
         Grid((4, 6, 6), 0.5, slice_pitch=0.0)
+
+
+def test_views_half_a_turn_apart_bring_nothing_new_only_where_they_see_the_same_rays() -> None:
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+
+    def parallel(**options: object) -> Geometry:
+        return Geometry.parallel(angles, (4, 40), **options)  # type: ignore[arg-type]
+
+    for middle in (parallel(), parallel(axis_col=20.5)):
+        assert middle.period == pytest.approx(np.pi)
+    beside, moved = parallel(axis_col=2.0), parallel(shifts=np.tile([12.0, 0.0], (12, 1)))
+    for other in (beside, moved, parallel(tilt=0.1), Geometry.cone(angles, (4, 40), 1.0, 50.0, 100.0)):
+        assert other.period == pytest.approx(2 * np.pi)

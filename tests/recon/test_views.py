@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from recon.geometry import Geometry
 from recon.views import parse_views
 
 HALF = np.deg2rad(np.arange(0, 180, 1.0))
@@ -42,6 +43,15 @@ def test_fixed_of_a_full_turn_spreads_over_the_half_circle() -> None:
     places = np.sort(np.mod(np.rad2deg(turn[parse_views("fixed:90", turn)]) + 1e-6, 180))
     np.testing.assert_allclose(np.diff(places), 2.0, atol=1e-5)
     assert parse_views("fixed:500", turn).size == 500
+
+
+@pytest.mark.parametrize("spec", ["fixed:90", "sector:0-360:90"])
+def test_fixed_of_a_cone_spreads_over_the_whole_turn(spec: str) -> None:
+    cone = Geometry.cone(np.deg2rad(np.arange(0, 360, 0.5)), (4, 8), 1.0, 50.0, 100.0)
+    chosen = np.rad2deg(cone.angles[parse_views(spec, cone.angles, period=cone.period)])
+    np.testing.assert_allclose(chosen, np.arange(0, 360, 4.0), atol=1e-9)
+    closed = np.deg2rad(np.arange(0, 361, 2.0))  # 0 and 360 degrees are one place of a cone
+    np.testing.assert_array_equal(parse_views("fixed:90", closed, period=2 * np.pi), np.arange(0, 180, 2))
 
 
 def test_fixed_works_in_any_order_of_angles() -> None:
