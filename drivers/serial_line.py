@@ -126,7 +126,7 @@ class SerialLine:
         Raises:
             DeviceError: the port is gone. DeviceTimeout: the device does not take bytes.
         """
-        self._write(command.encode("ascii") + self._framing.command_end, command)
+        self._write(command.encode("ascii") + self._framing.command_end, command or "an empty line")
 
     def send_raw(self, data: bytes) -> None:
         """`send` for bytes without an end, such as one control character."""
