@@ -51,8 +51,8 @@ class Acquisition:
         self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
         self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit)
         self._done: list[Done] = []
-        self.unsafe: tuple[Exception, ...] = ()
-        """What could not be made safe at the end: stage, camera or shutter may be as the scan left them."""
+        self.unsafe = False
+        """At the end something did not obey: stage, camera or shutter may be as the scan left them."""
 
     @property
     def n_frames(self) -> int:
@@ -88,11 +88,11 @@ class Acquisition:
             calm = True
             raise
         finally:
-            self.unsafe = self._make_safe(home if calm and not self._stop.aborting else None)
-            for error in self.unsafe[1:] if whole else self.unsafe:
+            failures = self._make_safe(home if calm and not self._stop.aborting else None)
+            for error in failures[1:] if whole else failures:
                 self._emit("warning", {"message": _in_words(error)})
-        if self.unsafe:
-            raise self.unsafe[0]
+        if failures:
+            raise failures[0]
         self._verdict()
 
     def _blocks(self) -> Iterator[Frame]:
@@ -145,10 +145,10 @@ class Acquisition:
                 "What was taken before is in the file."
             )
 
-    def _make_safe(self, home: float | None) -> tuple[Exception, ...]:
+    def _make_safe(self, home: float | None) -> list[Exception]:
         """Every step is tried, whatever became of the one before; the first failure of each that did not work."""
         stage, camera, shutter = self._devices.stage, self._devices.camera, self._devices.shutter
-        unsafe: list[Exception] = []
+        failed: list[Exception] = []
 
         def attempt(*ways: Callable[[], object]) -> bool:
             """One way after the other until one works: a line that was disturbed once often works again."""
@@ -164,7 +164,7 @@ class Acquisition:
                     for failure in failures:
                         self._emit("warning", {"message": _in_words(failure)})
                     return True
-            unsafe.append(failures[0])
+            failed.append(failures[0])
             return False
 
         stop = (self._exposures.stand, self._exposures.stand, stage.abort)
@@ -172,12 +172,13 @@ class Acquisition:
         attempt(camera.disarm, camera.disarm)
         attempt(shutter.close, shutter.close)
         attempt(stage.disarm, stage.disarm)
-        if home is None or unsafe or self._stop.aborting:
-            return tuple(unsafe)
+        self.unsafe = bool(failed)
+        if home is None or failed or self._stop.aborting:
+            return failed
         attempt(self._devices.sample.back)
         if not attempt(lambda: self._exposures.go_home(home)):
-            attempt(*stop)
-        return tuple(unsafe)
+            self.unsafe = not attempt(*stop)
+        return failed
 
     def _verdict(self) -> None:
         views = sum(done.taken.frames for done in self._done if done.block.kind is FrameKind.PROJECTION)

@@ -394,7 +394,7 @@ def test_a_stage_that_cannot_be_made_safe_is_said_though_the_data_are_good() -> 
     assert isinstance(run.error, DeviceError)  # the device's own, with its parts
     assert run.error.device == "shutter"
     assert [data for event, data in run.events if event == "warning"] == []  # it is told once
-    assert run.scan.unsafe == (run.error,)
+    assert run.scan.unsafe
     assert len(run.frames) == 12
     assert not bench.camera.armed
     assert f"move {HOME}" not in bench.log
@@ -416,7 +416,7 @@ def test_a_shutter_that_closes_at_the_second_try_is_told_and_the_scan_is_good() 
     run = Run(bench, bench.timeline(at=Place.NONE))
     assert run.error is None
     assert [data["message"] for event, data in run.events if event == "warning"] == ["shutter: does not answer."]
-    assert run.scan.unsafe == ()
+    assert not run.scan.unsafe
     assert_safe(bench)
 
 
@@ -447,6 +447,7 @@ def test_a_way_home_that_fails_leaves_a_stage_that_stands() -> None:
     bench.devices.stage.moving = dies_on_the_way_home  # type: ignore[method-assign]
     run = Run(bench, bench.timeline())
     assert isinstance(run.error, DeviceTimeout)
+    assert not run.scan.unsafe
     assert len(run.frames) == 17
     assert bench.log[-1] == "stop stage"
     assert not moving()
