@@ -44,9 +44,15 @@ class Grid:
 
     @classmethod
     def matching(cls, geometry: Geometry) -> Grid:
-        """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis."""
-        rows, cols = geometry.detector_shape
-        return cls((rows, cols, cols), geometry.sample_pitch, (geometry.middle_height, 0.0, 0.0))
+        """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis, at the height that views see.
+
+        Views that are shifted apart widen it to what at least half as many of them see as see any part: an alignment's
+        small shifts change nothing, views that jump up and down give all heights. However far off the detector's middle
+        the axis falls, it is no wider for that: all that such views see is in `of_field`.
+        """
+        across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
+        height = geometry.middle_height + middle * geometry.sample_pitch
+        return cls((down, across, across), geometry.sample_pitch, (height, 0.0, 0.0))
 
     @classmethod
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
@@ -91,6 +97,19 @@ class Grid:
             c + (np.arange(n) - (n - 1) / 2) * edge
             for n, c, edge in zip(self.shape, self.centre, self.spacing, strict=True)
         )
+
+
+def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
+    """How many pixels the shifted views reach across along columns (0) or rows (1), and where their middle is, from
+    that of a view without a shift; without what fewer than half as many views see as see the best seen part."""
+    size = geometry.detector_shape[1 - axis]
+    first = -geometry.shifts[:, axis]
+    edges = np.unique(np.concatenate((first, first + size)))
+    within = (edges[:-1] + edges[1:]) / 2
+    seen = (first[:, None] <= within) & (within < first[:, None] + size)
+    enough = np.flatnonzero(2 * seen.sum(axis=0) >= seen.sum(axis=0).max())
+    low, high = float(edges[enough[0]]), float(edges[enough[-1] + 1])
+    return max(1, round(high - low)), (low + high - size) / 2
 
 
 @dataclass(frozen=True, eq=False)

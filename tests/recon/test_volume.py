@@ -59,6 +59,43 @@ def test_views_that_jump_along_the_axis_find_all_matter() -> None:
         assert found[half].sum() == pytest.approx(expected[half].sum(), rel=0.15)
 
 
+def _shifted(*shifts: tuple[float, float]) -> Geometry:
+    """Views of 10 x 32 pixels of half a millimetre, shifted like these (col, row) in turn."""
+    return Geometry.parallel(TURN, (10, 32), 0.5, shifts=np.resize(np.array(shifts), (48, 2)))
+
+
+def test_a_shift_of_all_views_moves_the_matching_volume_as_the_axis_row_does() -> None:
+    said = Geometry.parallel(TURN, (10, 32), 0.5, axis_row=11.5)
+    found = Grid.matching(_shifted((14.0, 7.0)))
+    assert found == Grid.matching(said)
+    assert found.centre[0] == pytest.approx(Grid.for_fit(_shifted((0.0, 7.0)), found).centre[0])
+
+
+def test_the_matching_volume_holds_what_views_that_jump_see() -> None:
+    up_and_down, sideways = _shifted((0.0, 10.0), (0.0, -10.0)), _shifted((16.0, 0.0), (-16.0, 0.0))
+    for views, shape in ((up_and_down, (30, 32, 32)), (sideways, (10, 64, 64))):
+        assert Grid.matching(views).shape == shape
+        assert Grid.matching(views) == Grid.for_fit(views, Grid.matching(views))
+    uneven = Grid.matching(_shifted((0.0, 3.0), (0.0, 3.0), (0.0, 3.0), (0.0, 9.0)))  # a quarter sees six rows more
+    assert uneven.shape == (10, 32, 32) and uneven.centre[0] == pytest.approx(-1.5)
+
+
+def test_small_shifts_leave_the_matching_volume_the_size_of_the_detector() -> None:
+    jitter = np.random.default_rng(0).uniform(-1.5, 1.5, (48, 2))
+    views = Geometry.parallel(TURN, (10, 32), shifts=jitter)
+    volume = Grid.matching(views)
+    assert volume.shape == (10, 32, 32) and abs(volume.centre[0]) < 0.5
+    box = Grid.for_fit(views, volume)
+    assert (box.edges[0] <= volume.edges[0]).all() and (volume.edges[1] <= box.edges[1]).all()
+
+
+def test_a_volume_of_no_stated_size_shows_all_heights_that_jumping_views_see() -> None:
+    views = Geometry.parallel(TURN, (10, 32), shifts=np.resize([[0.0, 10.0], [0.0, -10.0]], (48, 2)))
+    result = reconstruct(project(_sample(9.0, 12.0), views).numpy(), views, method="fbp")
+    planes = np.abs(result.volume.data).sum(axis=(1, 2))
+    assert result.volume.grid.shape[0] == 30 and (planes[:10] > 0).all() and (planes[20:] > 0).all()
+
+
 def test_an_axis_beyond_the_detector_is_no_end_of_the_field() -> None:
     views = Geometry.parallel(TURN, (6, 48), axis_col=-20.0)  # sees what lies 19.5 to 67.5 pixels from the axis
     ring = Gaussians.from_physical([[59.0, 11.0, 0.0], [-50.0, -33.0, 0.5]], np.full((2, 3), 2.0), [0.1, 0.1])
