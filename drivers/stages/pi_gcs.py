@@ -194,6 +194,7 @@ class PiGcsStage:
             raise DeviceTimeout(
                 self.name,
                 f"still moving after {timeout:g} s",
+                request=self._axis.last_move,
                 expected="" if target is None else f"to stand at {self._deg(target)}",
                 advice="Allow more time, or stop it",
                 state=f"It was left moving and is at {self._deg(counts)}",
@@ -353,6 +354,7 @@ class PiGcsStage:
         return DeviceError(
             self.name,
             f"{problem} ({why})",
+            request=self._axis.last_move,
             reply=status.raw,
             expected=expected,
             advice=advice(code) if code in EVENTS else "Find what stopped it (limit switch, person) before moving on",

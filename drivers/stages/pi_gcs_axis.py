@@ -38,6 +38,8 @@ class PiGcsAxis:
         self._line, self._name, self._axis, self._output = line, name, axis, trigger_line
         self._counts_per_turn = counts_per_turn
         self._bit = 0
+        self.last_move = ""
+        """The command of the last move or search, for errors."""
         self._identity = ""
 
     def degrees(self, counts: Fraction | int) -> str:
@@ -157,6 +159,7 @@ class PiGcsAxis:
 
     def _begin(self, command: str) -> None:
         self._line.fault, before, self._line.commanded = 0, self._line.commanded, True
+        self.last_move = command
         code = self._line.tell(command)
         if code in REFUSALS:
             self._line.commanded = before

@@ -175,6 +175,7 @@ class PM16CStage:
             raise DeviceTimeout(
                 self.name,
                 f"still moving after {timeout:g} s",
+                request=self._channel.last_move,
                 reply=status.raw,
                 expected="" if target is None else f"to stand at {self._deg(target)}",
                 advice="Allow more time, or stop it",
@@ -184,6 +185,7 @@ class PM16CStage:
             raise DeviceError(
                 self.name,
                 f"it stopped short of {self._deg(target)} ({status.ending or 'no reason given'})",
+                request=self._channel.last_move,
                 reply=status.raw,
                 expected=f"{self._deg(target)}, {target} counts",
                 advice="Find what stopped it (limit switch, interlock, stop button) before moving on",

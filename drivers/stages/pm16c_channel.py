@@ -93,6 +93,8 @@ class PM16CChannel:
     ) -> None:
         self._name, self._digit = name, f"{channel:X}"
         self._commanded = False
+        self.last_move = ""
+        """The command of the last move or search, for errors."""
         self._restore_local = False
         self._line = SerialLine(
             url,
@@ -223,7 +225,7 @@ class PM16CChannel:
 
     def _begin(self, command: str, target: int | None) -> None:
         """Send a command that moves and see that it does, or that it is at its target (None: no target) already."""
-        self._commanded = True
+        self._commanded, self.last_move = True, command
         self._line.send(command)
         status = self.status()
         there = self.home() == status.counts if target is None else status.counts == target

@@ -182,6 +182,7 @@ class ZaberStage:
             raise DeviceTimeout(
                 self.name,
                 f"still moving after {timeout:g} s",
+                request=self._axis.last_move,
                 reply=status.raw,
                 expected=f"to stand at {aim}" if aim else "",
                 advice="Allow more time, or stop it",
@@ -196,6 +197,7 @@ class ZaberStage:
             raise DeviceError(
                 self.name,
                 f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
+                request=self._axis.last_move,
                 reply=status.raw,
                 expected=f"to stand at {aim} without a fault",
                 advice="Find what stopped it before moving on" if fault is None else fault.advice,

@@ -117,6 +117,8 @@ class ZaberAxis:
         self._ids = itertools.cycle(range(IDS))
         self._must_have_checksum = False
         self._commanded = False
+        self.last_move = ""
+        """The command of the last move or search, for errors."""
         self._found: dict[str, str] = {}
         self._checksums_found = "1"
         self._line = SerialLine(
@@ -183,12 +185,10 @@ class ZaberAxis:
         return status
 
     def move(self, target: int) -> None:
-        self._commanded = True
-        self.ask_axis(f"move abs {target}")
+        self._begin(f"move abs {target}")
 
     def home(self) -> None:
-        self._commanded = True
-        self.ask_axis("home")
+        self._begin("home")
 
     def stop(self, words: str) -> str:
         """Send `stop` or `estop`; what was sent. It waits for nothing: the reply is passed over when it comes."""
@@ -212,6 +212,10 @@ class ZaberAxis:
                 self.ask(f"set comm.checksum {self._checksums_found}")
         finally:
             self._line.close()
+
+    def _begin(self, words: str) -> None:
+        self._commanded, self.last_move = True, words
+        self.ask_axis(words)
 
     def _flags(self, words: str) -> tuple[str, ...]:
         return tuple(self.ask_axis(words, r"\d+(?: \w\w)*").data.split()[1:])
