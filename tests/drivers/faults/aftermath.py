@@ -1,0 +1,81 @@
+"""What must hold after any fault: one error with all its parts, an instrument at rest, a file, and the next scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from beamline.run import MESSAGES, UNSAFE, State
+from drivers.errors import DeviceError
+from drivers.frame import FrameKind
+from tests.drivers.faults.rig import DARKS, FLATS, VIEWS, Rig, Scanned
+
+PARTS = ("device", "problem", "request", "expected", "advice", "state")
+
+
+def assert_speaks(error: BaseException | None, device: str, replied: bool = True) -> None:
+    """It names the device, what was asked, what came back, what was expected, what to do, and what has (not) moved."""
+    assert isinstance(error, DeviceError), error
+    assert error.device == device
+    wanted = (*PARTS, "reply") if replied else PARTS
+    silent = [part for part in wanted if not getattr(error, part)]
+    assert silent == [], f"no {', '.join(silent)} in: {error}"
+    quoted = [repr(getattr(error, part)) for part in ("request", "reply") if part in wanted]
+    assert all(part in str(error) for part in quoted)
+    assert all(getattr(error, part).rstrip(".") in str(error) for part in PARTS if part != "request")
+
+
+def assert_told_once(scanned: Scanned) -> None:
+    """The run fails once, with the words of the error that it raises, which is not among the warnings too."""
+    assert scanned.error is not None
+    assert [event.data["message"] for event in scanned.of("failed")] == [str(scanned.error)]
+    assert str(scanned.error) not in scanned.warnings
+
+
+def assert_at_rest(rig: Rig, scanned: Scanned) -> None:
+    """The stage stands, the shutter is closed, nothing of the library is open, and the run says that it is safe."""
+    assert not rig.moving
+    assert not rig.shutter_open
+    assert rig.world.live == 0
+    said = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
+    assert said == ([] if scanned.folder is None else [MESSAGES[State.STOPPING]])
+
+
+def assert_known_to_be_unsafe(rig: Rig, scanned: Scanned) -> None:
+    """The line is gone, so nothing can be done: that is what the run must say."""
+    assert rig.world.live == 0
+    said = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
+    assert said == [UNSAFE]
+    told = " ".join([*scanned.warnings, str(scanned.error)])
+    assert "What the device was doing it may still be doing" in told
+    if rig.shutter_open:
+        assert "shutter: it could not be closed" in told
+        assert "look before anybody goes near the beam" in told
+
+
+def assert_kept(scanned: Scanned, views: list[int] | None = None, invalid: int = 0) -> None:
+    """A readable file with darks, flats and these views (None: the first ones of the scan, however many)."""
+    rows = scanned.rows()
+    taken = rows[FrameKind.PROJECTION]
+    assert taken == (list(range(len(taken))) if views is None else views)
+    assert len(rows[FrameKind.INVALID]) == invalid
+    if taken:
+        assert (len(rows[FrameKind.DARK]), len(rows[FrameKind.FLAT])) == (DARKS, FLATS)
+    done = scanned.of("scan_done")[0].data
+    assert done["n_frames"] == sum(map(len, rows.values()))
+    assert scanned.status() == "failed"
+
+
+def assert_complete(scanned: Scanned) -> None:
+    assert scanned.error is None
+    assert scanned.rows()[FrameKind.PROJECTION] == list(range(VIEWS))
+    assert scanned.status() == "complete"
+
+
+def assert_next_scan_works(rig: Rig, runs: Path) -> None:
+    """In the same process, over the same controller and library."""
+    rig.clock.sleep(30.0)  # a stage that could not be stopped stands by itself
+    rig.repair()
+    scanned = rig.scan(runs)
+    assert_complete(scanned)
+    assert scanned.warnings == []
+    assert_at_rest(rig, scanned)

@@ -1,0 +1,23 @@
+"""Fixtures of the fault table: the fake DCAM library, and a rig for each controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.drivers.dcam.fake import World, build
+from tests.drivers.faults.rig import Rig
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Path of the compiled library; skips where there is no compiler."""
+    return build(tmp_path_factory.mktemp("fakedcam"))
+
+
+@pytest.fixture
+def rig_of(library: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Rig]:
+    """Makes the rig with a controller of that kind."""
+    return lambda kind: Rig(World(library), monkeypatch, kind)

@@ -1,0 +1,218 @@
+"""The fault table: what breaks, how a scan must end, and for each controller why a fault is not its own.
+
+docs/faults.md has a row for each of these, with the same names; `test_page` keeps them the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from beamline.errors import ConfigError
+from beamline.ledger import LedgerError
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Phase, Rig
+
+FIRST_VIEW = DARKS + FLATS
+"""Row of the file."""
+BETWEEN = 21_000
+"""Counts between views 5 and 6, which are at 20 and 22 degrees."""
+
+
+@dataclass(frozen=True)
+class LineFault:
+    """Something happens to one reply on the serial line.
+
+    Attributes:
+        spoil: the reply as it arrives instead; the same where it is the next one's turn.
+        error: the class of the error, and what it says.
+        replied: something arrived, which the error must show.
+        not_on: controller -> why it cannot happen there.
+        harmless_on: controller -> why the scan is complete in spite of it.
+    """
+
+    fault: str
+    spoil: Callable[[Rig, bytes], bytes]
+    error: type[DeviceError]
+    says: str
+    replied: bool
+    not_on: Mapping[str, str] = field(default_factory=dict)
+    harmless_on: Mapping[str, str] = field(default_factory=dict)
+
+
+def _garbage(rig: Rig, reply: bytes) -> bytes:
+    end = rig.kind.line_end
+    return b"\xfe\x00" + reply.removesuffix(end)[::-1] + end
+
+
+def _changed(rig: Rig, reply: bytes) -> bytes:
+    """Another digit, in a reply that has a checksum."""
+    return reply.replace(b"0", b"8", 1) if b":" in reply else reply
+
+
+LINE: tuple[LineFault, ...] = (
+    LineFault("no reply", lambda rig, reply: b"", DeviceTimeout, "no whole reply within 1 s", replied=False),
+    LineFault(
+        "garbage",
+        _garbage,
+        DeviceError,
+        r"the reply does not have the form|the reply was damaged",
+        replied=True,
+    ),
+    LineFault(
+        "half a reply",
+        lambda rig, reply: reply[: max(1, (len(reply) - len(rig.kind.line_end)) // 2)],
+        DeviceTimeout,
+        "no whole reply within 1 s",
+        replied=True,
+    ),
+    LineFault(
+        "wrong checksum",
+        _changed,
+        DeviceError,
+        "the reply was damaged on the way: its checksum is",
+        replied=True,
+        not_on={
+            "pm16c": "its lines carry no checksum: a changed digit is noticed where settings are read back",
+            "pi_gcs": "its lines carry no checksum: a changed digit is noticed where settings are read back",
+        },
+    ),
+    LineFault(
+        "echo",
+        lambda rig, reply: rig.cable.last_request + reply,
+        DeviceError,
+        "the reply does not have the form",
+        replied=True,
+        harmless_on={"zaber": "what a host sends begins with another sign than a reply, and is passed over"},
+    ),
+    LineFault(
+        "a line that nobody asked for",
+        lambda rig, reply: rig.kind.unasked(rig.controller) + reply,
+        DeviceError,
+        "the reply does not have the form",
+        replied=True,
+        harmless_on={
+            "pm16c": "it tells of stops without being asked; such a line is passed over",
+            "zaber": "alerts are marked as such and passed over",
+        },
+    ),
+)
+LINE_PHASES = tuple(Phase)
+
+UNPLUGGED = "stage unplugged"
+"""In each phase with the next request, and while the stage turns and nobody asks it."""
+
+
+@dataclass(frozen=True)
+class MotionFault:
+    """Something stops the stage between views 5 and 6.
+
+    Attributes:
+        breaks: arranges it before the scan.
+        says: controller -> what the error says besides that it stopped short.
+    """
+
+    fault: str
+    breaks: Callable[[Rig], None]
+    says: Mapping[str, str]
+
+
+def _stop_after_view_5(rig: Rig) -> None:
+    rig.at_frame[FIRST_VIEW + 5] = rig.stop_from_elsewhere
+
+
+MOTION: tuple[MotionFault, ...] = (
+    MotionFault(
+        "fault in motion",
+        lambda rig: rig.block(stall_at=BETWEEN),
+        {"pm16c": "emergency stop", "pi_gcs": "error 1024", "zaber": r"stalled and stopped \(FS\)"},
+    ),
+    MotionFault(
+        "limit switch",
+        lambda rig: rig.block(switch_at=BETWEEN),
+        {"pm16c": "limit", "pi_gcs": "positive limit switch", "zaber": r"limit error \(FE\)"},
+    ),
+    MotionFault(
+        "stopped by somebody else",
+        _stop_after_view_5,
+        {"pm16c": "stop command", "pi_gcs": "error 10", "zaber": r"movement interrupted \(NI\)"},
+    ),
+)
+
+
+@dataclass(frozen=True)
+class PulseFault:
+    """The trigger cable loses pulses or picks some up.
+
+    Attributes:
+        missing: views.
+        invalid: rows without a trigger.
+    """
+
+    fault: str
+    breaks: Callable[[Rig], None]
+    says: str
+    missing: tuple[int, ...] = ()
+    invalid: int = 0
+
+
+def _lose(*pulses: int) -> Callable[[Rig], None]:
+    def breaks(rig: Rig) -> None:
+        rig.trigger_cable.lost = frozenset(pulses)
+
+    return breaks
+
+
+def _pick_up(*after: int) -> Callable[[Rig], None]:
+    def breaks(rig: Rig) -> None:
+        rig.trigger_cable.picked_up_after = frozenset(after)
+
+    return breaks
+
+
+PULSES: tuple[PulseFault, ...] = (
+    PulseFault("pulses lost on the way", _lose(3, 7, 8), "3 of 12 projections are missing: 3, 7-8", (3, 7, 8)),
+    PulseFault(
+        "fewer pulses than planned",
+        _lose(9, 10, 11),
+        "3 of 12 projections are missing: 9-11",
+        (9, 10, 11),
+    ),
+    PulseFault("extra pulses", _pick_up(2, 6), "2 frames came without a trigger", invalid=2),
+)
+"""Beyond the controllers, but run on each: their pulses differ in width and in when they are on the line."""
+
+CAMERA_KIND = "pm16c"
+"""What the camera does is the same with every controller, so camera faults run on one."""
+CAMERA: Mapping[str, type[Exception]] = MappingProxyType(
+    {
+        "camera absent at start": DeviceError,
+        "an error of the camera's library": DeviceError,
+        "frame lost in the camera": LedgerError,
+        "ring overrun": LedgerError,
+        "camera unplugged": DeviceError,
+        "triggers planned too fast": ConfigError,
+        "triggers too fast for the camera": LedgerError,
+        "setting refused": DeviceRefused,
+        "slow USB link": LedgerError,
+    }
+)
+"""Fault -> how a scan ends; `test_camera` has one test for each."""
+
+FAULTS = (
+    *(row.fault for row in LINE),
+    UNPLUGGED,
+    *(row.fault for row in MOTION),
+    *(row.fault for row in PULSES),
+    *CAMERA,
+)
+
+
+def applies() -> None:
+    """Every controller that a row speaks of exists, and no row is silent on a controller without saying why."""
+    for row in LINE:
+        assert set(row.not_on) <= set(KINDS) and set(row.harmless_on) <= set(KINDS)
+        assert all(row.not_on.values()) and all(row.harmless_on.values())
+    assert all(set(row.says) == set(KINDS) for row in MOTION)
+    assert VIEWS == 12

@@ -1,0 +1,59 @@
+"""Faults of the stage's motion and of the trigger cable, on every controller."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from beamline.ledger import LedgerError
+from drivers.frame import FrameKind
+from tests.drivers.faults import table
+from tests.drivers.faults.aftermath import (
+    assert_at_rest,
+    assert_kept,
+    assert_next_scan_works,
+    assert_speaks,
+    assert_told_once,
+)
+from tests.drivers.faults.rig import KINDS, VIEWS, Rig
+
+RigOf = Callable[[str], Rig]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("row", table.MOTION, ids=lambda row: row.fault)
+def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path) -> None:
+    """The views before it are in the file; no view is called missing, for it was never reached."""
+    rig = rig_of(kind)
+    row.breaks(rig)
+    scanned = rig.scan(tmp_path)
+    assert_speaks(scanned.error, "stage")
+    assert re.search(r"it stopped short of 38\.0000 deg.*It stands at 2[1-5]\.", str(scanned.error))
+    assert re.search(row.says[kind], str(scanned.error))
+    assert_told_once(scanned)
+    assert scanned.warnings == []
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned)
+    assert len(scanned.rows()[FrameKind.PROJECTION]) in range(6, VIEWS)
+    assert_next_scan_works(rig, tmp_path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("row", table.PULSES, ids=lambda row: row.fault)
+def test_a_trigger_cable_that_loses_or_picks_up_pulses(
+    rig_of: RigOf, row: table.PulseFault, kind: str, tmp_path: Path
+) -> None:
+    rig = rig_of(kind)
+    row.breaks(rig)
+    scanned = rig.scan(tmp_path)
+    assert isinstance(scanned.error, LedgerError)
+    assert row.says in str(scanned.error)
+    assert "Repeat these views, or reconstruct without them" in str(scanned.error)
+    assert [index - table.FIRST_VIEW for index in scanned.error.missing] == list(row.missing)
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned, [view for view in range(VIEWS) if view not in row.missing], row.invalid)
+    assert_next_scan_works(rig, tmp_path)
