@@ -15,6 +15,7 @@ from recon.fdk import fdk
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.iterative import solve
+from recon.masks import masked
 from recon.operators import Projector
 from recon.solvers import OsSirtTv
 from recon.splat import RayModel, project
@@ -29,6 +30,10 @@ MATTER = 0.05
 # Standard deviation of a new Gaussian in distances to its neighbours. Zha et al. take 1; narrower ones start sharper
 # and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3; 0.55 loses on the walnut).
 _SPREAD = 0.8
+
+# A pixel is wild beyond so many times the brightest one of other views: no sample shows so much more from one side than
+# from most. A tenth of the views, and one in any case, may hold such pixels.
+_WILD, _WILD_VIEWS = 10.0, 0.1
 
 _SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum more of them only begin to follow the noise
 
@@ -71,17 +76,35 @@ def place(
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
     volume = first_volume(projections, geometry, grid, start)
     placed = sample_gaussians(volume, wanted, rng, field_radius=geometry.reach)
-    return scale_to_data(placed, projections, geometry, rays=rays)
+    return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
+
+
+def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Projections [view, row, col] without values ten times as large as other views' largest: filled from neighbours.
+
+    One such pixel is a streak through a first volume, and may have all of a least-squares factor. A tenth of the views,
+    and one in any case, may hold such pixels. A view of nothing else is clipped.
+    """
+    peaks = np.maximum(projections.max(axis=(1, 2)), -projections.min(axis=(1, 2)))
+    sound = max(1, peaks.size - max(1, round(_WILD_VIEWS * peaks.size)))
+    largest = _WILD * float(np.partition(peaks, sound - 1)[sound - 1])
+    if not (0 < largest < peaks.max()):
+        return projections
+    tame = np.array(projections, np.float32)
+    for view in np.flatnonzero(peaks > largest):
+        if (np.abs(tame[view]) > largest).all():
+            np.clip(tame[view], -largest, largest, out=tame[view])
+    return masked(tame, None, largest)[0]
 
 
 def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp") -> Volume:
-    """A quick volume to draw Gaussians from, 1/mm.
+    """A quick volume to draw Gaussians from, 1/mm, in which wild pixels have no part (see `without_wild_pixels`).
 
     "fbp": FBP or FDK; a cone's short scan, for which there is no FDK here, gets a few sweeps of OS-SIRT with TV
     instead. "tv": these sweeps, always: slower, and without streaks where views are few. Rolled and tilted views count
     as straight ones here: the fit knows better.
     """
-    straight = geometry.straightened()
+    straight, projections = geometry.straightened(), without_wild_pixels(projections)
     if start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles)):
         sweeps = OsSirtTv(iterations=_SWEEPS, momentum=True)
         return solve(sweeps, Projector(straight, grid), projections)

@@ -16,6 +16,7 @@ from recon.correct import References, correct
 from recon.fbp import fbp
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
+from recon.initialise import without_wild_pixels
 from recon.metrics import psnr
 from recon.reconstruction import Reconstruction, reconstruct
 from recon.splat import Truncation, project
@@ -107,6 +108,28 @@ def test_values_that_are_not_finite_weigh_nothing_whatever_they_are(clean: F32, 
     for other in volumes[1:]:
         np.testing.assert_array_equal(other, volumes[0])
     assert psnr(truth, volumes[0]) > psnr(truth, fitted(clean, steps=150).volume.data) - 0.5
+
+
+@pytest.mark.parametrize("value", [1e30, -1e30, 1e9, 3e3, 300.0])
+def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, value: float) -> None:
+    # It may have no part in where the first Gaussians are placed, nor in how dense they are.
+    wild, without = clean.copy(), clean.copy()
+    wild[9, 4, 31], without[9, 4, 31] = value, np.nan
+    found, expected = fitted(wild).volume.data, fitted(without).volume.data
+    if abs(value) > 1e6:  # beyond what `make_problem` takes: as if it were not finite
+        np.testing.assert_array_equal(found, expected)
+    assert psnr(truth, found) > psnr(truth, expected) - 0.5
+
+
+def test_views_of_nothing_else_are_no_reason_to_fill_the_others(clean: F32) -> None:
+    # Most views before the sample was there: what the few others show is not wild.
+    late = np.concatenate((np.full((24, *SHAPE), 1e-5, np.float32), clean[24:]))
+    np.testing.assert_array_equal(without_wild_pixels(late), late)
+    closed = clean.copy()
+    closed[5] = 1e4  # a view of nothing but nonsense, which has nothing to be filled from
+    tame = without_wild_pixels(closed)
+    np.testing.assert_array_equal(np.delete(tame, 5, 0), np.delete(clean, 5, 0))
+    assert tame[5].max() <= 10 * clean.max()
 
 
 def test_a_nan_in_naive_arithmetic_takes_everything(clean: F32) -> None:
