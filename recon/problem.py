@@ -22,6 +22,8 @@ _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 # Images hold values of about one. Of ones beyond this no matter in the field can be the cause, and sums of products of
 # their squares, which SSIM takes, would leave float32's range.
 _LARGEST = 1e6
+# Of views that come later, where the unit may be that of the noise before the sample was there: what SSIM could not hold.
+_LARGEST_LATER = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +108,16 @@ def make_problem(
 def extend(problem: Problem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None) -> Problem:
     """The problem with more views [view, row, col]; those it has are not copied.
 
-    The size of new values is not judged: where the first views showed nothing, it is the density unit that is wrong.
+    Large values are let in up to what the loss can hold: where the first views showed nothing, it is the density unit
+    that is wrong. Only beyond a thousand million half fields times density units they get no weight.
 
     Raises:
-        ValueError: where the problem's views differ in shift, roll or tilt, see `Geometry.at`.
+        ValueError: where the problem's views differ in shift, roll or tilt, see `Geometry.at`, or a view has no value
+            that can be used.
     """
     geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
-    return replace(_with_views(problem, *masked(projections, weights)), geometry=geometry)
+    largest = _LARGEST_LATER * problem.half_field * problem.unit
+    return replace(_with_views(problem, *masked(projections, weights, largest)), geometry=geometry)
 
 
 def joined(geometry: Geometry, factor: int) -> Geometry:

@@ -32,7 +32,7 @@ _ROOM = 0.1  # of the first count that a round may add; the last one has what is
 
 # Slower than where all views are there from the start: each round would undo with its first fast steps what the last
 # one had learnt (battery of 180 views: 30.7 dB with the rates of `FitSettings`, 31.9 with these).
-WHILE_VIEWS_COME = fit.FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15)
+WHILE_VIEWS_COME = fit.FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15, tv_size=32)
 
 
 class StreamingFit:
@@ -44,12 +44,12 @@ class StreamingFit:
         grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
         seed: of every random choice.
         gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
-        settings: of the fit.
+        settings: of the fit; `coarse` is for fits whose views are all there.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
         now: a clock in s.
 
     Raises:
-        ValueError: for no Gaussians, or a template whose views differ in shift, roll or tilt.
+        ValueError: for no Gaussians, settings with `coarse`, or a template whose views differ in shift, roll or tilt.
     """
 
     def __init__(
@@ -70,6 +70,11 @@ class StreamingFit:
             raise ValueError(f"a model needs at least one Gaussian, got {gaussians}")
         self._count = gaussians
         self._settings = settings or WHILE_VIEWS_COME
+        if self._settings.coarse > 1:
+            raise ValueError(
+                f"coarse={self._settings.coarse} begins a fit on joined pixels, for a share of its steps: while views "
+                "come, their number is not known. Set `coarse` to 1 here"
+            )
         self._first_views, self._first_span = first_views, first_span
         self._now, self._start = now, now()
         self._data: list[F32] = []
@@ -96,7 +101,8 @@ class StreamingFit:
         """Line integrals [k, row, col] at angles [k] in radians; they count from the next step on.
 
         Raises:
-            ValueError: where shapes disagree with the template or values are not finite; nothing is added.
+            ValueError: where shapes disagree with the template, values are not finite, or a view holds nothing but
+                values far too large; nothing is added.
         """
         theta = np.atleast_1d(np.asarray(angles, np.float64))
         expected = (theta.size, *self._template.detector_shape)
@@ -106,11 +112,11 @@ class StreamingFit:
             images = np.array(data, np.float32)
         if not (np.isfinite(images).all() and np.isfinite(theta).all()):
             raise ValueError("new views hold values or angles that are not finite; nothing was added")
-        self._angles.extend(theta.tolist())
         if self._problem is None:
             self._data.extend(images)
         else:
             self._problem = extend(self._problem, images, theta)
+        self._angles.extend(theta.tolist())
 
     def move_axis(self, axis_col: float) -> None:
         """Say that the rotation axis lies elsewhere. The model stays: a fraction of a pixel is soon learnt again.

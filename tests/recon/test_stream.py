@@ -158,6 +158,26 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
         model.finish(0.1)
 
 
+def test_a_setting_that_would_do_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="coarse=2 begins a fit on joined pixels"):
+        StreamingFit(VIEWS, GRID, settings=fit.FitSettings(coarse=2))
+
+
+def test_one_wild_pixel_does_not_spoil_what_has_come_or_comes(data: np.ndarray, phantom: Phantom) -> None:
+    truth, qualities = phantom.attenuation(GRID), []
+    for marred in (None, 3, 30):  # among the first views, and after the model has been placed
+        views = data.copy()
+        if marred is not None:
+            views[marred, 10, 17] = 1e30
+        model = _stream(views, np.argsort((np.arange(40) * 0.618) % 1))
+        with pytest.raises(ValueError, match="no value"):
+            model.add_views(np.full((1, *SHAPE), 1e30, np.float32), [0.1])
+        assert model.n_views == 40
+        model.finish(4.0)
+        qualities.append(psnr(truth, model.snapshot().data))
+    assert min(qualities) > qualities[0] - 1.0
+
+
 def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np.ndarray) -> None:
     for name, own in (("shifts", [[0, 0], [3, 0]]), ("roll", [0, 0.1]), ("tilt", [0, 0.1])):
         with pytest.raises(ValueError, match=f"{name} differ from view to view"):
