@@ -13,7 +13,8 @@ from pathlib import Path
 from drivers.beam_monitor import within_a_line
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
-from drivers.serial_line import Framing, Probe, SerialLine
+from drivers.line_reader import Framing
+from drivers.serial_line import Probe, SerialLine
 
 QUERY = "READ?"
 PATTERN = r"^\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)"

@@ -8,22 +8,21 @@ been answered and the line has fallen quiet. Commands without a reply wait for n
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import serial
 
 from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.line_reader import CRLF, Damaged, Framing, LineReader, readable
 from drivers.serial_port import open_port
 from drivers.transcript import Transcript
 
-LONGEST_LINE = 1024
-LONGEST_REPLY = 1 << 16
-"""Characters of a reply of several lines."""
 QUIET = 0.05
 """s without a byte after which a line counts as quiet."""
 
@@ -34,27 +33,6 @@ class Probe:
 
     request: str
     reply: str
-
-
-@dataclass(frozen=True)
-class Framing:
-    """How lines end: commands with `command_end`, what the device sends with `line_end`.
-
-    `continued`: text at the end of a line that says that another line follows; "" where every reply is one line. The
-    reply is then its lines without that text, joined by newlines.
-    """
-
-    command_end: bytes = b"\r\n"
-    line_end: bytes = b"\r\n"
-    continued: str = ""
-
-
-@dataclass(frozen=True)
-class _Damaged:
-    """A line that is not what the device sent, as its checksum says."""
-
-    text: str
-    why: str
 
 
 def _sound(line: str) -> str:
@@ -69,13 +47,13 @@ class SerialLine:
         url: what pyserial opens: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
         device: the name that errors carry.
         probe: see `Probe`.
-        timeout: s for a whole reply.
+        timeout: s for a whole reply, more than 0.
         unsolicited: form of lines that the device may send unasked; they are noted and passed over.
         check: what is wrong with a received line, "" where nothing is; for checksums.
         transcript: file to which every byte sent and received is appended with its time; None keeps none.
 
     Raises:
-        DeviceError: the port or the transcript cannot be opened.
+        DeviceError: the port or the transcript cannot be opened. DeviceRefused: a timeout that is none.
     """
 
     def __init__(
@@ -88,16 +66,20 @@ class SerialLine:
         timeout: float,
         baudrate: int,
         unsolicited: str = r"(?!)",
-        framing: Framing = Framing(),
+        framing: Framing = CRLF,
         check: Callable[[str], str] = _sound,
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
-        self._unsolicited, self._framing, self._check = re.compile(unsolicited), framing, check
         self._asking, self._writing = threading.RLock(), threading.Lock()
-        self._received = bytearray()
-        self._asked = ""  # what the present reply is awaited for, for errors
-        self._in_step = True
+        self._framing, self._in_step, self._closed = framing, True, False
+        if not 0 < timeout < math.inf:
+            raise DeviceRefused(
+                device,
+                f"no reply comes within a timeout of {timeout} s, or it is waited for without end",
+                expected="a positive number of seconds",
+                state="Nothing was sent",
+            )
         try:
             self._transcript = Transcript(clock, transcript)
         except OSError as problem:
@@ -109,8 +91,10 @@ class SerialLine:
             ) from problem
         try:
             self._port = open_port(url, baudrate, QUIET, timeout)
-        except (OSError, ValueError) as problem:
+        except BaseException as problem:
             self._transcript.close()
+            if not isinstance(problem, OSError | ValueError):
+                raise
             raise DeviceError(
                 device,
                 f"the port {url!r} does not open: {problem}",
@@ -118,6 +102,7 @@ class SerialLine:
                 advice="Check the cable, the port's name in the configuration and that no other program holds it",
                 state="Nothing was sent",
             ) from problem
+        self._reader = LineReader(self._port, clock, self._transcript, framing, unsolicited, check)
 
     def send(self, command: str) -> None:
         """Send a command that has no reply. It goes out even where the line is out of step or another thread waits for
@@ -130,7 +115,7 @@ class SerialLine:
 
     def send_raw(self, data: bytes) -> None:
         """`send` for bytes without an end, such as one control character."""
-        self._write(data, _readable(data))
+        self._write(data, readable(data))
 
     def query(self, request: str, reply: str, meaning: str, state: str = "") -> re.Match[str]:
         """Send a request and read its reply.
@@ -147,35 +132,37 @@ class SerialLine:
 
     def query_raw(self, data: bytes, reply: str, meaning: str, state: str = "") -> re.Match[str]:
         """`query` for bytes without an end, such as one control character."""
-        return self._query(data, _readable(data), reply, meaning, state)
+        return self._query(data, readable(data), reply, meaning, state)
 
     def close(self) -> None:
-        """Free the port; a second time does nothing."""
+        """Free the port, once a request of another thread is through; a second time does nothing."""
         with self._asking, self._writing:
+            self._closed = True
             with contextlib.suppress(OSError):  # a port that is gone has nothing to free
                 self._port.close()
             self._transcript.close()
 
     def _query(self, data: bytes, request: str, reply: str, meaning: str, state: str) -> re.Match[str]:
         with self._asking:
-            self._asked = request
-            if not self._in_step:
-                self._find_step(state)
-            self._in_step = False
-            self._pass_over_what_came_before()
-            self._write(data, request)
-            text = self._read_reply()
+            self._refuse_if_closed(request)
+            with self._port_may_go(request):
+                if not self._in_step:
+                    self._find_step(request, state)
+                self._in_step = False
+                self._reader.pass_over_what_came_before()
+                self._write(data, request)
+                text = self._reader.reply(self._clock.now() + self._timeout)
             if text is None:
                 raise self._error(
                     DeviceTimeout,
                     f"no whole reply within {self._timeout:g} s",
                     request=request,
-                    reply=_readable(self._received[:80]),
+                    reply=self._reader.begun[:80],
                     expected=meaning,
                     advice="Check power, cable and baud rate; the next request will first find the line's step again",
                     state=state,
                 )
-            if isinstance(text, _Damaged):
+            if isinstance(text, Damaged):
                 raise self._error(
                     DeviceError,
                     f"the reply was damaged on the way: {text.why}",
@@ -199,13 +186,13 @@ class SerialLine:
             self._in_step = True
             return match
 
-    def _find_step(self, state: str) -> None:
+    def _find_step(self, request: str, state: str) -> None:
         """Throw away what is on the line, probe, pass over late replies until the probe's own, wait for quiet."""
         self._transcript.tell("!", "out of step: probing")
-        self._wait_for_quiet(state)
+        self._wait_for_quiet(request, state)
         self._write(self._probe.request.encode("ascii") + self._framing.command_end, self._probe.request)
         deadline = self._clock.now() + self._timeout
-        while (text := self._read_line(deadline)) is not None:
+        while (text := self._reader.line(deadline)) is not None:
             if isinstance(text, str) and re.fullmatch(self._probe.reply, text):
                 break
         else:
@@ -217,112 +204,60 @@ class SerialLine:
                 advice="Check power, cable and baud rate",
                 state=state,
             )
-        self._wait_for_quiet(state)
+        self._wait_for_quiet(request, state)
         self._in_step = True
         self._transcript.tell("!", "in step again")
 
-    def _wait_for_quiet(self, state: str) -> None:
-        deadline = self._clock.now() + max(self._timeout, 10 * QUIET)
-        while (junk := self._read()) or self._received:
-            self._transcript.tell("!", f"passed over {_readable(self._received + junk)}")
-            self._received.clear()
-            if self._clock.now() > deadline:
-                raise self._error(
-                    DeviceTimeout,
-                    "it sends without pause and was not asked",
-                    request=self._asked,
-                    expected="a quiet line before the next request",
-                    advice="Check the baud rate and that the port is this device's",
-                    state=state,
-                )
-
-    def _pass_over_what_came_before(self) -> None:
-        """Whole lines that are here before the request cannot be its reply. The rest may begin a line sent unasked."""
-        while len(self._received) <= LONGEST_LINE and self._waiting():
-            self._received += self._read()
-        old, end, rest = bytes(self._received).rpartition(self._framing.line_end)
-        if end:
-            self._transcript.tell("!", f"passed over {_readable(old)}")
-            self._received = bytearray(rest)
+    def _wait_for_quiet(self, request: str, state: str) -> None:
+        if not self._reader.drain(self._clock.now() + max(self._timeout, 10 * QUIET)):
+            raise self._error(
+                DeviceTimeout,
+                "it sends without pause and was not asked",
+                request=request,
+                expected="a quiet line before the next request",
+                advice="Check the baud rate and that the port is this device's",
+                state=state,
+            )
 
     def _write(self, data: bytes, text: str) -> None:
         with self._writing:
+            self._refuse_if_closed(text)
             self._transcript.tell(">", text)
             self._transcript.keep(">", data)
-            try:
+            with self._port_may_go(text):
                 self._port.write(data)
-            except serial.SerialTimeoutException as problem:
-                raise self._error(
-                    DeviceTimeout,
-                    f"it took no bytes for {self._timeout:g} s",
-                    request=text,
-                    expected="a device that takes what is sent",
-                    advice="Check power, cable and flow control (none is expected)",
-                    state="What the device was doing it may still be doing",
-                ) from problem
-            except OSError as problem:
-                raise self._port_gone(problem, text) from problem
 
-    def _read_reply(self) -> str | _Damaged | None:
-        """The lines of the reply, joined; None where they are not whole within the timeout or never end."""
-        deadline = self._clock.now() + self._timeout
-        continued = self._framing.continued
-        lines: list[str] = []
-        while sum(map(len, lines)) <= LONGEST_REPLY:
-            line = self._read_line(deadline)
-            if not isinstance(line, str):
-                return line
-            if not continued or not line.endswith(continued):
-                return "\n".join([*lines, line])
-            lines.append(line.removesuffix(continued))
-        return None
-
-    def _read_line(self, deadline: float) -> str | _Damaged | None:
-        """The next line that the device was asked for; None where none is whole by `deadline`."""
-        while True:
-            while self._framing.line_end in self._received:
-                line, _, rest = bytes(self._received).partition(self._framing.line_end)
-                self._received = bytearray(rest)
-                text = _readable(line)
-                self._transcript.tell("<", text)
-                if why := self._check(text):
-                    return _Damaged(text, why)
-                if not self._unsolicited.fullmatch(text):
-                    return text
-            if self._clock.now() >= deadline or len(self._received) > LONGEST_LINE:
-                return None
-            self._received += self._read()
-
-    def _read(self) -> bytes:
-        """What is there, or what comes first; nothing where the line is quiet."""
-        waiting = self._waiting()
+    @contextlib.contextmanager
+    def _port_may_go(self, request: str) -> Iterator[None]:
+        """What the port raises, in the words of the device."""
+        state = "What the device was doing it may still be doing"
         try:
-            data = bytes(self._port.read(max(1, waiting)))
+            yield
+        except serial.SerialTimeoutException as problem:
+            raise self._error(
+                DeviceTimeout,
+                f"it took no bytes for {self._timeout:g} s",
+                request=request,
+                expected="a device that takes what is sent",
+                advice="Check power, cable and flow control (none is expected)",
+                state=state,
+            ) from problem
         except OSError as problem:
-            raise self._port_gone(problem, self._asked) from problem
-        self._transcript.keep("<", data)
-        return data
+            raise self._error(
+                DeviceError,
+                f"the port failed: {problem}",
+                request=request,
+                expected="a port that stays there",
+                advice="Check that the cable or adapter is still plugged in, then start again",
+                state=state,
+            ) from problem
 
-    def _waiting(self) -> int:
-        """How many bytes can be read at once; over TCP only whether there are any."""
-        try:
-            return int(self._port.in_waiting)
-        except OSError as problem:
-            raise self._port_gone(problem, self._asked) from problem
-
-    def _port_gone(self, problem: OSError, request: str) -> DeviceError:
-        return self._error(
-            DeviceError,
-            f"the port failed: {problem}",
-            request=request,
-            expected="a port that stays there",
-            advice="Check that the cable or adapter is still plugged in, then start again",
-            state="What the device was doing it may still be doing",
-        )
+    def _refuse_if_closed(self, request: str) -> None:
+        """What a closed port itself raises differs from system to system."""
+        if self._closed:
+            raise DeviceError(
+                self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
+            )
 
     def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
         return kind(self._device, problem, wire=self._transcript.told(), **parts)
-
-
-def _readable(data: bytes | bytearray) -> str:
-    return bytes(data).decode("ascii", errors="backslashreplace")

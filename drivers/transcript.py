@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from io import FileIO
@@ -49,8 +50,7 @@ class Transcript:
                 self._file.write(f"{self._clock.now():.6f} {mark} {data!r}\n".encode("ascii"))
             except OSError as problem:
                 self._last.append((self._clock.now(), "!", f"transcript given up: {problem}"))
-                self._file.close()
-                self._file = None
+                self._give_up()
 
     def told(self) -> str:
         """The last lines and how long ago they went."""
@@ -60,9 +60,13 @@ class Transcript:
 
     def close(self) -> None:
         with self._lock:
-            if self._file is not None:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # a disk that is full or gone may say so once more
                 self._file.close()
-                self._file = None
+            self._file = None
 
 
 def _cut(text: str) -> str:

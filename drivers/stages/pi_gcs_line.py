@@ -12,7 +12,8 @@ from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial_line import Framing, Probe, SerialLine
+from drivers.line_reader import Framing
+from drivers.serial_line import Probe, SerialLine
 from drivers.stages.pi_gcs_errors import REFUSALS, advice, meaning
 
 FRAMING = Framing(command_end=b"\n", line_end=b"\n", continued=" ")
@@ -62,7 +63,6 @@ class GcsLine:
         """A move was begun: what is said of a failure depends on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
-        self._closed = False
         self._serial = SerialLine(
             url,
             device=name,
@@ -81,16 +81,16 @@ class GcsLine:
     def tell(self, command: str) -> int:
         """Send a set command; the code that the register then has."""
         with self._register:
-            self._line().send(command)
+            self._serial.send(command)
             return self.read_error()
 
     def stop(self, command: str | bytes) -> None:
         """Send a stop, as a command or a control byte, whoever else is asking; then see that it was understood. It sets
         a code of its own, and what else went wrong before does not speak against it."""
         if isinstance(command, str):
-            self._line().send(command)
+            self._serial.send(command)
         else:
-            self._line().send_raw(command)
+            self._serial.send_raw(command)
         with self._register:
             code = self.read_error()
         if code in REFUSALS:
@@ -120,8 +120,8 @@ class GcsLine:
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
         """A query as text, or as a control byte; the match of its whole reply with `form`."""
         if isinstance(request, bytes):
-            return self._line().query_raw(request, form, meant, self._state())
-        return self._line().query(request, form, meant, self._state())
+            return self._serial.query_raw(request, form, meant, self._state())
+        return self._serial.query(request, form, meant, self._state())
 
     def flag(self, query: str) -> bool:
         """A query of the axis that is answered by 0 or 1."""
@@ -156,17 +156,11 @@ class GcsLine:
 
     def wake(self) -> None:
         """End what another program may have left half said."""
-        self._line().send("")
+        self._serial.send("")
 
     def close(self) -> None:
         """Free the port; a second time does nothing."""
-        self._closed = True
         self._serial.close()
-
-    def _line(self) -> SerialLine:
-        if self._closed:  # what a closed port raises differs from system to system
-            raise DeviceError(self._name, "it was closed", advice="Open it again", state="Nothing was sent")
-        return self._serial
 
     def _state(self) -> str:
         return "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"

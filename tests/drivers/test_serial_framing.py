@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceError, DeviceTimeout
-from drivers.serial_line import LONGEST_REPLY, Framing, Probe, SerialLine
+from drivers.line_reader import LONGEST_REPLY, Framing
+from drivers.serial_line import Probe, SerialLine
 from simulators.clock import VirtualClock
 from simulators.serial_url import register
 

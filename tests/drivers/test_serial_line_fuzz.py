@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceError
-from drivers.serial_line import QUIET, Framing, Probe, SerialLine
+from drivers.line_reader import Framing
+from drivers.serial_line import QUIET, Probe, SerialLine
 from simulators.clock import VirtualClock
 from simulators.serial_url import register
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed, plans
