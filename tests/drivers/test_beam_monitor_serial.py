@@ -36,7 +36,7 @@ def test_the_current_of_the_moment() -> None:
         assert reading.value == pytest.approx(1e-9 * (reading.time - 99), abs=2.1e-12)
     assert second.time - first.time == pytest.approx(10.02, abs=0.01)
     monitor.close()
-    with pytest.raises(DeviceError, match="the it was closed"):
+    with pytest.raises(DeviceError, match="it was closed"):
         monitor.reading()
 
 
