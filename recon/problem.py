@@ -22,7 +22,7 @@ _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 # Images hold values of about one. Of ones beyond this no matter in the field can be the cause, and sums of products of
 # their squares, which SSIM takes, would leave float32's range.
 _LARGEST = 1e6
-# Of views that come later, where the unit may be that of the noise before the sample was there: what SSIM could not hold.
+# Of later views, where the unit may be that of the noise before the sample was there: what SSIM could not hold.
 _LARGEST_LATER = 1e9
 
 
