@@ -132,16 +132,6 @@ def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigm
     return table
 
 
-def view_backward(
-    active: Active, geometry: Geometry, view: int, table: F32, gradient: F32, into: Gradients, centres: F32
-) -> None:
-    """Add one view's image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
-    footprints_backward(
-        table, moments(table, gradient), active.means, active.scales, active.rotations, active.densities,
-        camera(geometry, view), into.means, into.log_scales, into.rotations, into.densities, centres,
-    )  # fmt: skip
-
-
 @dataclass(frozen=True, eq=False)
 class Room:
     """Memory that views of n Gaussians may share, one after the other: a step on 50k of them allocates several MB."""

@@ -32,7 +32,7 @@ from recon.kernels.adam_cpu import adam_all
 from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W
 from recon.kernels.losses_cpu import ProjectionLoss, total_variation
 from recon.kernels.project_cpu import moments, render, render_layers
-from recon.splat import Active, Gradients, grid_layout, project, view_backward, view_table
+from recon.splat import Active, Gradients, grid_layout, project, render_view, view_table
 from recon.volume import Grid
 from recon.warm_up import warm_up
 
@@ -160,7 +160,7 @@ def test_a_whole_step_and_its_parts() -> None:
     table = view_table(active, views, 2, cut.faint, cut.sigmas)
     image, layers = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE)
     slope, into, centres = np.empty_like(image), Gradients.zeros(n), np.empty((n, 2), np.float32)
-    render(table, image, layers)
+    seen = render_view(active, views, 2, cut.faint, cut.sigmas, settings.rays, image=image)
     loss = ProjectionLoss((SIDE, SIDE), 0.25)
     loss(image, problem.images[2], problem.target_maps[2], slope)
     box = Grid((32, 32, 32))
@@ -182,7 +182,7 @@ def test_a_whole_step_and_its_parts() -> None:
         ("render", lambda: render(table, image, layers)),
         ("loss (L1, SSIM)", lambda: loss(image, problem.images[2], problem.target_maps[2], slope)),
         ("moments", lambda: moments(table, slope, found)),
-        ("moments, footprints back", lambda: view_backward(active, views, 2, table, slope, into, centres)),
+        ("moments, footprints back", lambda: seen.backward(slope, into, centres)),
         ("TV box: find", lambda: grid_layout(active, box, 1e-7, cut.sigmas)),
         ("TV box: fill", layout.fill),
         ("TV box: loss", lambda: total_variation(density, tv, 0.1)),
