@@ -219,7 +219,10 @@ def _account(done: Done) -> str:
         at = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"
         text = f"{n} of {block.n} {noun}s are missing: {spans(taken.missing)}{at}."
         if taken.lost:
-            text += f" {taken.lost} were exposed but never delivered by the camera."
+            text += (
+                f" {taken.lost} were exposed but never delivered by the camera: `beamline doctor` looks at its link "
+                "and at the disk."
+            )
         if taken.ignored:
             text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
     if taken.extra:
