@@ -33,7 +33,13 @@ class Session:
             found = self._start()
             if index >= found:
                 raise DeviceError(
-                    device, f"there is no camera {index}", expected=f"an index below {found}, as DCAM found"
+                    device,
+                    f"there is no camera {index}",
+                    request="dcamapi_init",
+                    reply=f"{found} cameras",
+                    expected=f"an index below {found}, as DCAM found",
+                    advice="Correct the camera's index in the configuration",
+                    state="Nothing was changed",
                 )
             self.camera = self.dcam.dev_open(index)
             self._steps.append(lambda: self.dcam.dev_close(self.camera))  # ends a capture and frees the ring, too
@@ -63,10 +69,14 @@ class Session:
                 self._steps.clear()  # to end it would end that of another camera in this process
             if error.code != Error.NOCAMERA:
                 raise
-            advice = f"Switch the camera on and check its cable. {usb.preflight().message}"
-            reply = codes.error_name(error.code)
             raise DeviceError(
-                self._device, "DCAM finds no camera", request=error.request, reply=reply, advice=advice
+                self._device,
+                "DCAM finds no camera",
+                request=error.request,
+                reply=codes.error_name(error.code),
+                expected="a camera that is switched on and started",
+                advice=f"Switch the camera on and check its cable. {usb.preflight().message}",
+                state="Nothing was changed",
             ) from error
 
     def _end(self) -> None:
