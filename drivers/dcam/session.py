@@ -35,8 +35,6 @@ class Session:
                 raise DeviceError(
                     device,
                     f"there is no camera {index}",
-                    request="dcamapi_init",
-                    reply=f"{found} cameras",
                     expected=f"an index below {found}, as DCAM found",
                     advice="Correct the camera's index in the configuration",
                     state="Nothing was changed",
