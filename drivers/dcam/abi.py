@@ -25,6 +25,7 @@ from drivers.dcam.structures import (
 from drivers.errors import DeviceError
 
 _TEXT_BYTES = 256
+_RUNTIME = "Check the version of the vendor's DCAM-API runtime"
 
 
 ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
@@ -68,6 +69,10 @@ _ADVICE: Mapping[int, str] = MappingProxyType(
         Error.FAILOPEN: "Close other programs that use the camera, then switch it off and on",
         Error.TOOFREQUENTTRIGGER: "Turn the stage more slowly or expose for a shorter time: triggers come too fast",
         Error.NOTRIGGER: "Check the trigger cable and its polarity",
+        Error.DEVICEINITIALIZING: "The camera is still starting: wait half a minute and try again",
+        Error.FRAMEGRABBER_NEEDS_FIRMWAREUPDATE: "Update the frame grabber's firmware with the vendor's tool",
+        Error.NEWRUNTIMEREQUIRED: "Install a newer DCAM-API runtime",
+        Error.NEWAPIREQUIRED: "Install a newer DCAM-API runtime",
         Error.COOLINGTROUBLE: "Check the camera's fan and cooling water, and let it cool down",
         Error.TEMPERATURE_TROUBLE: "Check the camera's fan and cooling water, and let it cool down",
         Error.LESSSYSTEMMEMORY: "Give the camera's ring fewer bytes or free memory",
@@ -202,7 +207,11 @@ class Dcam:
     def cap_status(self, camera: int) -> CaptureState:
         status = c_int32()
         self._call("dcamcap_status", camera, byref(status))
-        return CaptureState(status.value)
+        try:
+            return CaptureState(status.value)
+        except ValueError:
+            problem = f"its capture is in a state {status.value} that DCAM-API version 4 does not have"
+            raise DeviceError(self._device, problem, request="dcamcap_status", advice=_RUNTIME) from None
 
     def cap_transferinfo(self, camera: int) -> int:
         """Frames put into the ring since the start; never blocks."""

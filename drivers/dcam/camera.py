@@ -31,7 +31,8 @@ class DcamCamera:
 
     A lost frame stays visible: framestamps are the camera's own count, so that a frame lost anywhere leaves a gap. A
     ring that was overrun is an error besides, and `describe` says how many frames it cost and how often the transport
-    reported a loss. Triggers that come too early leave nothing at all: only times tell. One thread takes frames;
+    reported a loss. Triggers that come too early leave nothing at all: only times tell. So it is with the loss of a
+    first frame where framestamps go on over captures, which is found out at the start. One thread takes frames;
     `disarm` and `close` may be called from another one and end its wait.
 
     Args:
@@ -61,6 +62,7 @@ class DcamCamera:
         self._ring: Ring | None = None  # armed
         self._held: Ring | None = None  # in the library's memory, also one that could not be freed
         self._clock_offset: float | None = None  # s, host time minus the camera's, in this run
+        self._origin: int | None = None  # framestamp of this run's first trigger; None until a frame tells
         self._overwritten, self._transport_losses = 0, 0
         self._closed = False
         self._session = Session(library, index, name)
@@ -68,7 +70,8 @@ class DcamCamera:
             self._dcam, self._camera = self._session.dcam, self._session.camera
             self._properties = Properties(self._dcam, self._camera, name)
             self._apply(_TEST_SETTINGS)  # another program may have left anything
-            self._first_stamp = self._stamp_of_a_first_frame()
+            stamps = self._stamp_of_a_first_frame(), self._stamp_of_a_first_frame()
+            self._first_stamp = stamps[0] if stamps[0] == stamps[1] else None
         except BaseException:
             with suppress(DcamError):
                 self._session.close()
@@ -115,6 +118,7 @@ class DcamCamera:
         slots = max(2, min(max(n_frames + 1, _LEAST_SLOTS), fitting))
         ring = self._start(slots, CaptureMode.SEQUENCE)
         self._overwritten, self._transport_losses, self._clock_offset = 0, 0, None
+        self._origin = self._first_stamp
         self._ring = ring
 
     def software_trigger(self) -> None:
@@ -177,6 +181,7 @@ class DcamCamera:
             **description(self._session, self._properties, self._settings, self._options),
             "frames_overwritten": self._overwritten,
             "transport_losses": self._transport_losses,
+            "framestamps_begin_anew": "no" if self._first_stamp is None else "yes",
         }
 
     def close(self) -> None:
@@ -270,7 +275,9 @@ class DcamCamera:
                 self._overwritten = ring.overwritten
         if taken is not None:
             counts, frame = taken
-            return CameraFrame(counts, frame.framestamp - self._first_stamp, self._trigger_time(frame))
+            if self._origin is None:
+                self._origin = frame.framestamp
+            return CameraFrame(counts, frame.framestamp - self._origin, self._trigger_time(frame))
         if state is not CaptureState.BUSY:
             problem = f"the capture ended by itself (state {state.name})"
             raise DeviceError(self.name, problem, advice="Check the camera's power and cable, then arm it again")

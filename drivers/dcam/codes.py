@@ -159,7 +159,7 @@ class Capability(IntFlag):
 
 
 class Cooler(IntEnum):
-    """SENSORCOOLERSTATUS; below 0 it reports trouble."""
+    """SENSORCOOLERSTATUS; below 0 it reports trouble. A number that is not known says no more than NONE."""
 
     ERROR4 = -4
     ERROR3 = -3
@@ -171,6 +171,10 @@ class Cooler(IntEnum):
     BUSY = 3
     ALWAYS = 4
     WARNING = 5
+
+    @classmethod
+    def _missing_(cls, value: object) -> Cooler:
+        return cls.ERROR1 if isinstance(value, int) and value < 0 else cls.NONE
 
 
 class Text(IntEnum):

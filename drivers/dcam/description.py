@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 from drivers.dcam import codes
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import Cooler, Error, Property, Text
@@ -10,13 +12,23 @@ from drivers.dcam.properties import Properties
 from drivers.dcam.session import Session
 from drivers.protocols import CameraSettings
 
+_NOT_TOLD = (Error.NOTSUPPORT, Error.NOTIMPLEMENT, Error.UNKNOWNSTRID, Error.INVALIDPARAM)
+_WHERE_THERE = MappingProxyType(
+    {
+        "sensor_temperature_c": Property.SENSORTEMPERATURE,
+        "conversion_factor": Property.CONVERSIONFACTOR_COEFF,
+        "conversion_offset": Property.CONVERSIONFACTOR_OFFSET,
+    }
+)
+
 
 def description(
     session: Session, properties: Properties, settings: CameraSettings, options: DcamOptions
 ) -> dict[str, str | int | float]:
     """What the camera itself says, as far as this model can say it.
 
-    An electron number is (count - conversion_offset) * conversion_factor; both depend on the readout.
+    An electron number is (count - conversion_offset) * conversion_factor; both depend on the readout, and a camera that
+    does not tell them has neither.
     """
     cooler = properties.find(Property.SENSORCOOLERSTATUS)
     repairs = properties.find(Property.DEFECTCORRECT_MODE) == codes.ON
@@ -29,7 +41,7 @@ def description(
     }
     return {
         **{which.name.lower(): text for which in Text if (text := _text(session, which))},
-        "capabilities": str(session.dcam.dev_getcapability(session.camera).name or "none").lower(),
+        "capabilities": _capabilities(session),
         "exposure": properties.get(Property.EXPOSURETIME),
         "trigger": str(settings.trigger),
         "trigger_active": str(options.trigger_active),
@@ -40,20 +52,27 @@ def description(
         "global_exposure": str(options.global_exposure),
         "readout": settings.readout,
         "binning": settings.binning,
-        "sensor_temperature_c": properties.get(Property.SENSORTEMPERATURE),
         "cooler": "unknown" if cooler is None else Cooler(round(cooler)).name.lower(),
-        "conversion_factor": properties.get(Property.CONVERSIONFACTOR_COEFF),
-        "conversion_offset": properties.get(Property.CONVERSIONFACTOR_OFFSET),
         "defect_correction": "on" if repairs else "off",
         "hot_pixels": str(options.hot_pixels) if repairs and options.hot_pixels else "as measured",
         **producers,
+        **{name: value for name, prop in _WHERE_THERE.items() if (value := properties.find(prop)) is not None},
     }
+
+
+def _capabilities(session: Session) -> str:
+    try:
+        return str(session.dcam.dev_getcapability(session.camera).name or "none").lower()
+    except DcamError as error:
+        if error.code not in _NOT_TOLD:
+            raise
+        return "not told"
 
 
 def _text(session: Session, which: Text) -> str:
     try:
         return session.dcam.dev_getstring(session.camera, which)
     except DcamError as error:
-        if error.code not in (Error.NOTSUPPORT, Error.UNKNOWNSTRID, Error.INVALIDPARAM):
+        if error.code not in _NOT_TOLD:
             raise
         return ""

@@ -59,8 +59,9 @@ class HotPixels(StrEnum):
 class DcamOptions:
     """What a DcamCamera is made with.
 
-    With LEVEL or SYNC_READOUT pulses make the exposure: set the camera's exposure to their length (or distance)
-    all the same, for the first frame of a run is dated by it.
+    What says how pulses are taken (active, mode, times, delay) holds for external triggers; a software trigger is
+    always one frame of the set exposure. With LEVEL or SYNC_READOUT pulses make the exposure: set the camera's exposure
+    to their length (or distance) all the same, for the first frame of a run is dated by it.
 
     Attributes:
         trigger_active, trigger_mode, trigger_polarity, global_exposure: see there.

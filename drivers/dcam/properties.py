@@ -105,8 +105,9 @@ class Properties:
             return f"legal: {limits.minimum:g} to {limits.maximum:g}{unit} in steps of {limits.step:g}{unit}"
         values = [limits.minimum]
         try:
-            while True:
-                values.append(self._dcam.prop_queryvalue(self._camera, prop, values[-1], codes.QUERY_NEXT))
+            # One that stays where it is would go on for ever.
+            while (value := self._dcam.prop_queryvalue(self._camera, prop, values[-1], codes.QUERY_NEXT)) > values[-1]:
+                values.append(value)
         except DcamError as error:
             if error.code not in _UNKNOWN | _ILLEGAL:  # these are how the list ends
                 raise

@@ -30,6 +30,7 @@ class Ring:
     def __init__(self, dcam: Dcam, camera: int, device: str, slots: int) -> None:
         self._dcam, self._camera, self._device, self._slots = dcam, camera, device, slots
         self._next = 0  # number, from 0 in the order of arrival, of the frame to hand out next
+        self._count = 0  # frames that had arrived when it was last looked at
         self._told = False  # an overrun was reported, and no frame was handed out since
         self.overwritten = 0
         dcam.buf_alloc(camera, slots)
@@ -42,8 +43,22 @@ class Ring:
         return self._dcam.cap_status(self._camera)
 
     def arrived(self) -> int:
-        """Frames put into it so far."""
-        return self._dcam.cap_transferinfo(self._camera)
+        """Frames put into it so far.
+
+        Raises:
+            DeviceError: fewer than before. The count has 32 bits; one that was set back would be waited for in vain.
+        """
+        before, self._count = self._count, self._dcam.cap_transferinfo(self._camera)
+        if self._count < before:
+            raise DeviceError(
+                self._device,
+                f"its count of frames went back from {before} to {self._count}",
+                request="dcamcap_transferinfo",
+                expected="a count that only grows while a capture runs",
+                advice="Check that no other program uses the camera, then arm it again",
+                state=f"{self._next} frames of this run were taken before",
+            )
+        return self._count
 
     def stamps(self, slot: int) -> BufFrame:
         """What is known of the frame in a slot, without its pixels."""

@@ -67,11 +67,12 @@ static const Property TABLE[N_PROPS] = {
 /* What the outside can do to the camera and its library. */
 static const char *const FAULTS[] = {"no_camera", "unplugged", "unplug_at", "report_loss", "pad", "first_stamp", "start_polls",
                                      "overrun_in_lock", "swallow_events", "refuse", "unsupported", "no_memory",
-                                     "no_stopped_event", "no_stamps", "short_ring", "drop", "slow_to_wake"};
+                                     "no_stopped_event", "no_stamps", "short_ring", "drop", "slow_to_wake", "stamps_go_on",
+                                     "count_back", "odd_status"};
 enum { NO_CAMERA, UNPLUGGED, UNPLUG_AT, REPORT_LOSS, PAD, FIRST_STAMP, START_POLLS, OVERRUN_IN_LOCK, SWALLOW, REFUSE, UNSUPPORTED,
-       NO_MEMORY, NO_STOPPED_EVENT, NO_STAMPS, SHORT_RING, DROP, SLOW_TO_WAKE, N_FAULTS };
+       NO_MEMORY, NO_STOPPED_EVENT, NO_STAMPS, SHORT_RING, DROP, SLOW_TO_WAKE, STAMPS_GO_ON, COUNT_BACK, ODD_STATUS, N_FAULTS };
 
-enum { MAX_PULSES = 4096, MAX_HANDLES = 4096, MAX_CALLS = 64 };
+enum { MAX_PULSES = 4096, MAX_HANDLES = 1 << 16, MAX_CALLS = 64 };
 static char handles[MAX_HANDLES]; /* their addresses are the handles; none is given out twice, so that old ones are known */
 static struct {
     Property props[N_PROPS];
@@ -80,7 +81,8 @@ static struct {
     int sensor_rows, sensor_cols, devices, n_handles;
     int session, status, mode, polls, waiters, aborts, pending;
     void *camera, *wait; /* NULL where closed */
-    int slots, count, exposed, edges, externals; /* externals: exposures by external trigger over the camera's life */
+    int slots, count, exposed, edges, externals, life; /* externals: exposures by external trigger
+                                                             over the camera's life; life: all exposures */
     uint8_t **ring;
     int32_t *stamps;
     double *times, last_edge, open_edge, started, boot, virtual_now; /* virtual_now 0: real time */
@@ -168,7 +170,8 @@ static void deliver(void) { /* the oldest exposed frame, into the ring */
 }
 
 static void expose(double begin, double exposure) {
-    int stamp = fake.faults[FIRST_STAMP] + fake.exposed++;
+    int stamp = fake.faults[FIRST_STAMP] + (fake.faults[STAMPS_GO_ON] ? fake.life : fake.exposed);
+    fake.exposed++; fake.life++;
     if (is(TRIGGERSOURCE, 2)) {
         int number = fake.externals++;
         if (fake.faults[UNPLUG_AT] && number >= fake.faults[UNPLUG_AT]) fake.faults[UNPLUGGED] = 1;

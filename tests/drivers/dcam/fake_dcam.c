@@ -189,14 +189,15 @@ int32_t dcamcap_stop(void *h) {
 
 int32_t dcamcap_status(void *h, int32_t *status) {
     CAMERA(h);
-    *status = fake.status == ST_BUSY && fake.polls++ < fake.faults[START_POLLS] ? ST_READY : fake.status;
+    if (fake.faults[ODD_STATUS]) *status = fake.faults[ODD_STATUS];
+    else *status = fake.status == ST_BUSY && fake.polls++ < fake.faults[START_POLLS] ? ST_READY : fake.status;
     return leave(SUCCESS);
 }
 
 int32_t dcamcap_transferinfo(void *h, DCAMCAP_TRANSFERINFO *p) {
     CAMERA(h); SIZED(p, size);
     if (!fake.slots) return leave(NOTREADY);
-    p->nFrameCount = fake.count;
+    p->nFrameCount = fake.count - fake.faults[COUNT_BACK];
     p->nNewestFrameIndex = fake.count ? (fake.count - 1) % fake.slots : -1;
     return leave(SUCCESS);
 }

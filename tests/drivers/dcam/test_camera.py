@@ -131,6 +131,38 @@ def test_a_lost_first_frame_shows_whatever_number_the_camera_begins_with(world, 
     camera.close()
 
 
+def test_framestamps_that_go_on_over_captures_count_from_a_run_s_first_frame(world) -> None:
+    """The fact sheet has it from memory that they begin anew; else every frame of a run would seem to be lost."""
+    world.fault("stamps_go_on")
+    camera = world.connect()
+    camera.configure(EXTERNAL)
+    for _ in range(2):
+        camera.arm(4)
+        world.pulses(2)
+        world.fault("drop", 1)
+        world.pulses(2)
+        assert take(camera, 3) == [0, 1, 3]
+        camera.disarm()
+    assert camera.describe()["framestamps_begin_anew"] == "no"
+    camera.close()
+
+
+def test_a_count_of_frames_that_goes_back_is_said_and_not_waited_out(camera: DcamCamera, world) -> None:
+    camera.arm(5)
+    world.pulses(3)
+    assert take(camera, 3) == [0, 1, 2]
+    world.fault("count_back", 2)
+    with pytest.raises(DeviceError, match=r"went back from 3 to 1.* 3 frames of this run were taken before"):
+        camera.next_frame(1.0)
+
+
+def test_a_state_that_the_interface_does_not_have_is_an_error_of_the_device(camera: DcamCamera, world) -> None:
+    camera.arm(1)
+    world.fault("odd_status", 9)
+    with pytest.raises(DeviceError, match="state 9"):
+        camera.next_frame(1.0)
+
+
 def test_framestamps_start_at_zero_at_every_arm(camera: DcamCamera, world) -> None:
     for _ in range(2):
         camera.arm(2)

@@ -57,6 +57,14 @@ def test_a_cooler_that_does_not_say_so_is_done_when_the_temperature_is_steady(
     assert world.clock.now() - began == pytest.approx(40 + 60, abs=3)
 
 
+@pytest.mark.parametrize(("number", "name"), [(7, "none"), (-9, "error1")])
+def test_a_cooler_s_status_that_is_not_known_is_no_defect(
+    camera: DcamCamera, world: World, number: int, name: str
+) -> None:
+    world.override(Property.SENSORCOOLERSTATUS, number)
+    assert camera.describe()["cooler"] == name
+
+
 def test_a_sensor_that_does_not_get_cold_is_a_timeout(camera: DcamCamera, world: World) -> None:
     play = cool(world, lambda celsius: Cooler.BUSY, rate=0.01)
     began = world.clock.now()

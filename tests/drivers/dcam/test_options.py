@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.dcam.camera import DcamCamera
-from drivers.dcam.codes import Property
+from drivers.dcam.codes import Error, Property
 from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixels, TriggerActive, TriggerMode, TriggerPolarity
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraSettings, TriggerSource
@@ -27,9 +27,11 @@ LINES = 48 / 2 + 5
 @contextmanager
 def connected(world: World, **options: Any) -> Iterator[DcamCamera]:
     camera = world.connect(DcamOptions(**options))
-    camera.configure(EXTERNAL)
-    yield camera
-    camera.close()
+    try:
+        camera.configure(EXTERNAL)
+        yield camera
+    finally:
+        camera.close()
     assert world.live == 0
 
 
@@ -56,9 +58,10 @@ def test_an_option_reaches_the_camera_and_one_that_it_ignores_is_noticed(
             ((name, said),) = option.items()
             assert camera.describe()[name] == said
     world.reset()
-    world.override(prop, value + 1)
-    with pytest.raises(DeviceRefused, match=f"made {prop.name} = {value + 1:g} of {value:g}"):
-        world.connect(DcamOptions(**option))
+    stuck = world.value(prop) if world.value(prop) != value else value + 1
+    world.override(prop, stuck)
+    with pytest.raises(DeviceRefused, match=f"made {prop.name} = {stuck:g} of {value:g}"), connected(world, **option):
+        pass
     assert world.live == 0
 
 
@@ -150,6 +153,28 @@ def test_start_runs_freely_from_the_first_pulse_and_can_be_armed_again(world: Wo
             camera.disarm()
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"trigger_active": TriggerActive.LEVEL},
+        {"trigger_active": TriggerActive.SYNC_READOUT},
+        {"trigger_mode": TriggerMode.START},
+        {"trigger_times": 3},
+        {"trigger_delay": 0.25},
+    ],
+)
+def test_how_pulses_are_taken_does_not_reach_software_triggers(world: World, option: dict[str, Any]) -> None:
+    """Darks, flats and step scans: one frame of the set exposure a trigger, whatever the pulses of a fly scan do."""
+    with connected(world, **option) as camera:
+        camera.configure(CameraSettings(0.001, TriggerSource.SOFTWARE))
+        plain = (Property.TRIGGERACTIVE, Property.TRIGGER_MODE, Property.TRIGGERTIMES, Property.TRIGGERDELAY)
+        assert [world.value(prop) for prop in plain] == [1, 1, 1, 0]
+        camera.arm(3)
+        for stamp in range(3):
+            camera.software_trigger()
+            assert camera.next_frame(1.0).framestamp == stamp
+
+
 def test_photon_number_resolving_is_a_readout(world: World) -> None:
     with connected(world) as camera:
         asked = replace(EXTERNAL, readout="photon_number", binning=2)
@@ -192,6 +217,10 @@ def test_an_exposure_may_be_rounded_but_not_ignored(world: World, accepted: floa
         Property.FRAMEBUNDLE_MODE,
         Property.SENSORCOOLERSTATUS,
         Property.TIMESTAMP_PRODUCER,
+        Property.SENSORTEMPERATURE,
+        Property.CONVERSIONFACTOR_COEFF,
+        Property.CONVERSIONFACTOR_OFFSET,
+        Property.INTERNAL_FRAMEINTERVAL,
         0x04000105,  # the text CAMERAVERSION
     ],
 )
@@ -203,6 +232,12 @@ def test_what_a_model_does_not_have_is_not_missed(world: World, absent: int) -> 
         camera.arm(1)
         world.pulse()
         np.testing.assert_array_equal(camera.next_frame(1.0).counts, world.pattern(0))
+
+
+def test_a_library_that_does_not_tell_what_frames_carry_is_none_the_less_described(world: World) -> None:
+    with connected(world) as camera:
+        world.fail("dcamdev_getcapability", Error.NOTSUPPORT)
+        assert camera.describe()["capabilities"] == "not told"
 
 
 def test_what_it_must_have_is_missed_by_name(world: World) -> None:
