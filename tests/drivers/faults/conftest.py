@@ -18,6 +18,6 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def rig_of(library: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Rig]:
-    """Makes the rig with a controller of that kind."""
-    return lambda kind: Rig(World(library), monkeypatch, kind)
+def rig_of(library: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
+    """Makes the rig with a controller of that kind, and what else `Rig` takes."""
+    return lambda kind, **settings: Rig(World(library), monkeypatch, kind, **settings)

@@ -231,6 +231,8 @@ class TriggerCable:
         self._line = line
 
     def next_after(self, time: float) -> Pulse | None:
+        if not (self.lost or self.picked_up_after):
+            return self._line.next_after(time)
         sent, at = [], 0.0
         while (pulse := self._line.next_after(at)) is not None:
             sent.append(pulse)
@@ -246,6 +248,7 @@ class Scanned:
     """A scan, how it ended and what it left."""
 
     folder: Path | None
+    shape: tuple[int, int]
     error: BaseException | None = None
     result: RunResult | None = None
     events: list[Event] = field(default_factory=list)
@@ -266,7 +269,7 @@ class Scanned:
             triggers = [int(trigger) for trigger in file["entry/frame_log/trigger"][()]]
             for frame, trigger in zip(source.frames(), triggers, strict=True):
                 found[frame.kind].append(trigger)
-                assert frame.counts.shape == SENSOR
+                assert frame.counts.shape == self.shape
                 if frame.kind is FrameKind.PROJECTION:
                     assert math.degrees(frame.angle) == pytest.approx(FIRST + STEP * trigger, abs=1e-6)
         return found
@@ -292,15 +295,20 @@ class _Recorder(Recorder):
 class Rig:
     """One controller and one camera, for any number of scans.
 
+    Args:
+        sensor: rows and columns of the camera.
+
     Attributes:
         at_frame: row of the file -> what happens when that frame has been taken.
         after_connecting: what happens once all devices are open.
         asked: what the operator was asked to do.
     """
 
-    def __init__(self, world: World, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-        self.world, self.name, self.kind = world, kind, KINDS[kind]
-        world.reset(*SENSOR)
+    def __init__(
+        self, world: World, monkeypatch: pytest.MonkeyPatch, kind: str, sensor: tuple[int, int] = SENSOR
+    ) -> None:
+        self.world, self.kind, self._sensor = world, KINDS[kind], sensor
+        world.reset(*sensor)
         self.clock = world.clock
         line = TriggerLine(self.clock)
         self.controller = self.kind.build(self.clock, line)
@@ -337,7 +345,7 @@ class Rig:
         """A whole scan: devices opened, run, closed."""
         runs.mkdir(exist_ok=True)
         before = set(runs.iterdir())
-        scanned = Scanned(None)
+        scanned = Scanned(None, self._sensor)
         try:
             scanned.result = run_scan(self.config(*overrides), runs, [scanned.events.append], ask=self.asked.append)
         except Exception as error:

@@ -26,7 +26,7 @@ class LineFault:
 
     Attributes:
         spoil: the reply as it arrives instead; the same where it is the next one's turn.
-        error: the class of the error, and what it says.
+        error: the class of the error; `seen`: words of it, which the page has too.
         replied: something arrived, which the error must show.
         not_on: controller -> why it cannot happen there.
         harmless_on: controller -> why the scan is complete in spite of it.
@@ -35,7 +35,7 @@ class LineFault:
     fault: str
     spoil: Callable[[Rig, bytes], bytes]
     error: type[DeviceError]
-    says: str
+    seen: str
     replied: bool
     not_on: Mapping[str, str] = field(default_factory=dict)
     harmless_on: Mapping[str, str] = field(default_factory=dict)
@@ -57,7 +57,7 @@ LINE: tuple[LineFault, ...] = (
         "garbage",
         _garbage,
         DeviceError,
-        r"the reply does not have the form|the reply was damaged",
+        "the reply does not have the form",
         replied=True,
     ),
     LineFault(
@@ -71,7 +71,7 @@ LINE: tuple[LineFault, ...] = (
         "wrong checksum",
         _changed,
         DeviceError,
-        "the reply was damaged on the way: its checksum is",
+        "the reply was damaged on the way",
         replied=True,
         not_on={
             "pm16c": "its lines carry no checksum: a changed digit is noticed where settings are read back",
@@ -100,8 +100,8 @@ LINE: tuple[LineFault, ...] = (
 )
 LINE_PHASES = tuple(Phase)
 
-UNPLUGGED = "stage unplugged"
-"""In each phase with the next request, and while the stage turns and nobody asks it."""
+UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
+"""In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,7 @@ class MotionFault:
     fault: str
     breaks: Callable[[Rig], None]
     says: Mapping[str, str]
+    seen: str = "it stopped short of"
 
 
 def _stop_after_view_5(rig: Rig) -> None:
@@ -152,7 +153,7 @@ class PulseFault:
 
     fault: str
     breaks: Callable[[Rig], None]
-    says: str
+    seen: str
     missing: tuple[int, ...] = ()
     invalid: int = 0
 
@@ -172,41 +173,48 @@ def _pick_up(*after: int) -> Callable[[Rig], None]:
 
 
 PULSES: tuple[PulseFault, ...] = (
-    PulseFault("pulses lost on the way", _lose(3, 7, 8), "3 of 12 projections are missing: 3, 7-8", (3, 7, 8)),
+    PulseFault("pulses lost on the way", _lose(3, 7, 8), "projections are missing: 3, 7-8", (3, 7, 8)),
     PulseFault(
         "fewer pulses than planned",
         _lose(9, 10, 11),
-        "3 of 12 projections are missing: 9-11",
+        "projections are missing: 9-11",
         (9, 10, 11),
     ),
-    PulseFault("extra pulses", _pick_up(2, 6), "2 frames came without a trigger", invalid=2),
+    PulseFault("extra pulses", _pick_up(2, 6), "frames came without a trigger", invalid=2),
 )
 """Beyond the controllers, but run on each: their pulses differ in width and in when they are on the line."""
 
 CAMERA_KIND = "pm16c"
-"""What the camera does is the same with every controller, so camera faults run on one."""
-CAMERA: Mapping[str, type[Exception]] = MappingProxyType(
-    {
-        "camera absent at start": DeviceError,
-        "an error of the camera's library": DeviceError,
-        "frame lost in the camera": LedgerError,
-        "ring overrun": LedgerError,
-        "camera unplugged": DeviceError,
-        "triggers planned too fast": ConfigError,
-        "triggers too fast for the camera": LedgerError,
-        "setting refused": DeviceRefused,
-        "slow USB link": LedgerError,
-    }
-)
-"""Fault -> how a scan ends; `test_camera` has one test for each."""
+"""What the camera does is the same with every controller, so its faults run on one."""
 
-FAULTS = (
-    *(row.fault for row in LINE),
-    UNPLUGGED,
-    *(row.fault for row in MOTION),
-    *(row.fault for row in PULSES),
-    *CAMERA,
+
+@dataclass(frozen=True)
+class CameraFault:
+    """`test_camera` has a test of the fault's name; the scan ends with this error, which has these words."""
+
+    fault: str
+    error: type[Exception]
+    seen: str
+
+
+CAMERA: tuple[CameraFault, ...] = (
+    CameraFault("camera absent at start", DeviceError, "DCAM finds no camera"),
+    CameraFault("an error of the library", DeviceError, "the camera's library reports an error"),
+    CameraFault("camera unplugged", DeviceError, "NOCONNECTION"),
+    CameraFault("setting refused", DeviceRefused, "it refuses EXPOSURETIME"),
+    CameraFault("frame lost in the camera", LedgerError, "were exposed but never delivered by the camera"),
+    CameraFault("ring overrun", LedgerError, "projections are missing"),
+    CameraFault("triggers planned too fast", ConfigError, "set scan.period_s >="),
+    CameraFault("triggers too fast", LedgerError, "triggers were ignored by the camera, which was not ready"),
+    CameraFault("slow link", LedgerError, "`beamline doctor` looks at its link"),
 )
+
+SEEN: Mapping[str, str] = MappingProxyType(
+    {row.fault: row.seen for row in LINE}
+    | {UNPLUGGED: PORT_FAILED}
+    | {row.fault: row.seen for row in (*MOTION, *PULSES, *CAMERA)}
+)
+"""Every fault, in the order of docs/faults.md -> words that the operator sees."""
 
 
 def applies() -> None:

@@ -31,7 +31,7 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     row.breaks(rig)
     scanned = rig.scan(tmp_path)
     assert_speaks(scanned.error, "stage")
-    assert re.search(r"it stopped short of 38\.0000 deg.*It stands at 2[1-5]\.", str(scanned.error))
+    assert re.search(rf"{row.seen} 38\.0000 deg.*It stands at 2[1-5]\.", str(scanned.error))
     assert re.search(row.says[kind], str(scanned.error))
     assert_told_once(scanned)
     assert scanned.warnings == []
@@ -50,7 +50,7 @@ def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     row.breaks(rig)
     scanned = rig.scan(tmp_path)
     assert isinstance(scanned.error, LedgerError)
-    assert row.says in str(scanned.error)
+    assert row.seen in str(scanned.error)
     assert "Repeat these views, or reconstruct without them" in str(scanned.error)
     assert [index - table.FIRST_VIEW for index in scanned.error.missing] == list(row.missing)
     assert_told_once(scanned)
