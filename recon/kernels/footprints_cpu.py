@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 
 from recon.kernels.activation import F32, OPTIONS
 
-_f = np.float32
+_f, _d = np.float32, np.float64
 _ROOT_TWO_PI = np.float32(math.sqrt(2 * math.pi))
 # Columns of the footprint table.
 U, V, K, SHEAR, KV, W, HU, HV = range(8)
@@ -148,7 +148,8 @@ def _forward(straight: bool) -> Any:
                 uu, uv, vv, hh = uu + a * a, uv + a * b, vv + b * b, hh + h * h
                 hu, hv = hu + h * pu * sharp, hv + h * pv * sharp
             within = _f(1) / np.sqrt(hh)  # mm of the ray in one standard deviation
-            scale = within / (g * (scales[i, 0] * scales[i, 1] * scales[i, 2]))  # g / sqrt(det Σ₂)
+            # g / sqrt(det Σ₂); in float64, since a product of three scales of 1e-13 mm would leave float32's range.
+            scale = _f(_d(within) / (_d(g) * (_d(scales[i, 0]) * _d(scales[i, 1]) * _d(scales[i, 2]))))
             table[i, U], table[i, V] = _f(col) + f * tu, _f(row) + f * tv
             # Squares of square roots: those of a Gaussian of 1e-12 px would leave float32's range on the way.
             wide, high = np.sqrt(uu), np.sqrt(vv)
@@ -229,7 +230,7 @@ def _backward(straight: bool) -> Any:
             h0, h1 = (ax * pu0 + ay * pv0 + pd0) * i0, (ax * pu1 + ay * pv1 + pd1) * i1
             h2 = (ax * pu2 + ay * pv2 + pd2) * i2
             hh = h0 * h0 + h1 * h1 + h2 * h2
-            size, level = turned / (g * (s0 * s1 * s2) * hh), kv * g
+            size, level = _f(_d(turned) / (_d(g) * (_d(s0) * _d(s1) * _d(s2)) * _d(hh))), kv * g
             a0, a1, a2 = size * (b1 * h2 - b2 * h1), size * (b2 * h0 - b0 * h2), size * (b0 * h1 - b1 * h0)
             b0, b1, b2 = level * b0, level * b1, level * b2
             d_densities[i] += m0 * (_f(length) if plain else _ROOT_TWO_PI * np.sqrt(rr / hh))

@@ -147,6 +147,20 @@ def test_dots_smaller_than_a_pixel(sigma: float) -> None:
     assert voxels.value < bound(20.0, sigma)
 
 
+@pytest.mark.parametrize("sigma", [1e-6, 1e-12, 1e-14, 1e-15])
+@pytest.mark.parametrize("pitch", [1e-3, 1.0, 1e3])
+def test_dots_of_any_size_where_a_position_can_be_as_fine(sigma: float, pitch: float) -> None:
+    # Only around 0 does float32 hold places a part of these σ (px) apart: the product of three of them is below its
+    # range from 1e-13 px on, with µm in mm from 1e-10 px.
+    view = Geometry.parallel([0.0], (5, 7), pitch, axis_col=0.0, axis_row=0.0)
+    length = sigma * pitch
+    off, rng = np.array([0.6, 0.0, -0.4]) * length, np.random.default_rng(0)
+    shape, turn = np.array([[2.0, 1.0, 1.5]]) * length, rng.normal(size=(1, 4))
+    found = compare(Gaussians.from_physical(off[None], shape, [0.8 / length], turn, 1.0), view)
+    assert found.image[0, 0, 0] > 0.5
+    assert found.value < bound(0.0, 1.0) and found.worst < gradient_bound(0.0, 1.0), found.gradients
+
+
 def test_a_turned_ball_feels_no_torque() -> None:
     # The off-diagonal part of T times (s_k / s_j - s_j / s_k): rounding of the scales' exponentials is all there is.
     found = compare(some((0.8,) * 3), BEAMS["parallel"])
