@@ -42,6 +42,24 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("row", table.MOTION[:2], ids=lambda row: row.fault)
+def test_a_stage_that_stops_early_in_a_step_scan(
+    rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path
+) -> None:
+    """Between views it stands, so that a stop from elsewhere has no effect there."""
+    rig = rig_of(kind)
+    row.breaks(rig)
+    scanned = rig.scan(tmp_path, "scan.mode=step")
+    assert_speaks(scanned.error, "stage")
+    assert f"{row.seen} 22.0000 deg" in str(scanned.error)
+    assert re.search(row.says[kind], str(scanned.error))
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned, list(range(6)))
+    assert_next_scan_works(rig, tmp_path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("row", table.PULSES, ids=lambda row: row.fault)
 def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     rig_of: RigOf, row: table.PulseFault, kind: str, tmp_path: Path
