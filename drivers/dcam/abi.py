@@ -25,7 +25,8 @@ from drivers.dcam.structures import (
 from drivers.errors import DeviceError
 
 _TEXT_BYTES = 256
-_RUNTIME = "Check the version of the vendor's DCAM-API runtime"
+_USUAL_ADVICE = "Check the camera's power and cable, switch it off and on, and try again"
+RUNTIME = "Check the version of the vendor's DCAM-API runtime"
 
 
 ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
@@ -80,13 +81,38 @@ _ADVICE: Mapping[int, str] = MappingProxyType(
 )
 
 
+_STATE: Mapping[str, str] = MappingProxyType(
+    {
+        "dcamprop_setvalue": "The setting was not changed",
+        "dcambuf_alloc": "The camera is not armed and no frame was taken",
+        "dcamcap_start": "The camera is not armed and no frame was taken",
+        "dcamcap_stop": "The camera may still capture; frames taken before are good",
+        "dcambuf_release": "The camera's ring is still held; frames taken before are good",
+        "dcamwait_close": "The camera may stay taken until this program ends",
+        "dcamdev_close": "The camera may stay taken until this program ends",
+        "dcamapi_uninit": "The camera may stay taken until this program ends",
+        "dcamapi_init": "No camera was opened",
+        "dcamdev_open": "No camera was opened",
+        "dcamcap_firetrigger": "No frame was exposed",
+    }
+)
+"""What a call that failed leaves behind; the others only ask."""
+
+
 class DcamError(DeviceError):
     """A DCAM call answered with an error; `code` is one of codes.Error (or an unknown number)."""
 
     def __init__(self, device: str, call: str, code: int) -> None:
         self.code = code & 0xFFFFFFFF
-        reply, advice = error_name(code), _ADVICE.get(self.code, "")
-        super().__init__(device, "the camera's library reports an error", request=call, reply=reply, advice=advice)
+        super().__init__(
+            device,
+            "the camera's library reports an error",
+            request=call,
+            reply=error_name(code),
+            expected="success, a number of 0 or more",
+            advice=_ADVICE.get(self.code, _USUAL_ADVICE),
+            state=_STATE.get(call.split()[0], "Nothing was changed; frames taken before are good"),
+        )
 
 
 def installed_library(platform: str) -> str:
@@ -211,7 +237,15 @@ class Dcam:
             return CaptureState(status.value)
         except ValueError:
             problem = f"its capture is in a state {status.value} that DCAM-API version 4 does not have"
-            raise DeviceError(self._device, problem, request="dcamcap_status", advice=_RUNTIME) from None
+            raise DeviceError(
+                self._device,
+                problem,
+                request="dcamcap_status",
+                reply=str(status.value),
+                expected=", ".join(state.name for state in CaptureState),
+                advice=RUNTIME,
+                state="Frames taken before are good",
+            ) from None
 
     def cap_transferinfo(self, camera: int) -> int:
         """Frames put into the ring since the start; never blocks."""

@@ -16,6 +16,7 @@ from drivers.dcam.properties import Properties
 from drivers.dcam.ring import Ring
 from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
+from drivers.dcam.stamps import require_stamps, seconds_of
 from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
@@ -223,7 +224,15 @@ class DcamCamera:
             # Triggers that come before BUSY are lost. A SNAP may be over already.
             while mode is CaptureMode.SEQUENCE and ring.state() is not CaptureState.BUSY:
                 if self._clock.now() > deadline:
-                    raise DeviceTimeout(self.name, f"the capture did not start within {_START_TIMEOUT:g} s")
+                    raise DeviceTimeout(
+                        self.name,
+                        f"the capture did not start within {_START_TIMEOUT:g} s",
+                        request="dcamcap_start",
+                        reply=ring.state().name,
+                        expected="BUSY",
+                        advice="Switch the camera off and on",
+                        state="It is not armed, and no frame was taken",
+                    )
                 self._clock.sleep(0.001)
         except BaseException:
             with suppress(DcamError):
@@ -237,18 +246,17 @@ class DcamCamera:
         deadline = self._clock.now() + _START_TIMEOUT
         while ring.arrived() < 2:
             if self._clock.now() > deadline:
-                problem = f"no test frames came within {_START_TIMEOUT:g} s in free run"
-                raise DeviceTimeout(self.name, problem, advice="Check its cable, then switch it off and on")
+                raise DeviceTimeout(
+                    self.name,
+                    f"{ring.arrived()} of 2 test frames came within {_START_TIMEOUT:g} s in free run",
+                    expected=f"2 frames of {_TEST_SETTINGS.exposure:g} s",
+                    advice="Check its cable, then switch it off and on",
+                    state="Nothing was measured",
+                )
             self._await_event(_WAIT_SLICE)
         first, second = ring.stamps(0), ring.stamps(1)
         self._free()
-        if second.framestamp - first.framestamp != 1 or not _seconds(second) > _seconds(first):
-            problem = (
-                f"it does not count and date its frames: framestamps {first.framestamp}, {second.framestamp}, "
-                f"times {_seconds(first):.6f} s, {_seconds(second):.6f} s"
-            )
-            expected = "framestamps one apart and times that grow, without which a lost frame cannot be seen"
-            raise DeviceError(self.name, problem, expected=expected)
+        require_stamps(first, second, self.name)
         return int(first.framestamp)
 
     def _await_event(self, seconds: float) -> None:
@@ -280,19 +288,22 @@ class DcamCamera:
             return CameraFrame(counts, frame.framestamp - self._origin, self._trigger_time(frame))
         if state is not CaptureState.BUSY:
             problem = f"the capture ended by itself (state {state.name})"
-            raise DeviceError(self.name, problem, advice="Check the camera's power and cable, then arm it again")
+            raise DeviceError(
+                self.name,
+                problem,
+                request="dcamcap_status",
+                reply=state.name,
+                expected="BUSY until it is disarmed",
+                advice="Check the camera's power and cable, then arm it again",
+                state="Frames taken before are good",
+            )
         return None
 
     def _trigger_time(self, frame: BufFrame) -> float:
         """Camera clocks start anywhere: the first frame is dated by the host, less its exposure and readout."""
-        stamp = _seconds(frame)
+        stamp = seconds_of(frame)
         if self._clock_offset is None:
             delay = self._settings.exposure + self._properties.get(Property.TIMING_READOUTTIME)
             self._clock_offset = self._clock.now() - delay - stamp
         external = self._settings.trigger is TriggerSource.EXTERNAL
         return self._clock_offset + stamp - (self._options.trigger_delay if external else 0.0)
-
-
-def _seconds(frame: BufFrame) -> float:
-    """The camera's own time of a frame."""
-    return float(frame.timestamp.seconds + 1e-6 * frame.timestamp.microseconds)

@@ -38,9 +38,21 @@ def wait_until_cold(
             return celsius
         if status < 0:
             problem = f"its cooler reports {status.name} at {celsius:.1f} °C"
-            raise DeviceError(device, problem, advice="Check the camera's fan and cooling water")
+            raise DeviceError(
+                device,
+                problem,
+                expected=_target(properties),
+                advice="Check the camera's fan and cooling water",
+                state="Nothing was measured",
+            )
         if status is Cooler.OFF:
-            raise DeviceRefused(device, f"its cooler is off ({celsius:.1f} °C)", advice="Switch the cooler on")
+            raise DeviceRefused(
+                device,
+                f"its cooler is off ({celsius:.1f} °C)",
+                expected=_target(properties),
+                advice="Switch the cooler on, or set devices.camera.cool_s: 0",
+                state="Nothing was measured",
+            )
         if now >= deadline:
             problem = f"its sensor is not cold after {timeout:g} s: {celsius:.1f} °C, cooler {status.name.lower()}"
             raise DeviceTimeout(
@@ -48,6 +60,7 @@ def wait_until_cold(
                 problem,
                 expected=_target(properties),
                 advice="Wait longer, or check the camera's fan and cooling water",
+                state="Nothing was measured",
             )
         clock.sleep(min(POLL, deadline - now))
 

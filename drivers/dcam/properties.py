@@ -20,6 +20,7 @@ _REFUSALS = frozenset(
     )
 )
 """What it answers to a value that it cannot take, or not now; the vendor's manuals disagree on which it will be."""
+_AS_BEFORE = "It takes no frames with it; what was taken before is good"
 
 
 class Properties:
@@ -58,23 +59,21 @@ class Properties:
         limits = self._limits(prop)
         if limits.attribute & codes.ATTRIBUTE_HASRANGE and not limits.minimum <= value <= limits.maximum:
             # Left to itself, a property that rounds would take the nearest limit without a word.
-            raise DeviceRefused(self._device, f"{prop.name} = {value:g} is out of range", advice=self._legal(prop))
+            raise self._refused(f"{prop.name} = {value:g} is out of range", prop, value)
         try:
             self._dcam.prop_setvalue(self._camera, prop, value)
         except DcamError as error:
             if error.code not in _REFUSALS:
                 raise
-            problem, reply = f"it refuses {prop.name} = {value:g}", codes.error_name(error.code)
-            raise DeviceRefused(self._device, problem, reply=reply, advice=self._legal(prop)) from error
+            reply = codes.error_name(error.code)
+            raise self._refused(f"it refuses {prop.name} = {value:g}", prop, value, reply) from error
         return self.get(prop)
 
     def set_exactly(self, prop: Property, value: float) -> None:
         """Set, read back, and refuse a value that the camera has rounded or ignored."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > 1e-9 * abs(value):
-            raise DeviceRefused(
-                self._device, f"it made {prop.name} = {accepted:g} of {value:g}", advice=self._legal(prop)
-            )
+            raise self._refused(f"it made {prop.name} = {accepted:g} of {value:g}", prop, value, f"{accepted:g}")
 
     def set_if_there(self, prop: Property, value: float) -> None:
         """Like set_exactly, for a value that a camera without the property has anyway."""
@@ -85,8 +84,15 @@ class Properties:
         """Set, read back, and refuse what differs by more than `tolerance`."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > tolerance:
-            problem = f"it made {prop.name} = {accepted:g} of {value:g}"
-            raise DeviceRefused(self._device, problem, expected=f"{value:g} within {tolerance:g}")
+            raise DeviceRefused(
+                self._device,
+                f"it made {prop.name} = {accepted:g} of {value:g}",
+                request=f"{prop.name} = {value:g}",
+                reply=f"{accepted:g}",
+                expected=f"{value:g} within {tolerance:g}",
+                advice="Ask for a value that the camera has, or allow a larger exposure_tolerance",
+                state=_AS_BEFORE,
+            )
 
     def _limits(self, prop: Property) -> PropAttr:
         try:
@@ -94,15 +100,34 @@ class Properties:
         except DcamError as error:
             if error.code not in _UNKNOWN:
                 raise
-            reply = codes.error_name(error.code)
-            raise DeviceRefused(self._device, f"this camera has no {prop.name}", reply=reply) from error
+            raise DeviceRefused(
+                self._device,
+                f"this camera has no {prop.name}",
+                request=error.request,
+                reply=codes.error_name(error.code),
+                expected="an ORCA-Quest, or a camera with the same properties",
+                advice="Check that index names the right camera, and its firmware",
+                state=_AS_BEFORE,
+            ) from error
+
+    def _refused(self, problem: str, prop: Property, value: float, reply: str = "") -> DeviceRefused:
+        """With what would have been legal."""
+        return DeviceRefused(
+            self._device,
+            problem,
+            request=f"{prop.name} = {value:g}",
+            reply=reply,
+            expected=f"another value, legal: {self._legal(prop)}",
+            advice="Choose one of them in the configuration",
+            state=_AS_BEFORE,
+        )
 
     def _legal(self, prop: Property) -> str:
         """What a property can be, in words."""
         limits = self._limits(prop)
         if limits.attribute & codes.ATTRIBUTE_TYPE_MASK != codes.ATTRIBUTE_TYPE_MODE:
             unit = " s" if limits.unit == codes.UNIT_SECOND else ""
-            return f"legal: {limits.minimum:g} to {limits.maximum:g}{unit} in steps of {limits.step:g}{unit}"
+            return f"{limits.minimum:g} to {limits.maximum:g}{unit} in steps of {limits.step:g}{unit}"
         values = [limits.minimum]
         try:
             # One that stays where it is would go on for ever.
@@ -111,4 +136,4 @@ class Properties:
         except DcamError as error:
             if error.code not in _UNKNOWN | _ILLEGAL:  # these are how the list ends
                 raise
-        return f"legal: {', '.join(f'{value:g}' for value in values)}"
+        return ", ".join(f"{value:g}" for value in values)

@@ -7,7 +7,7 @@ import ctypes
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.dcam.abi import Dcam
+from drivers.dcam.abi import RUNTIME, Dcam
 from drivers.dcam.codes import CaptureMode, CaptureState
 from drivers.dcam.session import run_all
 from drivers.dcam.structures import BufFrame
@@ -100,6 +100,7 @@ class Ring:
                 self._device,
                 f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers {first} to "
                 f"{oldest - 1} of this run in the order of arrival",
+                expected="frames taken before the ring comes round",
                 advice="Take frames faster, trigger slower or give the ring more memory",
                 state="Later frames can still be taken",
             )
@@ -109,6 +110,13 @@ class Ring:
         rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
         if not frame.buffer or rows < 1 or cols < 1 or stride < 2 * cols:
             problem = f"it gives a frame that cannot be: {rows} x {cols} pixels, {stride} bytes a row"
-            raise DeviceError(self._device, problem, request="dcambuf_lockframe")
+            raise DeviceError(
+                self._device,
+                problem,
+                request="dcambuf_lockframe",
+                expected="whole rows of 16-bit pixels",
+                advice=f"{RUNTIME}, and that no other program sets the camera",
+                state=f"{self._next} frames of this run were taken before",
+            )
         memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
         return np.ndarray((rows, cols), dtype="<u2", buffer=memoryview(memory), strides=(stride, 2)).copy()

@@ -67,7 +67,13 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     """
     if settings.readout not in _READOUTS:
         problem = f"there is no readout {settings.readout!r}"
-        raise DeviceRefused(device, problem, advice=f"legal: {', '.join(_READOUTS)}")
+        raise DeviceRefused(
+            device,
+            problem,
+            expected=f"another one, legal: {', '.join(_READOUTS)}",
+            advice="Choose one of them in the configuration",
+            state="Its settings are as they were",
+        )
     # Sensor mode and speed first: they change the ranges of what follows.
     mode, speed = _READOUTS[settings.readout]
     properties.set_exactly(Property.SENSORMODE, mode)
@@ -86,7 +92,14 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
         problem = (
             "the camera bundles several frames of this size into one transfer, which this driver cannot take apart"
         )
-        raise DeviceRefused(device, problem, advice="Ask for a larger region of interest")
+        raise DeviceRefused(
+            device,
+            problem,
+            request=f"a region of {settings.roi or 'the whole sensor'}",
+            expected="FRAMEBUNDLE_MODE off",
+            advice="Ask for a larger region of interest",
+            state="No frame was taken",
+        )
     line = 2 * properties.get(Property.TIMING_READOUTTIME) / _sensor_rows(properties, settings)
     tolerance = options.exposure_tolerance * settings.exposure + line
     properties.set_nearly(Property.EXPOSURETIME, settings.exposure, tolerance)
@@ -162,7 +175,13 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     height, width = (properties.maximum(prop) for prop in (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE))
     if not (0 <= row0 <= height - rows and 0 <= col0 <= width - cols):
         problem = f"the region {roi} (row0, col0, rows, cols) does not lie on the sensor"
-        raise DeviceRefused(device, problem, expected=f"a region within {height:g} x {width:g}")
+        raise DeviceRefused(
+            device,
+            problem,
+            expected=f"a region within {height:g} x {width:g}",
+            advice="Move or shrink the region in the configuration",
+            state="No frame was taken",
+        )
     properties.set_exactly(Property.SUBARRAYVSIZE, rows)
     properties.set_exactly(Property.SUBARRAYHSIZE, cols)
     properties.set_exactly(Property.SUBARRAYVPOS, row0)

@@ -203,7 +203,7 @@ def test_an_exposure_may_be_rounded_but_not_ignored(world: World, accepted: floa
     with connected(world) as camera:
         world.override(Property.EXPOSURETIME, accepted)
         if refused:
-            with pytest.raises(DeviceRefused, match=r"made EXPOSURETIME = .* of 0\.001\. Expected 0\.001 within"):
+            with pytest.raises(DeviceRefused, match=r"made EXPOSURETIME = .* of 0\.001\..* Expected 0\.001 within"):
                 camera.configure(EXTERNAL)
         else:
             assert camera.configure(EXTERNAL).exposure == accepted
@@ -242,7 +242,7 @@ def test_a_library_that_does_not_tell_what_frames_carry_is_none_the_less_describ
 
 def test_what_it_must_have_is_missed_by_name(world: World) -> None:
     world.fault("unsupported", Property.TRIGGERPOLARITY)
-    with pytest.raises(DeviceRefused, match=r"has no TRIGGERPOLARITY. Answered 'NOTSUPPORT"):
+    with pytest.raises(DeviceRefused, match=r"has no TRIGGERPOLARITY\..* Answered 'NOTSUPPORT"):
         world.connect()
     assert world.live == 0
 

@@ -33,17 +33,20 @@ def test_exposure_is_what_the_camera_rounded_it_to(camera: DcamCamera) -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"exposure": 1e-6}, r"EXPOSURETIME = 1e-06 is out of range\. legal: 7\.2e-06 to 1800 s"),
+        ({"exposure": 1e-6}, r"EXPOSURETIME = 1e-06 is out of range\..* legal: 7\.2e-06 to 1800 s"),
         ({"exposure": 100e-6, "readout": "ultra_quiet"}, r"legal: 0\.0001728 to 1800 s"),
         ({"exposure": 2000.0}, "out of range"),
-        ({"binning": 3}, r"refuses BINNING = 3. Answered 'INVALIDVALUE \(0x80000821\)'\. legal: 1, 2, 4"),
-        ({"roi": (0, 0, 30, 40)}, r"made SUBARRAYVSIZE = 32 of 30\. legal: 4 to 48 in steps of 4"),
+        (
+            {"binning": 3},
+            r"refuses BINNING = 3\..* 'INVALIDVALUE \(0x80000821\)'.* legal: 1, 2, 4",
+        ),
+        ({"roi": (0, 0, 30, 40)}, r"made SUBARRAYVSIZE = 32 of 30\..* legal: 4 to 48 in steps of 4"),
         (
             {"roi": (32, 0, 32, 40)},
             r"region \(32, 0, 32, 40\) .* does not lie on the sensor\. Expected a region within 48 x 72",
         ),
         ({"roi": (0, 0, 96, 40)}, "does not lie on the sensor"),
-        ({"readout": "fast"}, "no readout 'fast'. legal: standard, ultra_quiet"),
+        ({"readout": "fast"}, r"no readout 'fast'\..* legal: standard, ultra_quiet"),
     ],
 )
 def test_a_refusal_says_why_and_leaves_the_settings(camera: DcamCamera, wrong: dict, message: str) -> None:
