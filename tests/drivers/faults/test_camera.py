@@ -1,0 +1,231 @@
+"""Faults of the camera: at each call of its library, and what frames, triggers and links can do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from beamline.config_devices import DcamOrca
+from beamline.doctor import camera as doctor
+from beamline.doctor.check import Verdict
+from beamline.ledger import LedgerError
+from drivers.dcam.abi import ARGUMENTS, DcamError
+from drivers.dcam.codes import Error, Property
+from tests.drivers.faults import table
+from tests.drivers.faults.aftermath import (
+    assert_at_rest,
+    assert_complete,
+    assert_kept,
+    assert_next_scan_works,
+    assert_speaks,
+    assert_told_once,
+)
+from tests.drivers.faults.rig import VIEWS, Rig, Scanned
+from tests.drivers.usb_bus import Bus, Descriptor
+
+RigOf = Callable[..., Rig]
+ROWS = {row.fault: row for row in table.CAMERA}
+AT_CONNECTING = {"dcamapi_init", "dcamdev_open", "dcamwait_open"}
+"""Calls that no scan makes once its devices are open."""
+AFTER_A_REFUSAL = {"dcamprop_queryvalue"}
+"""It only tells which values are legal; the driver's own tests let it fail."""
+
+
+@pytest.fixture
+def rig(rig_of: RigOf) -> Rig:
+    return rig_of(table.CAMERA_KIND)
+
+
+def but(*missing: int) -> list[int]:
+    return [view for view in range(VIEWS) if view not in missing]
+
+
+def assert_ends_as(fault: str, scanned: Scanned) -> None:
+    assert isinstance(scanned.error, ROWS[fault].error), scanned.error
+    assert ROWS[fault].seen in str(scanned.error)
+
+
+def missing_views(scanned: Scanned) -> list[int]:
+    assert isinstance(scanned.error, LedgerError)
+    return [index - table.FIRST_VIEW for index in scanned.error.missing]
+
+
+def test_every_camera_fault_of_the_table_has_a_test() -> None:
+    assert {f"test_{fault.replace(' ', '_')}" for fault in ROWS} <= set(globals())
+
+
+def test_camera_absent_at_start(rig: Rig, tmp_path: Path) -> None:
+    rig.world.fault("no_camera")
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("camera absent at start", scanned)
+    assert_speaks(scanned.error, "camera")
+    assert "Switch the camera on" in str(scanned.error)
+    assert scanned.folder is None
+    assert_at_rest(rig, scanned)
+    assert_next_scan_works(rig, tmp_path)
+
+
+def calls_of_a_scan(rig: Rig, call: str, runs: Path) -> int:
+    """Calls from the moment when all devices are open, in a scan without a fault."""
+    before: list[int] = []
+    rig.after_connecting = lambda: before.append(rig.world.calls(call))
+    assert_complete(rig.scan(runs))
+    rig.repair()
+    return rig.world.calls(call) - before[0]
+
+
+@pytest.mark.parametrize("call", sorted(set(ARGUMENTS) - AT_CONNECTING - AFTER_A_REFUSAL))
+def test_an_error_of_the_library(rig: Rig, call: str, tmp_path: Path) -> None:
+    """At the first, a middle and the last such call of a scan: it ends with that error; or, where it came while frames
+    were waited for, it is told and nothing is lost, or what is lost is named."""
+    n = calls_of_a_scan(rig, call, tmp_path)
+    assert n > 0
+    for nth in sorted({1, (n + 1) // 2, n}):
+        rig.after_connecting = lambda nth=nth: rig.world.fail(call, Error.FAILREADCAMERA, nth)  # type: ignore[misc]
+        scanned = rig.scan(tmp_path)
+        told = [message for message in scanned.warnings if "FAILREADCAMERA" in message]
+        if scanned.error is None or isinstance(scanned.error, LedgerError):
+            assert len(told) == 1 and call in told[0], nth
+            assert_complete(scanned) if scanned.error is None else assert_told_once(scanned)
+        else:
+            assert_ends_as("an error of the library", scanned)
+            assert isinstance(scanned.error, DcamError)
+            assert scanned.error.code == Error.FAILREADCAMERA
+            assert scanned.error.request.split()[0] == call
+            assert_speaks(scanned.error, "camera")
+            assert told == []
+        assert_at_rest(rig, scanned)
+        assert_next_scan_works(rig, tmp_path)
+
+
+@pytest.mark.parametrize("call", sorted(AT_CONNECTING))
+def test_an_error_of_the_library_at_connecting(rig: Rig, call: str, tmp_path: Path) -> None:
+    rig.world.fail(call, Error.FAILREADCAMERA)
+    scanned = rig.scan(tmp_path)
+    assert_speaks(scanned.error, "camera")
+    assert scanned.folder is None
+    assert_at_rest(rig, scanned)
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_frame_lost_in_the_camera(rig: Rig, tmp_path: Path) -> None:
+    rig.world.lose(3, 7)
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("frame lost in the camera", scanned)
+    assert missing_views(scanned) == [3, 7]
+    assert "2 were exposed" in str(scanned.error)
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned, but(3, 7))
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_ring_overrun(rig_of: RigOf, tmp_path: Path) -> None:
+    """A ring of two frames, and a computer that does nothing for four and a half periods after view 4."""
+    rig = rig_of(table.CAMERA_KIND, sensor=(512, 512))
+    rig.at_frame[table.FIRST_VIEW + 4] = lambda: rig.clock.sleep(0.45)
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("ring overrun", scanned)
+    (warning,) = scanned.warnings
+    assert re.search(r"its ring of 2 frames was overrun and \d frames are lost", warning)
+    lost = missing_views(scanned)
+    assert lost == list(range(5, 5 + len(lost))) and 2 <= len(lost) <= 4
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned, but(*lost))
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_camera_unplugged(rig: Rig, tmp_path: Path) -> None:
+    rig.world.fault("unplug_at", 5)
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("camera unplugged", scanned)
+    assert_speaks(scanned.error, "camera")
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned)
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_triggers_planned_too_fast(rig: Rig, tmp_path: Path) -> None:
+    scanned = rig.scan(tmp_path, "scan.period_s=0.005", "scan.angles.span_deg=1")
+    assert_ends_as("triggers planned too fast", scanned)
+    assert "nothing was started" in str(scanned.error)
+    assert scanned.folder is None
+    assert_at_rest(rig, scanned)
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_triggers_too_fast(rig: Rig, tmp_path: Path) -> None:
+    """It needs longer than it said, and ignores every second pulse without a word."""
+    said = rig.world.value(Property.TIMING_MINTRIGGERINTERVAL)
+    rig.at_frame[0] = lambda: rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, 0.15)
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("triggers too fast", scanned)
+    odd = list(range(1, VIEWS, 2))
+    assert missing_views(scanned) == odd
+    assert "a longer period_s leaves the camera more time" in str(scanned.error)
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned, but(*odd))
+    rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, said)
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_triggers_of_which_the_camera_says_that_they_are_too_fast(rig: Rig, tmp_path: Path) -> None:
+    rig.at_frame[table.FIRST_VIEW] = lambda: rig.world.fail("dcamwait_start", Error.TOOFREQUENTTRIGGER)
+    scanned = rig.scan(tmp_path)
+    assert_complete(scanned)  # nothing was lost, but somebody should know
+    (warning,) = scanned.warnings
+    assert re.search(r"TOOFREQUENTTRIGGER.*Turn the stage more slowly", warning)
+    assert_next_scan_works(rig, tmp_path)
+
+
+@pytest.mark.parametrize("when", ["before the scan", "between darks and flats"])
+def test_setting_refused(rig: Rig, when: str, tmp_path: Path) -> None:
+    def refuse() -> None:
+        rig.world.fault("refuse", Property.EXPOSURETIME)
+
+    if when == "before the scan":
+        rig.after_connecting = refuse
+    else:
+        rig.at_frame[table.DARKS - 1] = refuse
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("setting refused", scanned)
+    assert_speaks(scanned.error, "camera")
+    assert_at_rest(rig, scanned)
+    if when == "before the scan":
+        assert scanned.folder is None
+    else:
+        assert_told_once(scanned)
+        assert_kept(scanned, [])
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_slow_link(rig: Rig, tmp_path: Path) -> None:
+    """The doctor says so before; a scan all the same loses the frames that the link does not carry, and names them."""
+    check = doctor.link(DcamOrca(kind="dcam"), Bus(Descriptor(speed=3)))
+    assert check.verdict is Verdict.FAILED
+    assert "480 Mbit/s" in check.found and "USB 3 cable" in check.advice
+    odd = list(range(1, VIEWS - 1, 2))
+    rig.world.lose(*odd)
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("slow link", scanned)
+    assert missing_views(scanned) == odd
+    assert_told_once(scanned)
+    assert_at_rest(rig, scanned)
+    assert_kept(scanned, but(*odd))
+    assert_next_scan_works(rig, tmp_path)
+
+
+def test_a_camera_that_says_that_its_link_is_slow_makes_the_plan_be_refused(rig: Rig, tmp_path: Path) -> None:
+    rig.world.override(Property.INTERNAL_FRAMEINTERVAL, 0.5)
+    scanned = rig.scan(tmp_path)
+    assert_ends_as("triggers planned too fast", scanned)
+    assert scanned.folder is None
+    assert_at_rest(rig, scanned)
+    rig.world.override(Property.INTERNAL_FRAMEINTERVAL, 0.01)
+    assert_next_scan_works(rig, tmp_path)
