@@ -1,0 +1,55 @@
+"""Where the Triton kernels are tested: on CUDA where there is one, else interpreted; geometries and comparisons."""
+
+from __future__ import annotations
+
+import importlib
+import os
+
+import pytest
+import torch
+from torch import Tensor
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.kernels import reference
+from recon.splat import RayModel
+from tests.recon.helpers import as_leaves, gradients
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when triton and the kernels are first imported, that is, here
+pytest.importorskip("triton", reason="the GPU kernels need triton (extra gpu, Linux)")
+
+DEVICE: torch.device = importlib.import_module("recon.kernels.gpu").require("cuda")
+WHOLE = (1e-12, 9.0)  # faint, cut: no cut-off worth the name
+AFFINE, EXACT = RayModel(), RayModel(exact_above=0.0)
+UNIT = 0.7
+SHAPE = (19, 26)  # no multiple of a tile
+
+
+def parallel(shape: tuple[int, int] = SHAPE) -> Geometry:
+    return Geometry.parallel([0.7, -4.0], shape, pixel_pitch=0.5, axis_col=shape[1] / 2 - 1.7)
+
+
+def leaned() -> Geometry:
+    return Geometry.parallel([2.5], SHAPE, 0.5, axis_row=8.2, shifts=[[1.3, -0.8]], roll=0.2, tilt=0.3)
+
+
+def cone(shape: tuple[int, int] = SHAPE) -> Geometry:
+    return Geometry.cone([0.4], shape, 1.1, 22.0, 45.0, shape[1] / 2 - 1.1, shifts=[[-0.6, 0.4]], roll=-0.1, tilt=0.2)
+
+
+def raw_of(g: Gaussians, device: torch.device) -> tuple[Tensor, ...]:
+    leaves = as_leaves(g)
+    tensors = (leaves.means, leaves.log_scales, leaves.quaternions, leaves.raw_densities)
+    return tuple(t.detach().to(device).requires_grad_() for t in tensors)
+
+
+def twin_view(g: Gaussians, geometry: Geometry, view: int) -> Tensor:
+    return reference.project_view(g.means, g.scales, g.quaternions, g.densities, geometry, view)
+
+
+def assert_gradients(found: tuple[Tensor, ...], twin: Gaussians, relative: float = 2e-5) -> None:
+    for tensor, (name, expected) in zip(found, gradients(twin).items(), strict=True):
+        assert tensor.grad is not None
+        off = float((tensor.grad.cpu().double() - expected).abs().max())
+        assert off < relative * float(expected.abs().max()), name

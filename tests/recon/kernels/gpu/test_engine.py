@@ -1,0 +1,92 @@
+"""A fit is the same on both backends, calls go to the device of their tensors, and errors say what is missing."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+
+from recon import fit
+from recon.backend import Backend, Cpu, backend_for
+from recon.checkpoint import arrays_of, state_from
+from recon.density_control import DensityPolicy
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.splat import RayModel, Truncation, project, voxelize
+from recon.volume import Grid
+from tests.recon.conftest import Make
+from tests.recon.helpers import as_leaves, in_double
+from tests.recon.kernels.gpu.on_gpu import DEVICE, UNIT, cone, parallel
+
+gpu = importlib.import_module("recon.kernels.gpu")
+
+
+def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: fit.FitSettings) -> tuple[fit.FitState, list]:
+    """Five steps with rounds of density control on data and weights that are always the same."""
+    rng = np.random.default_rng(5)
+    data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
+    weights = (rng.random(data.shape) > 0.1).astype(np.float32)
+    problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
+    state, told = fit.init(g, 11, 1.5, backend), []
+    fit.run(state, problem, settings, 5, lambda s: told.append((s.n, float(s.loss), float(s.residual))) is not None)
+    return state, [*told, fit.misfit_of(state, problem, settings)]
+
+
+@pytest.mark.parametrize(
+    ("make", "changes"),
+    [
+        (parallel, {"loss": "poisson", "views_per_step": 2}),
+        (cone, {"loss": "l1", "rays": RayModel(exact_above=0.05)}),
+    ],
+)
+def test_a_fit_is_the_same_on_both_backends(make: object, changes: dict, random_gaussians: Make) -> None:
+    g, geometry = random_gaussians(14, 6.0), make((11, 14))  # type: ignore[operator]
+    # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.
+    policy = DensityPolicy(start=0.0, stop=1.0, every=2, threshold=1e-4, prune_below=0.3)
+    settings = fit.FitSettings(
+        truncation=Truncation(9.0, 1e-12), policy=policy, tv_size=5, pace=10.0, smallest=0.8, **changes
+    )
+    (ours, said), (theirs, told) = (_fit(backend, g, geometry, settings) for backend in (Cpu(), backend_for("cuda")))
+    assert len({n for n, *_ in said[:-1]}) > 1  # density control changed the model
+    np.testing.assert_allclose(np.hstack(told), np.hstack(said), rtol=2e-5)
+    device = backend_for("cuda")
+    for name in fit.NAMES:
+        a, b = ours.parameters[name], device.numpy(theirs.parameters[name])
+        np.testing.assert_allclose(b, a, atol=2e-5 * float(np.abs(a).max()), err_msg=name)
+    np.testing.assert_allclose(device.numpy(theirs.statistic), ours.statistic, atol=2e-5 * ours.statistic.max())
+    checkpoint = arrays_of(theirs, device)
+    again = state_from(checkpoint, device)
+    for key, array in arrays_of(again, device).items():
+        np.testing.assert_array_equal(array, checkpoint[key], err_msg=key)
+
+
+def test_project_and_voxelize_go_where_they_are_sent(random_gaussians: Make) -> None:
+    g, geometry, grid = random_gaussians(9, 8.0), cone(), Grid((4, 6, 5), 0.9)
+    model, cut = RayModel(exact_above=0.05), Truncation(9.0, 1e-12)
+    there = as_leaves(g, DEVICE)
+    shown = project(there, geometry, truncation=cut, model=model, kernel="gpu").detach().cpu()
+    np.testing.assert_allclose(shown, project(g, geometry, truncation=cut, model=model), rtol=1e-4, atol=1e-5)
+    dense = voxelize(there, grid, truncation=cut, kernel="gpu").detach().cpu()
+    np.testing.assert_allclose(dense, voxelize(g, grid, truncation=cut), rtol=1e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="gpu kernel works in float32"):
+        project(in_double(g), geometry, kernel="gpu")
+
+
+def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu, "interpreted", lambda: False)
+    with pytest.raises(ValueError, match="run on cuda devices, got cpu"):
+        gpu.require("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(RuntimeError, match="sees no CUDA DEVICE"):
+        gpu.require("cuda:1")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(ValueError, match=r"cuda:1 was asked for.*current one, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
+        gpu.require("cuda:1")
+    for absent in ("cuda:2", "cuda:200"):  # torch takes the latter for a DEVICE of negative number
+        with pytest.raises(ValueError, match=rf"{absent} was asked for, and torch sees 2 CUDA devices.*ask for cuda"):
+            gpu.require(absent)
+    assert gpu.require("cuda:0") == torch.DEVICE("cuda:0")

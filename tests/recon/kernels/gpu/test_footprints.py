@@ -1,0 +1,191 @@
+"""Footprints, images and what flows back from them: the Triton kernels against the twin and the CPU's."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+
+from recon.gaussians import Gaussians
+from recon.geometry import Geometry
+from recon.kernels import footprints_cpu, reference
+from recon.splat import Active, RayModel, view_table
+from recon.volume import Grid
+from tests.recon.conftest import Make
+from tests.recon.helpers import gradients, in_double
+from tests.recon.kernels.gpu.on_gpu import (
+    AFFINE,
+    DEVICE,
+    EXACT,
+    SHAPE,
+    UNIT,
+    WHOLE,
+    assert_gradients,
+    cone,
+    leaned,
+    parallel,
+    raw_of,
+    twin_view,
+)
+
+autograd = importlib.import_module("recon.kernels.gpu.autograd")
+engine = importlib.import_module("recon.kernels.gpu.engine")
+
+
+@pytest.mark.parametrize("make", [parallel, leaned, cone])
+def test_images_and_gradients_equal_the_twins(make: object, random_gaussians: Make) -> None:
+    geometry = make()  # type: ignore[operator]
+    g = random_gaussians(18, 9.0)
+    raw, twin = raw_of(g, DEVICE), in_double(g)
+    found = autograd.project(*raw, UNIT, geometry, *WHOLE, AFFINE)
+    expected = torch.stack([twin_view(twin, geometry, view) for view in range(geometry.n_views)])
+    peak = float(expected.detach().max())
+    assert float((found.detach().cpu() - expected.detach()).abs().max()) < 3e-6 * peak
+    weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
+    (found * weights.float().to(DEVICE)).sum().backward()
+    (expected * weights).sum().backward()
+    assert_gradients(raw, twin)
+
+
+@pytest.mark.parametrize("make", [parallel, cone])
+def test_the_uncorrected_factor_equals_the_twins(make: object, random_gaussians: Make) -> None:
+    geometry = make()  # type: ignore[operator]
+    g = random_gaussians(10, 9.0)
+    raw, twin = raw_of(g, DEVICE), in_double(g)
+    plain = RayModel(rectified=False)
+    found = autograd.project(*raw, UNIT, geometry, *WHOLE, plain)[0]
+    physical = (twin.means, twin.scales, twin.quaternions, twin.densities)
+    expected = reference.project_view(*physical, geometry, 0, length=plain.length(geometry))
+    assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
+    (found * found).sum().backward()
+    (expected * expected).sum().backward()
+    assert_gradients(raw, twin)
+
+
+def test_footprints_equal_the_cpus(random_gaussians: Make) -> None:
+    g, geometry = random_gaussians(30, 30.0), parallel()
+    arrays = g.arrays()
+    active = Active.of(*(arrays[k] for k in ("means", "log_scales", "quaternions", "raw_densities")), UNIT)
+    expected = view_table(active, geometry, 0, 1e-3, 3.5)
+    raw = [t.detach() for t in raw_of(g, DEVICE)]
+    found = engine.GpuPass(*raw, UNIT).view(geometry, 0, 1e-3, 3.5, AFFINE).footprints
+    table = found.table.cpu().numpy()
+    hidden = expected[:, footprints_cpu.HU] < 0
+    assert hidden.any() or not (table[:, footprints_cpu.HU] < 0).any()
+    np.testing.assert_array_equal(table[:, footprints_cpu.HU] < 0, hidden)
+    np.testing.assert_allclose(table[~hidden], expected[~hidden], rtol=2e-5, atol=2e-5)
+    boxes = found.boxes.cpu().numpy()
+    assert (boxes >= 0).all() and (boxes[:, 1] <= SHAPE[0]).all() and (boxes[:, 3] <= SHAPE[1]).all()
+    u, v, hu, hv = (table[:, k] for k in (0, 1, 6, 7))
+    hit = (u + hu >= 0) & (u - hu <= SHAPE[1] - 1) & (v + hv >= 0) & (v - hv <= SHAPE[0] - 1)
+    assert 0 < hit.sum() < hit.size  # some lie outside the image
+    np.testing.assert_array_equal(boxes[:, 1] > boxes[:, 0], hit)
+
+
+def test_a_cut_off_ends_at_the_box_whatever_the_tiles() -> None:
+    # One Gaussian over several tiles and image borders: exactly the pixels of its box are lit.
+    g = Gaussians.from_physical([[2.3, 0.0, -3.1]], [1.4], [1.0])
+    geometry = Geometry.parallel([0.0], (17, 20), axis_col=14.0)
+    view = engine.GpuPass(*(t.detach() for t in raw_of(g, DEVICE)), 1.0).view(geometry, 0, 1e-9, 2.5, AFFINE)
+    image = view.image.cpu().numpy()
+    rows, cols = np.abs(np.arange(17) - (8 - 3.1)) <= 2.5 * 1.4, np.abs(np.arange(20) - 16.3) <= 2.5 * 1.4
+    np.testing.assert_array_equal(image > 0, rows[:, None] & cols[None, :])
+    assert view.footprints.boxes.tolist() == [
+        [rows.argmax(), 17 - rows[::-1].argmax(), cols.argmax(), 20 - cols[::-1].argmax()]
+    ]
+
+
+def test_the_backward_pass_is_the_adjoint_where_footprints_are_cut(
+    random_gaussians: Make, rng: np.random.Generator
+) -> None:
+    # <A ρ, y> = <ρ, Aᵀ y>: render and moments must agree on every pixel of every footprint, also at the cut.
+    g = random_gaussians(25, 14.0)
+    raw = raw_of(g, DEVICE)
+    y = torch.from_numpy(rng.normal(size=(2, *SHAPE)).astype(np.float32)).to(DEVICE)
+    image = autograd.project(*raw, UNIT, parallel(), 1e-3, 2.0, AFFINE)
+    (image * y).sum().backward()
+    assert raw[3].grad is not None
+    back = raw[3].grad.cpu().double() / (UNIT * torch.sigmoid(g.raw_densities.double()))
+    left, right = float((image.detach() * y).double().sum()), float((g.densities.double() * back).sum())
+    assert left == pytest.approx(right, rel=1e-5)
+
+    raw = raw_of(g, DEVICE)
+    grid = Grid((9, 11, 10), 0.9)
+    y = torch.from_numpy(rng.normal(size=grid.shape).astype(np.float32)).to(DEVICE)
+    volume = autograd.voxelize(*raw, UNIT, grid, 1e-3, 2.0)
+    (volume * y).sum().backward()
+    assert raw[3].grad is not None
+    back = raw[3].grad.cpu().double() / (UNIT * torch.sigmoid(g.raw_densities.double()))
+    left, right = float((volume.detach() * y).double().sum()), float((g.densities.double() * back).sum())
+    assert left == pytest.approx(right, rel=1e-5)
+
+
+def test_what_misses_the_image_or_is_too_faint_has_no_gradient() -> None:
+    g = Gaussians.from_physical([[0.0, 0, 0], [500.0, 0, 0], [0, 0, 1e30]], [1.0, 1.0, 1.0], [1e-9, 1.0, 1.0])
+    raw = raw_of(g, DEVICE)
+    image = autograd.project(*raw, 1.0, Geometry.parallel([0.0], (5, 6)), 1e-6, 3.5, AFFINE)
+    assert not image.any()
+    image.sum().backward()
+    assert all(tensor.grad is not None and not tensor.grad.any() for tensor in raw)
+
+
+@pytest.mark.parametrize("aspect", [30.0, 1000.0])
+def test_a_needle_keeps_its_digits(aspect: float) -> None:
+    # Askew and longer than the image: the expanded quadratic form would lose it in float32.
+    g = Gaussians.from_physical([[0.1, 0.2, -0.3]], [[0.03 * aspect, 0.03, 0.03]], [1.0], [[0.9, 0.1, 0.35, 0.2]])
+    geometry = Geometry.parallel([0.3], (24, 24), 0.05)
+    raw, twin = raw_of(g, DEVICE), in_double(g)
+    found = autograd.project(*raw, g.density_unit, geometry, *WHOLE, AFFINE)
+    expected = twin_view(twin, geometry, 0)
+    assert float((found[0].cpu() - expected).detach().abs().max()) < 1e-5 * float(expected.detach().max())
+    found.sum().backward()
+    expected.sum().backward()
+    assert_gradients(raw, twin, 2e-5)
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_none_one_and_those_that_cover_everything(n: int) -> None:
+    g = Gaussians.from_physical(np.full((n, 3), 0.2), np.full((n, 3), 40.0), np.ones(n), density_unit=1.0)
+    raw, twin = raw_of(g, DEVICE), in_double(g)
+    geometry, grid = Geometry.parallel([1.0], (9, 17)), Grid((3, 9, 9))
+    image = autograd.project(*raw, 1.0, geometry, *WHOLE, AFFINE)
+    volume = autograd.voxelize(*raw, 1.0, grid, *WHOLE)
+    image.sum().backward()
+    volume.sum().backward()
+    if n == 0:
+        assert not image.any() and not volume.any()
+        return
+    z, y, x = (torch.from_numpy(axis) for axis in grid.coordinates())
+    expected = twin_view(twin, geometry, 0)
+    dense = reference.voxelize(twin.means, twin.scales, twin.quaternions, twin.densities, (z, y, x))
+    np.testing.assert_allclose(image.detach().cpu().numpy()[0], expected.detach().numpy(), rtol=3e-6)
+    np.testing.assert_allclose(volume.detach().cpu().numpy(), dense.detach().numpy(), rtol=3e-6)
+    (expected.sum() + dense.sum()).backward()
+    # The rotation of a ball has no gradient: what is left of it is rounding.
+    for tensor, (name, value) in zip(raw, gradients(twin).items(), strict=True):
+        assert tensor.grad is not None
+        np.testing.assert_allclose(tensor.grad.cpu(), value, rtol=1e-4, atol=0.3 if name == "quaternions" else 1e-3)
+
+
+def test_extreme_gaussians_stay_finite() -> None:
+    scales = torch.tensor([[1e-3, 1.0, 1e-3], [1e3, 1e6, 1e3], [1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [1e-30, 1.0, 1.0]])
+    g = Gaussians(
+        torch.tensor([[0.0, 0.0, 0.0], [1e4, -1e4, 5e3], [1e30, 0.0, 0.0], [0.1, 0.2, 0.3], [0.0, 0.0, 0.0]]),
+        torch.log(scales),
+        torch.tensor([[1e-30, 0, 1e-30, 0], [1e6, 0, 1e6, 0], [0, 0, 0, 0], [1, 0.2, 0, 0], [1, 1, 1, 0]]),
+        torch.tensor([0.5, 3.0, 0.0, -80.0, 0.5]),
+    )
+    with np.errstate(all="ignore"):  # the interpreter is numpy, which warns of an infinity that a GPU just makes
+        for call, where, *model in (
+            (autograd.project, parallel(), AFFINE),
+            (autograd.project, cone(), AFFINE),
+            (autograd.project, cone(), EXACT),
+            (autograd.voxelize, Grid((4, 5, 6))),
+        ):
+            raw = raw_of(g, DEVICE)
+            out = call(*raw, 1.0, where, 1e-5, 3.5, *model)
+            out.sum().backward()
+            assert torch.isfinite(out).all() and float(out.detach().min()) >= 0
+            assert all(tensor.grad is not None and torch.isfinite(tensor.grad).all() for tensor in raw)

@@ -1,0 +1,71 @@
+"""Losses: the Triton kernels against the twin and the CPU's."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+
+from recon.backend import Cpu, backend_for
+from recon.kernels.losses_cpu import L1, L2, POISSON, DataTerm
+from recon.losses import projection_loss
+from recon.losses import total_variation as twin_total_variation
+from tests.recon.kernels.gpu.on_gpu import DEVICE
+
+engine = importlib.import_module("recon.kernels.gpu.engine")
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("term", [DataTerm(L1, 1.0, 1.0), DataTerm(L2, 0.3, 1.0), DataTerm(POISSON, 0.2, 1.7)])
+def test_projection_loss_and_gradient_equal_the_twin(weighted: bool, term: DataTerm, rng: np.random.Generator) -> None:
+    target = rng.random((19, 33)).astype(np.float32)
+    image = (target + 0.2 * rng.normal(size=target.shape)).astype(np.float32)
+    image[3, 4] = target[3, 4]
+    weights = np.maximum(rng.uniform(-0.5, 2.0, target.shape), 0).astype(np.float32) if weighted else None
+    backend = engine.Gpu("cuda")
+    loss = backend.projection_loss(target.shape, 0.25, term)
+    x, y = backend.array(image), backend.array(target)
+    w = None if weights is None else backend.array(weights)
+    value, gradient = loss(x, y, loss.target_maps(y, w), w)
+    twin, *others = (None if a is None else torch.from_numpy(a.astype(np.float64)) for a in (image, target, weights))
+    assert twin is not None
+    twin.requires_grad_()
+    expected = projection_loss(twin, others[0], 0.25, others[1], term)
+    expected.backward()
+    assert float(value) == pytest.approx(expected.item(), rel=1e-5)
+    assert twin.grad is not None
+    np.testing.assert_allclose(gradient.cpu(), twin.grad, atol=2e-5 * float(twin.grad.abs().max()))
+    if weights is not None:
+        assert not gradient.cpu().numpy()[weights == 0].any()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_misfit_and_lengths_equal_the_cpus(weighted: bool, rng: np.random.Generator) -> None:
+    image, target, w = rng.random((3, 12, 17)).astype(np.float32)
+    vectors, factor = rng.normal(size=(31, 2)).astype(np.float32), 2.5
+    found = []
+    for backend in (Cpu(), backend_for("cuda")):
+        weights, sums = backend.array(w) if weighted else None, backend.array(np.arange(31, dtype=np.float32))
+        here = [backend.array(a) for a in (image, target, 0 * target)]
+        assert float(backend.misfit(here[0], here[2], weights)) == 0
+        backend.add_lengths(backend.array(vectors), factor, sums)
+        found.append((float(backend.misfit(here[0], here[1], weights)), backend.numpy(sums)))
+    assert found[1][0] == pytest.approx(found[0][0], rel=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(5, 6, 11), (1, 4, 4), (1, 1, 3), (1, 1, 1)])
+def test_total_variation_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int, int]) -> None:
+    volume = torch.from_numpy(rng.normal(size=shape).astype(np.float32))
+    value, gradient = engine.losses.total_variation(volume.to(DEVICE), 0.3)
+    if volume.numel() == 1:
+        assert float(value) == 0 and not gradient.any()
+        return
+    x = volume.double().requires_grad_()
+    expected = 0.3 * twin_total_variation(x)
+    expected.backward()
+    assert float(value) == pytest.approx(expected.item(), rel=1e-6)
+    assert x.grad is not None
+    np.testing.assert_allclose(gradient.cpu(), x.grad, atol=1e-7)
