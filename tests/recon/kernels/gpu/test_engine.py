@@ -79,7 +79,7 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="run on cuda devices, got cpu"):
         gpu.require("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(RuntimeError, match="sees no CUDA DEVICE"):
+    with pytest.raises(RuntimeError, match="sees no CUDA device"):
         gpu.require("cuda:1")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
