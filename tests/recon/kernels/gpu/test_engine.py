@@ -86,7 +86,7 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     with pytest.raises(ValueError, match=r"cuda:1 was asked for.*current one, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
         gpu.require("cuda:1")
-    for absent in ("cuda:2", "cuda:200"):  # torch takes the latter for a DEVICE of negative number
+    for absent in ("cuda:2", "cuda:200"):  # torch takes the latter for a device of negative number
         with pytest.raises(ValueError, match=rf"{absent} was asked for, and torch sees 2 CUDA devices.*ask for cuda"):
             gpu.require(absent)
-    assert gpu.require("cuda:0") == torch.DEVICE("cuda:0")
+    assert gpu.require("cuda:0") == torch.device("cuda:0")
