@@ -21,14 +21,12 @@ import h5py
 import pytest
 import serial
 
-from beamline import devices
 from beamline import run as run_module
 from beamline.config import Config, config_folder, load
 from beamline.devices import Bench, connect
 from beamline.events import Event
 from beamline.recorder import Recorder
 from beamline.run import RunResult, run_scan
-from beamline.stages import make_stage
 from beamline.storage.source import open_scan
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
@@ -41,6 +39,7 @@ from tests.drivers.dcam.fake import World
 
 COUNTS = 360_000
 SENSOR = (16, 16)
+PORT = "/dev/rig"
 VIEWS, DARKS, FLATS = 12, 2, 1
 FIRST, STEP = 10.0, 2.0
 """Degrees of the first view, and between views."""
@@ -317,14 +316,16 @@ class Rig:
         self.asked: list[str] = []
         self.after_connecting: Callable[[], None] = lambda: None
         self.at_frame: dict[int, Callable[[], object]] = {}
-        url = register(f"rig-{uuid4().hex}", self.cable)
-        monkeypatch.setattr(devices, "make_stage", lambda settings, port, clock: make_stage(settings, url, clock))
+        simulated, opens = register(f"rig-{uuid4().hex}", self.cable), serial.serial_for_url
+        monkeypatch.setattr(
+            serial, "serial_for_url", lambda url, **how: opens(simulated if url == PORT else url, **how)
+        )
         monkeypatch.setattr(run_module, "connect", self._connect)
         monkeypatch.setattr(run_module, "Recorder", partial(_Recorder, self.at_frame))
 
     def config(self, *overrides: str) -> Config:
         stage = (
-            f"{self.kind.stage}, port: /dev/rig, counts_per_turn: {COUNTS}, max_speed_deg_s: 30, "
+            f"{self.kind.stage}, port: {PORT}, counts_per_turn: {COUNTS}, max_speed_deg_s: 30, "
             "acceleration_deg_s2: 60, low_deg: -5, high_deg: 365"
         )
         shutter = "manual" if self.kind.levels is None else f"stage_output, output: {SHUTTER}, settle_s: 0"
@@ -385,7 +386,7 @@ class Rig:
         wishes = [wish for wish in self.asked if "shutter" in wish]
         return bool(wishes) and wishes[-1].startswith("Open")
 
-    def _connect(self, config: Config, ask: Callable[[str], None]) -> Bench:
-        bench = connect(config, self.clock, ask)
+    def _connect(self, config: Config, ask: Callable[[str], None], heed: Callable[[], None]) -> Bench:
+        bench = connect(config, self.clock, ask, heed)
         self.after_connecting()
         return bench

@@ -28,6 +28,7 @@ class LineFault:
         spoil: the reply as it arrives instead; the same where it is the next one's turn.
         error: the class of the error; `seen`: words of it, which the page has too.
         replied: something arrived, which the error must show.
+        phases: of the scan, in which it is tried.
         not_on: controller -> why it cannot happen there.
         harmless_on: controller -> why the scan is complete in spite of it.
     """
@@ -37,6 +38,7 @@ class LineFault:
     error: type[DeviceError]
     seen: str
     replied: bool
+    phases: tuple[Phase, ...] = (Phase.OPENING, Phase.TURNING)
     not_on: Mapping[str, str] = field(default_factory=dict)
     harmless_on: Mapping[str, str] = field(default_factory=dict)
 
@@ -52,7 +54,7 @@ def _changed(rig: Rig, reply: bytes) -> bytes:
 
 
 LINE: tuple[LineFault, ...] = (
-    LineFault("no reply", lambda rig, reply: b"", DeviceTimeout, "no whole reply within 1 s", replied=False),
+    LineFault("no reply", lambda rig, reply: b"", DeviceTimeout, "no whole reply within 1 s", False, tuple(Phase)),
     LineFault(
         "garbage",
         _garbage,
@@ -98,7 +100,6 @@ LINE: tuple[LineFault, ...] = (
         },
     ),
 )
-LINE_PHASES = tuple(Phase)
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""

@@ -37,11 +37,15 @@ def test_without_a_fault_a_scan_is_complete(rig_of: RigOf, kind: str, tmp_path: 
     assert_next_scan_works(rig, tmp_path)
 
 
-@pytest.mark.parametrize("phase", table.LINE_PHASES, ids=lambda phase: phase.name.lower())
 @pytest.mark.parametrize(
-    ("row", "kind"),
-    [(row, kind) for row in table.LINE for kind in KINDS if kind not in row.not_on],
-    ids=lambda of: of if isinstance(of, str) else of.fault,
+    ("row", "kind", "phase"),
+    [
+        pytest.param(row, kind, phase, id=f"{row.fault}-{kind}-{phase.name.lower()}")
+        for row in table.LINE
+        for kind in KINDS
+        if kind not in row.not_on
+        for phase in row.phases
+    ],
 )
 def test_one_bad_reply(rig_of: RigOf, row: table.LineFault, kind: str, phase: Phase, tmp_path: Path) -> None:
     rig = rig_of(kind)
@@ -66,7 +70,7 @@ def test_one_bad_reply(rig_of: RigOf, row: table.LineFault, kind: str, phase: Ph
     assert_next_scan_works(rig, tmp_path)
 
 
-@pytest.mark.parametrize("phase", table.LINE_PHASES, ids=lambda phase: phase.name.lower())
+@pytest.mark.parametrize("phase", Phase, ids=lambda phase: phase.name.lower())
 @pytest.mark.parametrize("kind", KINDS)
 def test_stage_unplugged(rig_of: RigOf, kind: str, phase: Phase, tmp_path: Path) -> None:
     rig = rig_of(kind)
