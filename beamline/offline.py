@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,7 @@ from beamline.storage.source import Quantity, ScanSource, open_scan
 from drivers.clock import Clock
 from recon.backend import backend_for
 from recon.fbp import Filter
-from recon.fit import FitSettings
+from recon.fit import FitSettings, Progress
 from recon.initialise import Start, default_count
 from recon.problem import Loss
 from recon.quality import PRESETS, Quality
@@ -154,11 +155,12 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = 
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
     with stoppable() as stopped:
-        if options.budget is None:
-            made = reconstruct(options, prepared, Grid.matching(prepared.geometry), sink, clock, stopped, warn)
-        else:
-            made, prepared, factor = spend(options, options.budget, prepared, sink, clock, stopped, warn)
+        work = _Work(options, prepared, sink, clock, Heeded(stopped), warn)
+        if options.budget is not None:
+            made, prepared, factor = _spend(work, options.budget)
             selection = replace(selection, binning=selection.binning * factor)
+        else:
+            made = _fit(work) if options.method == "r2" else _by_voxels(work)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
     context = Context(facts, selection, options.command, options.seed, warn.said, started)
     return deliver(made, prepared, truth, options.target, context, sink, clock)
@@ -186,58 +188,70 @@ def check_device(device: str) -> None:
         raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
 
 
-def reconstruct(
-    options: ReconOptions,
-    prepared: Prepared,
-    grid: Grid,
-    sink: Sink,
-    clock: Clock,
-    stopped: Callable[[], bool],
-    warn: Warnings,
-) -> Made:
-    """Run the reconstructor on prepared views."""
-    if options.method == "r2":
-        return _fit(options, prepared, grid, sink, clock, stopped, warn)
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What a reconstruction is made of and with."""
+
+    options: ReconOptions
+    prepared: Prepared
+    sink: Sink
+    clock: Clock
+    heeded: Heeded
+    warn: Warnings
+
+    @property
+    def grid(self) -> Grid:
+        return Grid.matching(self.prepared.geometry)
+
+    def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
+        return progress_events(self.sink, self.clock, seconds)
+
+    @contextmanager
+    def refused(self, by: str = "") -> Iterator[None]:
+        """What the data do not allow, as a DataError that names the file."""
+        try:
+            yield
+        except ValueError as error:
+            raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
+
+    def made(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> Made:
+        """The result with what it was made with: its own settings, `settings`, and whether it ended early."""
+        return Made(
+            volume=result.volume,
+            method=result.method,
+            seconds=result.seconds,
+            history=result.history,
+            settings={**result.settings, **settings, **({"ended_early": True} if early else {})},
+            filter=self.options.filter,
+            chosen=chosen,
+        )
+
+
+def _by_voxels(work: _Work) -> Made:
+    """By FBP or an iterative method."""
+    options, prepared = work.options, work.prepared
     own: dict[str, Any] = {"filter": options.filter} if options.method == "fbp" else {}
-    heeded = Heeded(stopped)
-    try:
+    with work.refused(f" by {options.method}"):
         result = recon.reconstruct(
             prepared.projections.data,
             prepared.geometry,
-            grid,
+            work.grid,
             method=options.method,
             seed=options.seed,
             **own,
             iterations=options.iterations,
             tv_weight=options.tv_weight,
-            on_progress=progress_events(sink, clock),
-            should_stop=heeded,
-            now=clock.now,
+            on_progress=work.listener(),
+            should_stop=work.heeded,
+            now=work.clock.now,
         )
-    except ValueError as error:
-        raise DataError(f"{options.source.path} cannot be reconstructed by {options.method}: {error}") from error
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    early = {"ended_early": True} if heeded.cut(reached, planned) else {}
-    return Made(
-        volume=result.volume,
-        method=options.method,
-        seconds=result.seconds,
-        history=result.history,
-        settings={**result.settings, **early},
-        filter=options.filter,
-    )
+    return work.made(result, work.heeded.cut(reached, planned))
 
 
-def _fit(
-    options: ReconOptions,
-    prepared: Prepared,
-    grid: Grid,
-    sink: Sink,
-    clock: Clock,
-    stopped: Callable[[], bool],
-    warn: Warnings,
-) -> Made:
+def _fit(work: _Work) -> Made:
     """Fit Gaussians, by steps, by seconds or by a preset; keeping its state and taking it up where that is wanted."""
+    options, prepared, grid = work.options, work.prepared, work.grid
     steps, gaussians, polish, said = options.steps, options.gaussians, options.polish, ""
     if options.quality is not None:
         preset = PRESETS[options.quality]
@@ -250,12 +264,11 @@ def _fit(
     if keeper.wanted:
         others = {"seed": options.seed, "start": options.start, "gaussians": gaussians or 0}
         origin = made_from(prepared, settings, others)
-        resume = keeper.begin(origin, steps or 0, warn)
+        resume = keeper.begin(origin, steps or 0, work.warn)
     # So that the fit's time, and the time it says is left, hold no compilation.
     warm_up(options.device, options.loss, prepared.geometry, rays=settings.rays, start=options.start)
     data, geometry, held_out = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
-    heeded = Heeded(stopped)
-    try:
+    with work.refused(" by r2"):
         result = recon.reconstruct(
             data,
             geometry,
@@ -271,61 +284,33 @@ def _fit(
             resume=resume,
             device=options.device,
             polish=polish,
-            on_progress=progress_events(sink, clock, options.seconds),
-            should_stop=heeded,
-            on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, warn),
-            now=clock.now,
+            on_progress=work.listener(options.seconds),
+            should_stop=work.heeded,
+            on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, work.warn),
+            now=work.clock.now,
         )
-    except ValueError as error:
-        raise DataError(f"{options.source.path} cannot be reconstructed by r2: {error}") from error
     if result.checkpoint is not None:
-        keeper.write(origin, steps or 0, warn, result.checkpoint)
+        keeper.write(origin, steps or 0, work.warn, result.checkpoint)
     begun = int(result.settings["gaussians_at_start"])
     if options.quality is not None:
         said = f"{options.quality}: {steps} steps from {begun} Gaussians"
         said += f", {polish} sweeps on voxels" if polish else ""
     if options.gaussians is not None and resume is None and begun < options.gaussians:
-        warn(f"The fit started from {begun} Gaussians, not from {options.gaussians}: there is no matter for more.")
-    used = {name: value for name, value in result.settings.items() if name != "held_out"}
+        work.warn(f"The fit started from {begun} Gaussians, not from {options.gaussians}: there is no matter for more.")
+    told = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     # Sweeps come after the last step, and end early as well.
-    early = heeded.told if polish else heeded.cut(result.history[-1].step, steps or 0)
+    early = work.heeded.told if polish else work.heeded.cut(result.history[-1].step, steps or 0)
     resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
-    return Made(
-        volume=result.volume,
-        method="r2",
-        seconds=result.seconds,
-        history=result.history,
-        settings={**used, **resumed, **({"ended_early": True} if early else {})},
-        filter=options.filter,
-        chosen=said,
-    )
+    return work.made(told, early, said, **resumed)
 
 
-def spend(
-    options: ReconOptions,
-    budget: float,
-    prepared: Prepared,
-    sink: Sink,
-    clock: Clock,
-    stopped: Callable[[], bool],
-    warn: Warnings,
-) -> tuple[Made, Prepared, int]:
+def _spend(work: _Work, budget: float) -> tuple[Made, Prepared, int]:
     """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
-    heeded = Heeded(stopped)
-    warm_up(geometry=prepared.geometry)  # compilation happens once on a machine; no budget pays for it
-    try:
-        listen = progress_events(sink, clock, budget)
-        done = within(budget, prepared, options.seed, options.filter, clock.now, listen, heeded, warn)
-    except ValueError as error:
-        raise DataError(f"{options.source.path} cannot be reconstructed: {error}") from error
-    early = {"ended_early": True} if heeded.told else {}
-    made = Made(
-        volume=done.result.volume,
-        method=done.choice.method,
-        seconds=done.seconds,
-        history=done.result.history,
-        settings={**done.result.settings, **done.settings(budget), **early},
-        filter=options.filter,
-        chosen=done.said(budget),
-    )
-    return made, done.prepared, done.choice.binning
+    warm_up(geometry=work.prepared.geometry)  # compilation happens once on a machine; no budget pays for it
+    with work.refused():
+        done = within(
+            budget, work.prepared, work.options.seed, work.options.filter, work.clock.now, work.listener(budget),
+            work.heeded, work.warn,
+        )  # fmt: skip
+    made = work.made(done.result, work.heeded.told, done.said(budget), **done.settings(budget))
+    return replace(made, seconds=done.seconds, method=done.choice.method), done.prepared, done.choice.binning

@@ -15,28 +15,17 @@ from recon.problem import Loss
 from recon.quality import PRESETS, parse_budget
 from recon.reconstruction import DEFAULT_STEPS
 
-SETTINGS = (
-    "steps",
-    "seconds",
-    "gaussians",
-    "start",
-    "loss",
-    "device",
-    "early_stop",
-    "polish",
-    "iterations",
-    "tv_weight",
-)
+_TIMED = ("steps", "seconds", "gaussians")
+_FITTED = (*_TIMED, "start", "loss", "device", "early_stop", "polish")
+_ITERATIVE = ("iterations", "tv_weight")
+SETTINGS = (*_FITTED, *_ITERATIVE)
 """Options that are handed to the reconstructor as they are."""
 
-_FIT = ("steps", "seconds", "gaussians", "start", "loss", "device", "early_stop", "polish", "checkpoint", "resume")
+_FIT = (*_FITTED, "checkpoint", "resume")
 _PLANS = ("budget", "quality")
 # What each of the options that choose a plan leaves no room for.
-_CHOSEN = {
-    "budget": ("quality", *_FIT),
-    "quality": ("budget", "steps", "seconds", "gaussians", "polish"),
-}
-_WITHOUT_END = ("start", "loss", "device", "early_stop", "polish", "checkpoint", "resume")
+_CHOSEN = {"budget": ("quality", *_FIT), "quality": ("budget", *_TIMED, "polish")}
+_FINISHED = tuple(name for name in _FIT if name not in _TIMED)  # of scans that are finished only
 _DIRECT, _SMOOTHED = ("r2", "fbp"), ("fista-tv", "os-sirt-tv")
 
 
@@ -72,7 +61,7 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
         method: of recon.reconstruct.
         follow: the scan is still running.
     """
-    given = [name for name in (*_PLANS, *SETTINGS, *_FIT) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    given = [name for name in (*_PLANS, *_FIT, *_ITERATIVE) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     if {"steps", "seconds"} <= set(given):
         raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
     for plan in _PLANS:
@@ -91,7 +80,7 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
         raise click.UsageError(f"--iterations is of the iterative methods; it does not go with --method {method}.")
     if "tv_weight" in given and method not in _SMOOTHED:
         raise click.UsageError(f"--tv-weight is of {' and '.join(_SMOOTHED)}; it does not go with --method {method}.")
-    endless = [name for name in given if follow and name in _WITHOUT_END]
+    endless = [name for name in given if follow and name in _FINISHED]
     if endless:
         raise click.UsageError(f"{_option(endless[0])} is for a finished scan; it does not go with --follow.")
 
