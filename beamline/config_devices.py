@@ -4,141 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
 
 from beamline.config_section import Section
+from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, StageConfig
 from drivers.beam_monitor import pattern_problem
 from drivers.beam_monitor_page import url_problem
 from drivers.beam_monitor_serial import PATTERN, QUERY
-from drivers.stages.zaber_train import PulseSettings
-
-
-class _Stage(Section):
-    """What every stage has. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
-
-    kind: str
-    port: Annotated[str, Field(min_length=1)]
-    """Where its controller is; sim:// and the kind is its simulated counterpart, which takes all else from here."""
-    counts_per_turn: PositiveInt
-    """Motor pulses or encoder counts for 360 deg; triggers fall on whole ones."""
-    max_speed_deg_s: PositiveFloat
-    acceleration_deg_s2: PositiveFloat
-    low_deg: FiniteFloat = -5.0
-    high_deg: FiniteFloat = 365.0
-    """The stage is never sent beyond low_deg and high_deg."""
-    timeout_s: PositiveFloat = 1.0
-    """For a reply."""
-    baudrate: PositiveInt
-    pulse_width_s: PositiveFloat | None = None
-    """Of the trigger pulses; null: the driver's choice, or what the controller has."""
-    active_high: bool = True
-    """Trigger pulses are high; refused where the controller has no such choice."""
-    transcript: str | None = None
-    """A file to which every byte to and from the controller is appended with its time; null: none."""
-
-    @model_validator(mode="after")
-    def _sensible(self) -> Self:
-        if not self.low_deg < self.high_deg:
-            raise ValueError(f"low_deg {self.low_deg} must lie below high_deg {self.high_deg}")
-        if self.simulated and self.port.lower() != f"sim://{self.kind}":
-            raise ValueError(f"port {self.port} is not the simulated counterpart of {self.kind}, sim://{self.kind}")
-        return self
-
-    @property
-    def simulated(self) -> bool:
-        return self.port.lower().startswith("sim://")
-
-
-class PM16CStageConfig(_Stage):
-    """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated."""
-
-    kind: Literal["pm16c"]
-    channel: Annotated[int, Field(ge=0, le=15)] = 0
-    baudrate: PositiveInt = 9600
-    home_deg: FiniteFloat | None = None
-    """Where its home switch is; null: it has none, and no search is made."""
-    home_speed_deg_s: PositiveFloat | None = None
-    """For the search; null: a tenth of max_speed_deg_s."""
-
-    @model_validator(mode="after")
-    def _polarity_is_fixed(self) -> Self:
-        if not self.active_high:
-            raise ValueError("active_high cannot be false: the PM16C's trigger output has one polarity")
-        return self
-
-
-class PiGcsStageConfig(_Stage):
-    """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863."""
-
-    kind: Literal["pi_gcs"]
-    axis: Annotated[str, Field(pattern=r"^\w{1,16}$", description="1 to 16 letters, digits and _")] = "1"
-    trigger_line: PositiveInt = 1
-    """Digital output that the trigger pulses come from."""
-    baudrate: PositiveInt = 115_200
-    reference: Literal["switch", "negative_limit", "positive_limit"] = "switch"
-    """What the search for the reference goes to."""
-    first_pulse: Literal["at_threshold", "step_after", "grid"] = "at_threshold"
-    """Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md)."""
-    firmware_pulse_s: PositiveFloat = 50e-6
-    """How long the firmware holds a pulse."""
-    tolerance_counts: Annotated[int, Field(ge=0)] = 10
-    """From the target, within which a move has arrived."""
-    settle_s: Annotated[float, Field(ge=0)] = 1.0
-    """After a move, in which the controller may still bring the axis on target."""
-
-    @model_validator(mode="after")
-    def _width_is_the_firmware_s(self) -> Self:
-        if self.pulse_width_s is not None:
-            raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
-        return self
-
-
-class ZaberStageConfig(_Stage):
-    """Zaber stage that talks ASCII, firmware 7.06 or later, with triggers on a digital output."""
-
-    kind: Literal["zaber"]
-    device: Annotated[int, Field(ge=1, le=99)] = 1
-    axis: Annotated[int, Field(ge=1, le=9)] = 1
-    output: PositiveInt = 1
-    """Digital output that the trigger pulses come from."""
-    baudrate: PositiveInt = 115_200
-    toggle: bool = False
-    """Each fire toggles the output (firmware without `schedule`): every second one is a pulse, intervals are even."""
-    speed_unit: PositiveFloat = 1.6384
-    """Native speed per microstep/s; the vendor's convention, from memory."""
-    measured: bool = False
-    """Pulses by the encoder, not by the commanded position."""
-    chained: bool = True
-    """An action may enable another trigger; false: arming turns the stage to one step before the first pulse."""
-    fires_when_enabled: bool = False
-    """A distance trigger fires where it is enabled, too."""
-    starter: PositiveInt = 1
-    repeater: PositiveInt = 2
-    """The numbers of the two triggers used."""
-    shortest_s: PositiveFloat = 1e-3
-    """Between two fires at full speed."""
-
-    @model_validator(mode="after")
-    def _possible_pulses(self) -> Self:
-        width = self.pulse_width_s
-        if self.toggle and width is not None:
-            raise ValueError("a toggled output has no pulse width of its own; set pulse_width_s null or toggle false")
-        try:
-            PulseSettings(
-                self.output,
-                1e-3 if width is None else width,
-                chained=self.chained,
-                fires_when_enabled=self.fires_when_enabled,
-                starter=self.starter,
-                repeater=self.repeater,
-            )
-        except ValueError as problem:
-            raise ValueError(str(problem)) from None
-        return self
-
-
-StageConfig = PM16CStageConfig | PiGcsStageConfig | ZaberStageConfig
-
 
 Roi = Annotated[
     tuple[
@@ -158,6 +30,8 @@ class _Orca(Section):
     roi: Roi | None = None
     """null: the full sensor, 2304 x 4096."""
     binning: Literal[1, 2, 4] = 1
+    trigger_polarity: Literal["positive", "negative"] = "positive"
+    """The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here."""
 
 
 class SimulatedOrca(_Orca):
@@ -180,8 +54,6 @@ class DcamOrca(_Orca):
     sync_readout: a pulse ends an exposure and begins the next; n pulses give n - 1 frames, which no fly scan takes."""
     trigger_mode: Literal["normal", "start"] = "normal"
     """start: the first pulse begins a free run, which no fly scan takes."""
-    trigger_polarity: Literal["positive", "negative"] = "positive"
-    """The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here."""
     trigger_times: Annotated[int, Field(ge=1, le=10_000)] = 1
     """Every so many pulses make one frame; a fly scan takes 1."""
     trigger_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.0
@@ -287,6 +159,17 @@ class DeviceSection(Section):
     shutter: Annotated[Simple | StageOutputShutter, Field(discriminator="kind")]
     sample_mover: Simple
     beam_monitor: Annotated[BeamMonitorConfig, Field(discriminator="kind")] = NoBeamMonitor()
+
+    @model_validator(mode="after")
+    def _edges_agree(self) -> Self:
+        camera, high = self.camera, self.stage.active_high
+        if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
+            raise ValueError(
+                f"stage.active_high {str(high).lower()} does not go with camera.trigger_polarity "
+                f"{camera.trigger_polarity}: the simulated cable has no inverter, and every exposure would begin at "
+                f"its pulse's end; set trigger_polarity {'positive' if high else 'negative'}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _output_is_free(self) -> Self:

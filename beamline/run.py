@@ -111,10 +111,9 @@ def run_scan(
     stop = stop or StopRequest()
     runs = runs or Path(config.storage.folder)
     with ExitStack() as connected:
-        bench = bench or connected.enter_context(connect(config, ask=ask))
+        bench = bench or connected.enter_context(connect(config, ask=ask, heed=lambda: _heed(stop)))
         prepared = prepare(config, bench, runs)
-        if stop.stopping:
-            raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
+        _heed(stop)
         folder = create_run_folder(runs, config.sample.name, SystemClock().now())
         with ExitStack() as stack:
             try:
@@ -128,6 +127,12 @@ def run_scan(
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], bench.clock))
             run = _Run(config, bench, prepared, folder, stop, emit, began)
             return run.go(live, release=connected.close)
+
+
+def _heed(stop: StopRequest) -> None:
+    """Before the run has begun, a stop is as good as an abort."""
+    if stop.stopping:
+        raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:

@@ -9,11 +9,12 @@ import math
 from pathlib import Path
 from typing import TypedDict
 
-from beamline.config_devices import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
+from beamline.config_devices import StageOutputShutter
+from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
 from beamline.errors import ConfigError
 from drivers.clock import Clock
 from drivers.protocols import RotationStage, StageLimits
-from drivers.shutter import DigitalOutput
+from drivers.shutter import DigitalOutput, OutputShutter
 
 _REFERENCES = {"switch": "FRF", "negative_limit": "FNL", "positive_limit": "FPL"}
 
@@ -131,6 +132,14 @@ def output_of(config: StageConfig, stage: RotationStage, number: int) -> Digital
     if isinstance(stage, PiGcsStage | ZaberStage):
         return stage.digital_output(number)
     raise ConfigError(f"devices.shutter: the controller of a {config.kind} stage has no digital output to set")
+
+
+def output_shutter(
+    config: StageConfig, shutter: StageOutputShutter, stage: RotationStage, clock: Clock
+) -> OutputShutter:
+    """A shutter on an output of the stage's controller. Raises as `output_of` does."""
+    output = output_of(config, stage, shutter.output)
+    return OutputShutter(output, clock, open_high=shutter.open_high, settle=shutter.settle_s)
 
 
 def _figures(config: StageConfig) -> _Figures:

@@ -11,10 +11,10 @@ from types import FrameType
 
 import click
 
+from beamline.ask import ask_operator
 from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.told import told_as_json
 from beamline.config import Config, load
-from beamline.devices import ask_operator
 from beamline.dry_run import dry_run, refuse_violations
 from beamline.events import Event, Sink
 from beamline.live import LiveCommand, follow_command

@@ -7,10 +7,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from beamline.beam_monitors import make_beam_monitor
 from beamline.config import Config
 from beamline.config_devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
 from beamline.config_models import Storage
-from beamline.devices import beam_monitor
 from beamline.doctor import camera, disk
 from beamline.doctor.check import Check, Verdict, of_error
 from beamline.doctor.memory import memory
@@ -71,7 +71,7 @@ def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Cloc
         if of_port.verdict in (Verdict.FAILED, Verdict.NOT_APPLICABLE):
             return
     try:
-        with closing(beam_monitor(config, clock)) as monitor:
+        with closing(make_beam_monitor(config, clock)) as monitor:
             reading = monitor.reading()
     except DeviceError as error:
         yield of_error(name, error, "a reading")

@@ -41,6 +41,7 @@ class Build:
         reference_fails: a reference move ends with error 45.
         first_pulse: see `FirstPulse`.
         pulse_width: s that the firmware holds a pulse.
+        rising: the camera in the trigger output takes rising edges, else falling ones.
         servo_period: s; positions are compared and read once a period. 0 compares at every instant.
         settle: s after a move until the axis reports to be on target.
         max_velocity, max_acceleration: degrees/s, degrees/s².
@@ -59,6 +60,7 @@ class Build:
     reference_fails: bool = False
     first_pulse: FirstPulse = FirstPulse.AT_THRESHOLD
     pulse_width: float = 50e-6
+    rising: bool = True
     servo_period: float = 0.0
     settle: float = 0.02
     max_velocity: float = 720.0
@@ -79,7 +81,7 @@ class GcsAxis:
         self.velocity, self.acceleration, self.deceleration, self.reference_velocity = 10.0, 100.0, 100.0, 5.0
         self._servo = False
         self._clock = clock
-        firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost)
+        firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost, build.rising)
         self._wired = WiredOutput(wired, line, firmware, self.per_degree)
         found = round(build.found_at * self.per_degree)
         self._zero = 0 if build.referenced else found

@@ -38,17 +38,19 @@ class Firmware:
         width: s that a pulse is held.
         period: s of a servo cycle; positions are compared once in it. 0 compares at every instant.
         lost: pulses, counted from 0 since power-on, that never reach the cable.
+        rising: the camera at the cable's end takes rising edges, else falling ones.
     """
 
     first_pulse: FirstPulse
     width: float
     period: float
     lost: Set[int]
+    rising: bool = True
 
 
 @dataclass(frozen=True)
 class _Coming:
-    """Something that the line will do at `time` if nobody stops the move; the rising edge that it gives, if any."""
+    """Something that the line will do at `time` if nobody stops the move; the edge that it gives the camera, if any."""
 
     time: float
     crossing: Crossing
@@ -110,14 +112,17 @@ class WiredOutput:
         self._line.schedule([*owed, *(coming.edge for coming in self._coming if coming.edge is not None)])
 
     def _foresee(self, move: TrapezoidMove, now: float) -> None:
-        """A pulse that begins while the last is held gives no edge; where low is active, the cable rises at its end."""
+        """A pulse that begins while the last is held gives no edge.
+
+        Where pulses are the other way round than the camera takes them, its edge is a pulse's end.
+        """
         number, high_until, firmware = self._pulses, self._high_until, self._firmware
         for crossing in crossings(self._window(), self._progress, self._done_until, float(move.target)):
             time, edge = self._noticed(move.time_at(crossing.position), now), None
             if crossing.pulse:
                 if time > high_until and number not in firmware.lost:
-                    rise = time if self.settings.polarity else time + firmware.width
-                    edge = Pulse(rise, move.position(rise) * 2 * math.pi / (360.0 * self._per_degree))
+                    at = time if bool(self.settings.polarity) is firmware.rising else time + firmware.width
+                    edge = Pulse(at, move.position(at) * 2 * math.pi / (360.0 * self._per_degree))
                 high_until, number = time + firmware.width, number + 1
             self._coming.append(_Coming(time, crossing, edge))
 

@@ -14,8 +14,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from beamline import config
-from beamline.config_devices import DcamOrca, PiGcsStageConfig, SimulatedOrca, ZaberStageConfig
+from beamline.config_devices import DcamOrca, SimulatedOrca
 from beamline.config_models import Config
+from beamline.config_stages import PiGcsStageConfig, ZaberStageConfig
 from beamline.errors import ConfigError
 from beamline.plan import Mode, Place
 
@@ -77,7 +78,7 @@ def test_templates_are_complete_and_differ_only_in_devices() -> None:
         *((("simulation", k)) for k in simulated["simulation"]),
     }
     only_real = DcamOrca.model_fields.keys() - SimulatedOrca.model_fields.keys()
-    assert {"library", "index", "link", "trigger_polarity"} < only_real
+    assert {"library", "index", "link", "trigger_active"} < only_real
     assert _keys(instrument) - _keys(simulated) == {("devices", "camera", key) for key in only_real}
     kinds = {
         name: [d[k]["kind"] for k in ("camera", "shutter", "sample_mover")]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import io
+import itertools
 import math
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from beamline.dry_run import dry_run
 from beamline.errors import ConfigError
 from beamline.plan import Block
 from beamline.stages import output_of
+from beamline.stop import ScanAborted
 from beamline.timeline import block_seconds, pass_ends
 from drivers.clock import SystemClock
 from drivers.dcam.options import DcamOptions
@@ -80,6 +81,7 @@ STAGES = {
     "pi_gcs": f"{{kind: pi_gcs, port: 'sim://pi_gcs', axis: A, trigger_line: 2, {COMMON}}}",
     "pi_gcs, a step after": f"{{kind: pi_gcs, port: 'sim://pi_gcs', first_pulse: step_after, {COMMON}}}",
     "zaber": f"{{kind: zaber, port: 'sim://zaber', device: 2, output: 3, {COMMON}}}",
+    "pi_gcs, falling": f"{{kind: pi_gcs, port: 'sim://pi_gcs', active_high: false, firmware_pulse_s: 0.1, {COMMON}}}",
     "zaber, falling": f"{{kind: zaber, port: 'sim://zaber', active_high: false, {COMMON}}}",
     "zaber, toggled": f"{{kind: zaber, port: 'sim://zaber', toggle: true, {COMMON}}}",
     "zaber, unchained": f"{{kind: zaber, port: 'sim://zaber', chained: false, {COMMON}}}",
@@ -90,7 +92,11 @@ STAGES = {
 @pytest.mark.parametrize("angles", ["{scheme: fixed, views: 24}", "{scheme: interlaced, views: 24, passes: 3}"])
 def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
     """The stand-in of each controller behind the same configuration: as many frames as pulses, each at its count."""
-    settings = small(f"devices.stage={stage}", "devices.stage.low_deg=-60", f"scan.angles={angles}", "scan.period_s=2")
+    settings = small(
+        f"devices.stage={stage}",
+        f"devices.camera.trigger_polarity={'negative' if 'active_high: false' in stage else 'positive'}",
+        *("devices.stage.low_deg=-60", f"scan.angles={angles}", "scan.period_s=2"),
+    )
     worked = dry_run(settings)
     assert worked.timeline.violations == ()
     block = worked.timeline.views
@@ -103,6 +109,17 @@ def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
     scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
     exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.line_integrals(a, detector)) for a in block.angles])
     assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
+
+
+@pytest.mark.parametrize("stage", ["pi_gcs", "zaber, falling"])
+def test_a_simulated_camera_that_takes_the_other_edge_is_refused_with_the_one_it_needs(stage: str) -> None:
+    """It would expose at every pulse's end; a real cable may have an inverter, so a real camera may."""
+    falling = "falling" in stage
+    other, needed = ("positive", "negative") if falling else ("negative", "positive")
+    with pytest.raises(ConfigError, match=f"active_high {str(not falling).lower()} .* set trigger_polarity {needed}"):
+        small(f"devices.stage={STAGES[stage]}", f"devices.camera.trigger_polarity={other}")
+    real = shipped("instrument", "devices.camera.trigger_polarity=negative")
+    assert real.devices.stage.active_high
 
 
 @pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
@@ -287,7 +304,7 @@ def test_settings_that_a_device_would_refuse() -> None:
         ("devices.stage.max_speed_deg_s=0.0001", "devices.stage: 0.0001 deg/s are 0 pulses/s"),
         ("devices.stage.pulse_width_s=0.005", "devices.stage: the trigger output has no pulses of 0.005 s; it has"),
         (f"devices.stage={STAGES['zaber'].replace('60,', '1e-9,')}", "devices.stage: 30 deg/s and 1e-09 deg/s² are"),
-        (f"devices.stage={STAGES['pi_gcs'].replace('60,', '1e-9,')}", "devices.stage: .* must be positive"),
+        (f"devices.stage={STAGES['pi_gcs'].replace('60,', '1e-9,')}", "devices.stage: .* must be "),
     ):
         with pytest.raises(ConfigError, match=message):
             devices.describe(small(change))
@@ -342,7 +359,9 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stage.closed == 2
 
 
-def test_every_camera_option_reaches_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_camera_option_reaches_the_driver(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Values that are no default, one for each option that the driver has."""
     waited: list[float] = []
 
@@ -352,8 +371,9 @@ def test_every_camera_option_reaches_the_driver(monkeypatch: pytest.MonkeyPatch)
             self.library, self.options = library, options
             made.append(self)
 
-        def wait_until_cold(self, timeout: float) -> None:
+        def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> None:
             waited.append(timeout)
+            progress(-19.5, "busy")
 
     made: list[Camera] = []
     monkeypatch.setattr(devices, "make_stage", lambda *args: _Stage())
@@ -373,6 +393,7 @@ def test_every_camera_option_reaches_the_driver(monkeypatch: pytest.MonkeyPatch)
     }
     changes = [f"devices.camera.{key}={value}" for key, value in said.items()]
     devices.connect(shipped("instrument", "scan.mode=step", *changes)).close()
+    assert "-19.5 °C, its cooler says busy" in capsys.readouterr().err
     (camera,) = made
     assert camera.library == Path("/opt/libdcamapi.so")
     default = DcamOptions()
@@ -382,6 +403,28 @@ def test_every_camera_option_reaches_the_driver(monkeypatch: pytest.MonkeyPatch)
         key = {"trigger_delay": "trigger_delay_s", "ring_bytes": "ring_mb"}.get(field.name, field.name)
         assert value == said[key] * (1_000_000 if key == "ring_mb" else 1)
     assert waited == [90]
+
+
+def test_a_stop_ends_the_wait_for_a_cold_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Signals only set the stop request, so that the wait has to look at it; all that is open is closed again."""
+    stage, looks, heeded = _Stage(), itertools.count(1), 3
+
+    class Camera(_Stage):
+        def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> None:
+            while True:
+                progress(20.0, "busy")
+
+    def heed() -> None:
+        if next(looks) == heeded:
+            raise ScanAborted("Interrupted")
+
+    camera = Camera()
+    monkeypatch.setattr(devices, "make_stage", lambda *args: stage)
+    monkeypatch.setattr(devices, "make_camera", lambda *args: camera)
+    with pytest.raises(ScanAborted):
+        devices.connect(shipped("instrument", "devices.camera.cool_s=900"), heed=heed)
+    assert next(looks) == heeded + 1
+    assert stage.closed == camera.closed == 1
 
 
 def test_a_beam_monitor_is_part_of_the_bench(tmp_path: Path) -> None:
@@ -415,25 +458,6 @@ def test_a_stage_keeps_a_transcript_where_it_is_asked_to(tmp_path: Path) -> None
 def test_a_port_that_is_not_there() -> None:
     with pytest.raises(DeviceError, match="COM_NONE"):
         devices.connect(shipped("instrument", "devices.stage.port=COM_NONE"))
-
-
-def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
-    with pytest.raises(DeviceError, match="no terminal to ask at"):
-        devices.ask_operator("Open the beam shutter.")
-
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    monkeypatch.setattr(sys, "stdin", Terminal(""))
-    with pytest.raises(DeviceError, match="was not confirmed"):
-        devices.ask_operator("Open the beam shutter.")
-    monkeypatch.setattr(sys, "stdin", Terminal("\n"))
-    devices.ask_operator("Open the beam shutter.")
-    captured = capsys.readouterr()
-    assert captured.out.strip() == ""  # stdout is for results
-    assert "Open the beam shutter. Then press Enter (to stop the scan: Ctrl-C, then Enter)" in captured.err
 
 
 def test_limits_hold() -> None:

@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from beamline import config_devices as models
 from beamline.cli.main import main
+from beamline.config_devices import DcamOrca, StageOutputShutter
+from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, ZaberStageConfig
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 DEVICES: dict[str, tuple[type[BaseModel], ...]] = {
-    "stage": (models.PM16CStageConfig, models.PiGcsStageConfig, models.ZaberStageConfig),
-    "camera": (models.DcamOrca,),
-    "shutter": (models.StageOutputShutter,),
+    "stage": (PM16CStageConfig, PiGcsStageConfig, ZaberStageConfig),
+    "camera": (DcamOrca,),
+    "shutter": (StageOutputShutter,),
 }
 
 

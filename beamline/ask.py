@@ -1,0 +1,36 @@
+"""Ask: requests to the operator at the terminal, for what no device does by itself."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from drivers.errors import DeviceError
+
+
+def ask_operator(request: str) -> None:
+    """Put a request to whoever sits at the terminal, and wait for Enter.
+
+    Raises:
+        DeviceError: nobody sits there.
+    """
+    if not sys.stdin.isatty():
+        raise DeviceError(
+            "operator",
+            "there is no terminal to ask at",
+            request=request,
+            advice="Run it in a terminal, or configure a shutter and a sample mover that need no hand",
+            state="What was acquired so far is in the file",
+        )
+    try:
+        # A read from a terminal goes on after a signal, so that a stop is heeded only once it returns.
+        how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
+        click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
+    except click.Abort as error:  # the end of input
+        raise DeviceError(
+            "operator",
+            "the request was not confirmed",
+            request=request,
+            state="What was acquired so far is in the file",
+        ) from error

@@ -1,0 +1,148 @@
+"""Simulated instrument: the stand-ins that take the devices' places, behind the same drivers where there are any.
+
+Simulators are imported where they are needed, so that an instrument loads none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import TYPE_CHECKING
+from uuid import uuid4
+
+from beamline.config import Config, scene_mapping
+from beamline.config_devices import StageOutputShutter
+from beamline.config_models import Simulation, Speed
+from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
+from beamline.errors import ConfigError
+from beamline.stages import make_stage, output_shutter
+from drivers.clock import Clock, SystemClock
+from drivers.protocols import Devices, Shutter
+
+if TYPE_CHECKING:
+    from recon.volume import Grid, Volume
+    from simulators.camera import SimulatedOrcaQuest
+    from simulators.scene import Scene
+    from simulators.serial_url import Wire
+    from simulators.shutter import BeamGate
+    from simulators.trigger_line import TriggerLine
+
+
+def simulated_devices(
+    config: Config, simulation: Simulation, clock: Clock, opened: ExitStack
+) -> tuple[Devices, Callable[[Grid], Volume]]:
+    """Every device of the configuration, connected, and the truth of the sample (see `devices.Bench`).
+
+    Args:
+        opened: takes what closes them.
+
+    Raises:
+        ConfigError: the scene is wrong.
+    """
+    from simulators.camera import SimulatedOrcaQuest
+    from simulators.serial_url import register
+    from simulators.shutter import SimulatedSampleMover, SimulatedShutter, WiredShutter
+    from simulators.trigger_line import TriggerLine
+
+    scene = scene_of(config)
+    line = TriggerLine(clock)
+    settings, wanted = config.devices.stage, config.devices.shutter
+    wire, high = _wire(settings, clock, line)
+    # A name of its own for every bench: two in one process must not share a controller.
+    stage = make_stage(settings, register(f"{settings.kind}-{uuid4().hex}", wire), clock)
+    opened.callback(stage.close)
+    shutter: Shutter = SimulatedShutter()
+    blade: BeamGate = shutter
+    if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
+        output = wanted.output
+        shutter = output_shutter(settings, wanted, stage, clock)
+        blade = WiredShutter(lambda: high(output), wanted.open_high)
+    sample = SimulatedSampleMover()
+    pitch = config.optics.pixel_size_um * 1e-3
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
+    opened.callback(camera.close)
+    return Devices(stage, camera, shutter, sample), _truth(scene, camera)
+
+
+def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, Callable[[int], bool]]:
+    """The simulated controller, built as the configuration says of the real one, and the levels of its outputs."""
+    counts = config.counts_per_turn
+    match config:
+        case PM16CStageConfig():
+            from simulators.wires.pm16c import PM16CController
+
+            return PM16CController(clock, line, channel=config.channel, counts_per_turn=counts), lambda number: False
+        case PiGcsStageConfig():
+            from simulators.wires.pi_gcs import PiGcsController
+            from simulators.wires.pi_gcs_axis import Build
+            from simulators.wires.pi_gcs_trigger import FirstPulse
+
+            build = Build(
+                counts_per_turn=counts,
+                low=config.low_deg - 1,
+                high=config.high_deg + 1,
+                first_pulse=FirstPulse(config.first_pulse),
+                pulse_width=config.firmware_pulse_s,
+                rising=config.active_high,
+                max_velocity=config.max_speed_deg_s,
+                max_acceleration=config.acceleration_deg_s2,
+            )
+            pi = PiGcsController(clock, line, axis=config.axis, output=config.trigger_line, build=build)
+            return pi, lambda number: pi.box.levels.get(number, False)
+        case ZaberStageConfig():
+            from simulators.wires.zaber import ZaberController
+
+            zaber = ZaberController(
+                clock,
+                line,
+                counts_per_turn=counts,
+                output=config.output,
+                active_high=config.active_high,
+                address=config.device,
+                can_schedule=not config.toggle,
+                can_chain=config.chained,
+                fires_when_enabled=config.fires_when_enabled,
+            )
+            return zaber, lambda number: bool(zaber.device.triggers.outputs[number - 1])
+
+
+def scene_of(config: Config) -> Scene:
+    """The simulated scene. Raises ConfigError: it is wrong."""
+    from simulators.mapping import SceneError
+    from simulators.scene import load_scene
+
+    try:
+        return load_scene(scene_mapping(config))
+    except SceneError as error:
+        raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
+
+
+def clock_of(kind: str | Speed) -> Clock:
+    """The simulation's clock: real, virtual or faster."""
+    from simulators.clock import ScaledClock, VirtualClock
+
+    if isinstance(kind, Speed):
+        return ScaledClock(SystemClock(), kind.speed)
+    return VirtualClock() if kind == "virtual" else SystemClock()
+
+
+def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
+    from recon.volume import Volume
+
+    def truth(grid: Grid) -> Volume:
+        # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
+        detector = camera.detector
+        up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
+        z, y, x = grid.centre
+        return Volume(scene.phantom.attenuation(replace(grid, centre=(z + up, y, x))), grid)
+
+    return truth
+
+
+def simulated_electrometer(clock: Clock, end: bytes) -> str:
+    """The url of an electrometer that shows a steady current; its lines end with `end`."""
+    from simulators.serial_url import register
+    from simulators.wires.electrometer import ElectrometerWire
+
+    return register(f"electrometer-{uuid4().hex}", ElectrometerWire(clock, end=end))
