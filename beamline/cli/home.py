@@ -13,6 +13,7 @@ from beamline.cli.numbers import POSITIVE
 from beamline.cli.told import terminated_like_interrupted
 from beamline.config import load
 from beamline.devices import stage_alone
+from beamline.errors import INTERRUPTED
 from drivers.errors import DeviceError
 
 
@@ -24,13 +25,21 @@ from drivers.errors import DeviceError
 def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
     """Search the reference of CONFIG's stage. THE STAGE TURNS, maybe by a whole turn and beyond its soft limits.
 
-    Only the stage is connected. Ctrl-C stops it. Exit code 3 where it has no reference, or the search failed.
+    Only the stage is connected. Ctrl-C stops it. Exit code 3 where it has no reference, or the search failed;
+    130 where it was not confirmed, or was interrupted.
     """
     config = load(file, overrides)
     stage_config = config.devices.stage
     if not yes:
         way = f"The {stage_config.kind} stage at {stage_config.port} will turn to find its reference. Is the way free?"
-        click.confirm(way, abort=True, err=True)
+        try:
+            free = click.confirm(way, err=True)
+        except click.Abort:  # Ctrl-C, or the end of input: nobody sits there
+            click.echo(err=True)
+            free = False
+        if not free:
+            click.echo("beamline: the search was not confirmed. Nothing has moved; --yes does not ask.", err=True)
+            click.get_current_context().exit(INTERRUPTED)
     with terminated_like_interrupted(), stage_alone(config) as stage:
         try:
             stage.start_home()

@@ -61,7 +61,7 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Check:
             name,
             Verdict.FAILED,
             f"{known or url} may not be opened by this user.",
-            f"leave to read and write {url}",
+            f"permission to read and write {url}",
             "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again",
             values,
         )

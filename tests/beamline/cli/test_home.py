@@ -40,14 +40,16 @@ def test_a_stage_without_a_reference_refuses() -> None:
     assert "it has no home switch" in result.stderr and "Nothing has moved" in result.stderr
 
 
-def test_nothing_turns_before_somebody_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("answer", ["n\n", "\n", ""])
+def test_nothing_turns_before_somebody_says_so(monkeypatch: pytest.MonkeyPatch, answer: str) -> None:
     def moved(self: PM16CStage) -> None:
         raise AssertionError("it turned")
 
     monkeypatch.setattr(PM16CStage, "start_home", moved)
-    result = run(answer="n\n")
-    assert result.exit_code == 1
+    result = run(answer=answer)
+    assert result.exit_code == 130
     assert "Is the way free?" in result.stderr
+    assert "was not confirmed. Nothing has moved" in result.stderr
 
 
 def test_an_interrupted_search_stops_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
