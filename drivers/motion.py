@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 from drivers.protocols import Motion
+
+FARTHEST = 1e9
+"""rad; no stage goes further."""
 
 
 def start_move_by(stage: Motion, angle: float, speed: float) -> None:
@@ -16,7 +17,7 @@ def start_move_by(stage: Motion, angle: float, speed: float) -> None:
     Raises:
         DeviceRefused, DeviceError: as `start_move`.
     """
-    if not math.isfinite(angle):
+    if not abs(angle) < FARTHEST:
         stage.start_move(angle, speed)  # refuses in the stage's own words
         return
     stage.start_move(stage.to_angle(stage.status().counts + stage.to_counts(angle)), speed)

@@ -7,18 +7,22 @@ come from a digital output in trigger mode 0; the controller does not count them
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
 
 from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.pi_gcs_axis import AxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs_digital import GcsOutput
 from drivers.stages.pi_gcs_errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs_line import GcsLine
 from drivers.stages.pi_gcs_train import FirstPulse, TriggerWindow, is_spent_by, window_of
+from drivers.stages.stops import Stops
+from drivers.stages.travel import Travel, check_figures
 
 POLL = 0.02
 """s between looks at a moving stage."""
@@ -42,8 +46,9 @@ def limits_of(
     Raises:
         ValueError: figures that no stage can have.
     """
-    if not (counts_per_turn > 0 and math.degrees(max_speed) >= SLOWEST and math.degrees(acceleration) >= SLOWEST):
-        raise ValueError(f"counts a turn, speed and acceleration must be positive, from {SLOWEST:g} deg/s on")
+    check_figures(counts_per_turn, max_speed, acceleration, low, high)
+    if min(math.degrees(max_speed), math.degrees(acceleration)) < SLOWEST:
+        raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
     run_up = 1 if first_pulse is FirstPulse.STEP_AFTER else 0
     return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True, run_up=run_up)
 
@@ -115,13 +120,15 @@ class PiGcsStage:
             )
         try:
             self._first_pulse = FirstPulse(first_pulse)
-            self._limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse)
+            self._travel = Travel(name, limits)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
         self._per_radian = Fraction(counts_per_turn) / Fraction(2 * math.pi)
-        self._low, self._high = self.to_counts(low), self.to_counts(high)
         self._target: int | None = None
-        self._homing = self._stopped = False
+        self._homing = False
+        self._stops = Stops(name, self._send_stop)
+        self._stops_before = 0
         self._train: TriggerTrain | None = None
         self._line = GcsLine(
             url, axis=axis, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
@@ -131,20 +138,20 @@ class PiGcsStage:
         )
         try:
             self._identity = self._axis.open(Fraction(acceleration) * self._per_radian)
-            self._check_own_limits()
-        except DeviceError:
+            self._travel.refuse_narrower(*self._axis.own_limits(), advice="widen the travel range in the controller")
+        except BaseException:
             self.close()
             raise
 
     @property
     def limits(self) -> StageLimits:
-        return self._limits
+        return self._travel.limits
 
     def to_counts(self, angle: float) -> int:
-        return round(angle * self._limits.counts_per_turn / (2 * math.pi))
+        return self._travel.to_counts(angle)
 
     def to_angle(self, counts: int) -> float:
-        return counts * 2 * math.pi / self._limits.counts_per_turn
+        return self._travel.to_angle(counts)
 
     def position(self) -> float:
         return self.to_angle(self._axis.counts())
@@ -154,35 +161,29 @@ class PiGcsStage:
         return StageStatus(status.counts, status.moving, status.homed, self._fault(status))
 
     def start_move(self, angle: float, speed: float) -> None:
-        if not math.isfinite(angle) or not self._low <= self.to_counts(angle) <= self._high:
-            raise DeviceRefused(
-                self.name,
-                f"a move to {math.degrees(angle):g} deg is beyond the soft limits",
-                expected=self._range(),
-                state="Nothing has moved",
-            )
-        if not SLOWEST <= math.degrees(speed) <= math.degrees(self._limits.max_speed) * (1 + 1e-12):
+        target = self._travel.target(angle)
+        if not SLOWEST <= math.degrees(speed) <= math.degrees(self.limits.max_speed) * (1 + 1e-12):
             raise DeviceRefused(
                 self.name,
                 f"a speed of {math.degrees(speed):g} deg/s is not possible",
-                expected=f"{SLOWEST:g} to {math.degrees(self._limits.max_speed):g} deg/s",
+                expected=f"{SLOWEST:g} to {math.degrees(self.limits.max_speed):g} deg/s",
                 state="Nothing has moved",
             )
-        self._axis.standing("a move")
-        target = self.to_counts(angle)
-        if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
-            self.disarm()
-        self._stopped = self._homing = False
-        self._target = None  # what of an earlier move is left, a refusal must not leave as this one's
-        self._axis.start(target, Fraction(speed) * self._per_radian)
-        self._target = target
+        with self._begin("the move"):
+            self._axis.standing("a move")
+            if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
+                self.disarm()
+            self._target, self._homing = None, False  # what is left of an earlier move is not this one's if it fails
+            self._axis.start(target, Fraction(speed) * self._per_radian)
+            self._target = target
 
     def start_home(self) -> None:
         """As `drivers.protocols.Motion` has it; soft limits do not hold on the way. A train that was armed is over."""
-        self._axis.standing("a reference move")
-        self._train, self._target, self._stopped, self._homing = None, None, False, False
-        self._axis.search_reference(self._reference)
-        self._homing = True
+        with self._begin("the reference move"):
+            self._axis.standing("a reference move")
+            self._train, self._target, self._homing = None, None, False
+            self._axis.search_reference(self._reference)
+            self._homing = True
 
     def moving(self) -> bool:
         return self._axis.searching() if self._homing else self._axis.moving()
@@ -190,15 +191,8 @@ class PiGcsStage:
     def wait(self, timeout: float) -> float:
         target, homing = self._target, self._homing
         if self._until_standing(timeout):
-            counts = self._axis.counts()
-            raise DeviceTimeout(
-                self.name,
-                f"still moving after {timeout:g} s",
-                request=self._axis.last_move,
-                expected="" if target is None else f"to stand at {self._deg(target)}",
-                advice="Allow more time, or stop it",
-                state=f"It was left moving and is at {self._deg(counts)}",
-            )
+            aim = "" if target is None else self._travel.degrees(target)
+            raise self._travel.still_moving(timeout, self._axis.counts(), aim, self._axis.last_move)
         if target is not None:
             self._until_settled(target)
         status = self._axis.status()
@@ -209,8 +203,8 @@ class PiGcsStage:
         if homing:
             self._homing = False
         elif target is not None and self._away(status.counts):
-            wanted = f"{self._deg(target)}, {target} counts"
-            raise self._stopped_short(f"it stopped short of {self._deg(target)}", status, wanted)
+            wanted = f"{self._travel.degrees(target)}, {target} counts"
+            raise self._stopped_short(f"it stopped short of {self._travel.degrees(target)}", status, wanted)
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
@@ -218,18 +212,13 @@ class PiGcsStage:
         sign = 1 if train.interval > 0 else -1
         self._axis.standing("arming")
         counts = self._axis.counts()
-        if sign * (train.start - counts) <= 0:
-            raise DeviceRefused(
-                self.name,
-                f"it stands at {self._deg(counts)}, at or past the first pulse at {self._deg(train.start)}",
-                advice="Move to before the first pulse, then arm",
-                state="Nothing has moved and this train is not armed",
-            )
+        self._travel.refuse_late_arming(train, counts)
         if sign * (window.start - counts) <= 0:
+            here, begin = self._travel.degrees(counts), self._travel.degrees(window.start)
             raise DeviceRefused(
                 self.name,
-                f"it stands at {self._deg(counts)}, at or past {self._deg(window.start)}, where pulses are let through",
-                advice=f"Move back by {self._deg(abs(train.interval))} at least, then arm",
+                f"it stands at {here}, at or past {begin}, where pulses are let through",
+                advice=f"Move back by {self._travel.degrees(abs(train.interval))} at least, then arm",
                 state="Nothing has moved and this train is not armed",
             )
         self._train = None
@@ -245,20 +234,14 @@ class PiGcsStage:
         """None: the controller does not count its pulses."""
 
     def stop(self) -> None:
-        self._stopped = True
+        self._stops.came(hard=False)
         command = self._axis.brake()
-        longest = self._limits.max_speed / self._limits.acceleration + STOP_MARGIN
+        longest = self.limits.max_speed / self.limits.acceleration + STOP_MARGIN
         if self._until_standing(longest):
-            raise DeviceTimeout(
-                self.name,
-                f"still moving {longest:.1f} s after the stop command",
-                request=command,
-                advice="Abort, or use the emergency stop",
-                state=f"It is moving, at {self._deg(self._axis.counts())}",
-            )
+            raise self._travel.not_stopped(longest, self._axis.counts(), command)
 
     def abort(self) -> None:
-        self._stopped = True
+        self._stops.came(hard=True)
         self._axis.stop_all()
 
     def describe(self) -> dict[str, str | int | float]:
@@ -271,11 +254,11 @@ class PiGcsStage:
             "trigger_polarity": "active high" if self._active_high else "active low",
             "first_pulse": self._first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
-            "counts_per_turn": self._limits.counts_per_turn,
-            "max_speed_rad_s": self._limits.max_speed,
-            "acceleration_rad_s2": self._limits.acceleration,
-            "low_rad": self._limits.low,
-            "high_rad": self._limits.high,
+            "counts_per_turn": self.limits.counts_per_turn,
+            "max_speed_rad_s": self.limits.max_speed,
+            "acceleration_rad_s2": self.limits.acceleration,
+            "low_rad": self.limits.low,
+            "high_rad": self.limits.high,
         }
 
     def digital_output(self, number: int) -> GcsOutput:
@@ -293,31 +276,28 @@ class PiGcsStage:
 
     def _window(self, train: TriggerTrain) -> TriggerWindow:
         """Refuses what cannot be emitted."""
-        pitch = math.inf if train.n == 1 else abs(self.to_angle(train.interval)) / self._limits.max_speed
-        within = all(self._low <= at <= self._high for at in (train.start, train.end))
+        pitch = math.inf if train.n == 1 else abs(self.to_angle(train.interval)) / self.limits.max_speed
         why = ""
         try:
-            if train.n >= 1 and train.interval and 2 * self._pulse <= pitch and within:
+            if train.n >= 1 and train.interval and 2 * self._pulse <= pitch and self._travel.has_room_for(train):
                 return window_of(train, self._first_pulse)
         except ValueError as problem:
             why = f": {problem}"
-        raise DeviceRefused(
-            self.name,
-            f"{train.n} pulses every {train.interval} counts from {self._deg(train.start)} cannot be emitted{why}",
-            expected=f"one or more, not closer than {2 * self._pulse:g} s at full speed, all within {self._range()}",
-            state="Nothing has moved and nothing was sent",
-        )
+        apart = f"one or more, not closer than {2 * self._pulse:g} s at full speed"
+        raise self._travel.cannot_emit(train, apart, why)
 
-    def _check_own_limits(self) -> None:
-        low, high = self._axis.own_limits()
-        if self._low < low or self._high > high:
-            raise DeviceRefused(
-                self.name,
-                f"the controller itself is limited to {self._deg(low)} to {self._deg(high)}",
-                expected=f"room for the configured {self._range()}",
-                advice="Narrow low and high in the configuration, or widen the travel range in the controller",
-                state="Nothing has moved",
-            )
+    @contextmanager
+    def _begin(self, purpose: str) -> Iterator[None]:
+        """Around the commands that begin a move; a stop meanwhile wins."""
+        self._stops_before = self._stops.count
+        with self._stops.none_while(purpose):
+            yield
+
+    def _send_stop(self, hard: bool) -> None:
+        if hard:
+            self._axis.stop_all()
+        else:
+            self._axis.brake()
 
     def _until_standing(self, timeout: float) -> bool:
         """Whether it still moves when the time is over."""
@@ -341,7 +321,7 @@ class PiGcsStage:
         early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
         if code and code != STOPPED:
             words.append(meaning(code))
-        elif early and (code == STOPPED or self._stopped):
+        elif early and (code == STOPPED or self._stops.count != self._stops_before):
             words.append(meaning(STOPPED))
         elif early:
             words.append(self._axis.limit_switch() or "no reason given")
@@ -358,12 +338,6 @@ class PiGcsStage:
             reply=status.raw,
             expected=expected,
             advice=advice(code) if code in EVENTS else "Find what stopped it (limit switch, person) before moving on",
-            state=f"It stands at {self._deg(status.counts)}, {status.counts} counts"
+            state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts"
             + ("" if status.homed else ", which are not those of the reference"),
         )
-
-    def _range(self) -> str:
-        return f"{math.degrees(self._limits.low):g} to {math.degrees(self._limits.high):g} deg"
-
-    def _deg(self, counts: Fraction | int) -> str:
-        return f"{float(counts) * 360 / self._limits.counts_per_turn:.4f} deg"

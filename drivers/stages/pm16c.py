@@ -11,11 +11,13 @@ import math
 from pathlib import Path
 
 from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pm16c_channel import MAX_SPEED, RATES, ChannelStatus, PM16CChannel, steepest_code
+from drivers.stages.pm16c_channel import MAX_COUNT, MAX_SPEED, RATES, ChannelStatus, PM16CChannel, steepest_code
 from drivers.stages.pm16c_home import HomeSearch
 from drivers.stages.pm16c_train import MODES, PulseWidths
+from drivers.stages.stops import Stops
+from drivers.stages.travel import Travel, check_figures
 
 POLL = 0.02
 """s between looks at a moving stage."""
@@ -28,9 +30,12 @@ def limits_of(counts_per_turn: int, max_speed: float, acceleration: float, low: 
     steepest one that it has and that is not above `acceleration`.
 
     Raises:
-        ValueError: a speed that it does not have, or even its gentlest acceleration is above.
+        ValueError: a speed or a place that it does not have, or even its gentlest acceleration is above.
     """
+    check_figures(counts_per_turn, max_speed, acceleration, low, high)
     radians = 2 * math.pi / counts_per_turn
+    if max(abs(low), abs(high)) > MAX_COUNT * radians:
+        raise ValueError(f"the controller counts to {MAX_COUNT}, which is {math.degrees(MAX_COUNT * radians):g} deg")
     fastest = round(max_speed / radians)
     if not 1 <= fastest <= MAX_SPEED:
         raise ValueError(
@@ -85,7 +90,7 @@ class PM16CStage:
         transcript: Path | None = None,
     ) -> None:
         self.name = name
-        self._clock, self._url, self._number, self._counts_per_turn = clock, url, channel, counts_per_turn
+        self._clock, self._url, self._number = clock, url, channel
         if not 0 <= channel <= 15:
             raise DeviceRefused(name, f"there is no channel {channel}", expected="0 to 15", state="Nothing was sent")
         if not active_high:
@@ -93,52 +98,46 @@ class PM16CStage:
                 name, "its trigger output cannot be inverted", expected="active_high", state="Nothing was sent"
             )
         try:
-            self._limits = limits_of(counts_per_turn, max_speed, acceleration, low, high)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high)
+            self._travel = Travel(name, limits)
             self._widths = PulseWidths(pulse_width)
             self._home = self._home_count(home)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        self._low, self._high = self.to_counts(low), self.to_counts(high)
         self._fastest = round(max_speed * counts_per_turn / (2 * math.pi))
-        self._home_pps = self._pps(self._limits.max_speed / 10 if home_speed is None else home_speed)
+        self._home_pps = self._pps(limits.max_speed / 10 if home_speed is None else home_speed)
         self._target: int | None = None
         self._search: HomeSearch | None = None
         self._closed = False
+        self._stops = Stops(name, self._send_stop)
         self._channel = PM16CChannel(
             url, channel=channel, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
         )
         try:
-            self._version = self._channel.open(
-                steepest_code(self._limits.acceleration * counts_per_turn / (2 * math.pi))
-            )
-            self._check_own_limits()
-        except DeviceError:
+            self._version = self._channel.open(steepest_code(limits.acceleration * counts_per_turn / (2 * math.pi)))
+            if (own := self._channel.own_limits()) is not None:
+                self._travel.refuse_narrower(*own, advice="widen the limits on the controller's panel")
+        except BaseException:
             self.close()
             raise
 
     @property
     def limits(self) -> StageLimits:
-        return self._limits
+        return self._travel.limits
 
     def to_counts(self, angle: float) -> int:
-        return round(angle * self._counts_per_turn / (2 * math.pi))
+        return self._travel.to_counts(angle)
 
     def to_angle(self, counts: int) -> float:
-        return counts * 2 * math.pi / self._counts_per_turn
+        return self._travel.to_angle(counts)
 
     def position(self) -> float:
         return self.to_angle(self._channel.counts())
 
     def start_move(self, angle: float, speed: float) -> None:
-        if not math.isfinite(angle) or not self._low <= self.to_counts(angle) <= self._high:
-            raise DeviceRefused(
-                self.name,
-                f"a move to {math.degrees(angle):g} deg is beyond the soft limits",
-                expected=self._range(),
-                state="Nothing has moved",
-            )
-        pps, target = self._pps(speed), self.to_counts(angle)
-        self._channel.start(target, pps)
+        target, pps = self._travel.target(angle), self._pps(speed)
+        with self._stops.none_while("the move"):
+            self._channel.start(target, pps)
         self._target, self._search = target, None
 
     def start_home(self) -> None:
@@ -151,7 +150,8 @@ class PM16CStage:
                 state="Nothing has moved",
             )
         search = HomeSearch(self._channel, self.name, self._home)
-        search.begin(self._home_pps)
+        with self._stops.none_while("the search"):
+            search.begin(self._home_pps)
         self._target, self._search = self._home, search
 
     def status(self) -> StageStatus:
@@ -172,46 +172,27 @@ class PM16CStage:
                 self._search = search = None
             status = self._until_standing(deadline - self._clock.now())
         if status.moving:
-            raise DeviceTimeout(
-                self.name,
-                f"still moving after {timeout:g} s",
-                request=self._channel.last_move,
-                reply=status.raw,
-                expected="" if target is None else f"to stand at {self._deg(target)}",
-                advice="Allow more time, or stop it",
-                state=f"It was left moving and is at {self._deg(status.counts)}",
-            )
+            aim = "" if target is None else self._travel.degrees(target)
+            raise self._travel.still_moving(timeout, status.counts, aim, self._channel.last_move, status.raw)
         if target is not None and status.counts != target:
             raise DeviceError(
                 self.name,
-                f"it stopped short of {self._deg(target)} ({status.ending or 'no reason given'})",
+                f"it stopped short of {self._travel.degrees(target)} ({status.ending or 'no reason given'})",
                 request=self._channel.last_move,
                 reply=status.raw,
-                expected=f"{self._deg(target)}, {target} counts",
+                expected=f"{self._travel.degrees(target)}, {target} counts",
                 advice="Find what stopped it (limit switch, interlock, stop button) before moving on",
-                state=f"It stands at {self._deg(status.counts)}, {status.counts} counts",
+                state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts",
             )
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
         width = self._widths.widest_for(train, self._fastest)
-        within = all(self._low <= at <= self._high for at in (train.start, train.end))
-        if train.n < 1 or train.interval == 0 or width is None or not within:
-            raise DeviceRefused(
-                self.name,
-                f"{train.n} pulses every {train.interval} counts from {self._deg(train.start)} cannot be emitted",
-                expected=f"one or more, not closer than {2 * self._widths.narrowest:g} s at full speed, all within "
-                + self._range(),
-                state="Nothing has moved and nothing was sent",
-            )
-        sign, counts = (1 if train.interval > 0 else -1), self._channel.standing("arming").counts
-        if sign * (train.start - counts) <= 0:
-            raise DeviceRefused(
-                self.name,
-                f"it stands at {self._deg(counts)}, at or past the first pulse at {self._deg(train.start)}",
-                advice="Move to before the first pulse, then arm",
-                state="Nothing has moved and this train is not armed",
-            )
+        if train.n < 1 or train.interval == 0 or width is None or not self._travel.has_room_for(train):
+            apart = f"one or more, not closer than {2 * self._widths.narrowest:g} s at full speed"
+            raise self._travel.cannot_emit(train, apart)
+        self._travel.refuse_late_arming(train, self._channel.standing("arming").counts)
+        sign = 1 if train.interval > 0 else -1
         # Half an interval of room behind the last pulse: whether the end point itself fires then does not matter.
         interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)
         self._channel.arm(MODES[width], train.start, train.end + sign * (interval // 2), interval)
@@ -223,23 +204,16 @@ class PM16CStage:
         """None: the controller says only whether the first pulse is still to come."""
 
     def stop(self) -> None:
-        self._cancel_search()
-        command = self._channel.slow_stop()
-        longest = self._limits.max_speed / self._limits.acceleration + STOP_MARGIN
+        self._stops.came(hard=False)
+        command = self._send_stop(hard=False)
+        longest = self.limits.max_speed / self.limits.acceleration + STOP_MARGIN
         status = self._until_standing(longest)
         if status.moving:
-            raise DeviceTimeout(
-                self.name,
-                f"still moving {longest:.1f} s after the stop command",
-                request=command,
-                reply=status.raw,
-                advice="Abort, or use the emergency stop",
-                state=f"It is moving, at {self._deg(status.counts)}",
-            )
+            raise self._travel.not_stopped(longest, status.counts, command, status.raw)
 
     def abort(self) -> None:
-        self._cancel_search()
-        self._channel.emergency_stop()
+        self._stops.came(hard=True)
+        self._send_stop(hard=True)
 
     def describe(self) -> dict[str, str | int | float]:
         return {
@@ -250,11 +224,11 @@ class PM16CStage:
             "trigger_output": "TP0",
             "pulse_width_s": self._widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
-            "counts_per_turn": self._counts_per_turn,
-            "max_speed_rad_s": self._limits.max_speed,
-            "acceleration_rad_s2": self._limits.acceleration,
-            "low_rad": self._limits.low,
-            "high_rad": self._limits.high,
+            "counts_per_turn": self.limits.counts_per_turn,
+            "max_speed_rad_s": self.limits.max_speed,
+            "acceleration_rad_s2": self.limits.acceleration,
+            "low_rad": self.limits.low,
+            "high_rad": self.limits.high,
         }
 
     def close(self) -> None:
@@ -263,37 +237,31 @@ class PM16CStage:
             with contextlib.suppress(DeviceError):  # closing a dead line is no news to whoever closes
                 self._channel.close()
 
-    def _cancel_search(self) -> None:
+    def _send_stop(self, hard: bool) -> str:
+        """What was sent."""
         if (search := self._search) is not None:
             search.cancel()
+        return self._channel.emergency_stop() if hard else self._channel.slow_stop()
 
     def _home_count(self, home: float | None) -> int | None:
-        if home is not None and not math.isfinite(home):
-            raise ValueError(f"the home switch cannot be at {home} rad")
-        return None if home is None else self.to_counts(home)
+        if home is None:
+            return None
+        if not abs(home) <= self.to_angle(MAX_COUNT):
+            raise ValueError(f"the home switch cannot be at {home:g} rad")
+        return self.to_counts(home)
 
     def _pps(self, speed: float) -> int:
         """Pulses/s for rad/s."""
-        pps = round(speed * self._counts_per_turn / (2 * math.pi)) if math.isfinite(speed) else 0
+        possible = 0 < speed < 2 * self.limits.max_speed
+        pps = round(speed * self.limits.counts_per_turn / (2 * math.pi)) if possible else 0
         if not 1 <= pps <= self._fastest:
             raise DeviceRefused(
                 self.name,
-                f"a speed of {math.degrees(speed):g} deg/s ({pps} pulses/s) is not possible",
-                expected=f"1 to {self._fastest} pulses/s, at most {math.degrees(self._limits.max_speed):g} deg/s",
+                f"a speed of {math.degrees(speed):g} deg/s is not possible",
+                expected=f"1 to {self._fastest} pulses/s, at most {math.degrees(self.limits.max_speed):g} deg/s",
                 state="Nothing has moved",
             )
         return pps
-
-    def _check_own_limits(self) -> None:
-        own = self._channel.own_limits()
-        if own is not None and (self._low < own[0] or self._high > own[1]):
-            raise DeviceRefused(
-                self.name,
-                f"the controller itself is limited to {self._deg(own[0])} to {self._deg(own[1])}",
-                expected=f"room for the configured {self._range()}",
-                advice="Narrow low and high in the configuration, or widen the limits on the controller's panel",
-                state="Nothing has moved",
-            )
 
     def _until_standing(self, timeout: float) -> ChannelStatus:
         """The status once the stage stands, or when the time is over."""
@@ -301,9 +269,3 @@ class PM16CStage:
         while (status := self._channel.status()).moving and (left := deadline - self._clock.now()) > 0:
             self._clock.sleep(min(POLL, left))
         return status
-
-    def _range(self) -> str:
-        return f"{math.degrees(self._limits.low):g} to {math.degrees(self._limits.high):g} deg"
-
-    def _deg(self, counts: int) -> str:
-        return f"{math.degrees(self.to_angle(counts)):.4f} deg"

@@ -20,6 +20,8 @@ COUNT = r"([+-]\d{7,10})"
 STATUS = r"([RL])[0-9A-F]([PNS])(?:[0-9A-F]([0-9A-F]{2})|---)" + COUNT
 MAX_SPEED = 5_000_000
 """pulses/s."""
+MAX_COUNT = 2_147_483_647
+"""Of positions, trigger points and limits, either way."""
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 E24 = (
@@ -108,8 +110,9 @@ class PM16CChannel:
         )
 
     def open(self, rate_code: int) -> str:
-        """Go to REMOTE, take position controller A, set the acceleration; the firmware's version."""
+        """Go to REMOTE, take position controller A without a train, set the acceleration; the firmware's version."""
         c = self._digit
+        self._line.send("")  # an empty line ends what another program may have left half said
         version = self._ask("VER?", r".*PM16C-04X.*", "the version of a PM16C-04XD(L)")[0]
         if not self.status().remote:
             self._line.send("REM")
@@ -119,6 +122,7 @@ class PM16CChannel:
         if not self._ask("SETCH?", r"[0-9A-F]{4}", "four channels")[0].startswith(c):
             self._line.send(f"SETCH{c}---")
             self._ask("SETCH?", rf"{c}[0-9A-F]{{3}}", f"channel {c} on position controller A")
+        self._make_ready(f"TMGC{c}", "NO")  # of whoever was here before and died
         self._set(f"RTE{c}{rate_code:03d}", f"RTE?{c}", rate_code)
         return version
 
@@ -206,8 +210,10 @@ class PM16CChannel:
         self._line.send(command := f"SSTP{self._digit}")
         return command
 
-    def emergency_stop(self) -> None:
-        self._line.send(f"ESTP{self._digit}")
+    def emergency_stop(self) -> str:
+        """As `slow_stop`, without deceleration."""
+        self._line.send(command := f"ESTP{self._digit}")
+        return command
 
     def close(self) -> None:
         """Give the panel back if it was in LOCAL, and free the port even where the line is dead."""

@@ -12,8 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.stages.stops import Stops
+from drivers.stages.travel import Travel, check_figures
 from drivers.stages.zaber_axis import SPEED_UNIT, AxisStatus, ZaberAxis, native_limits
 from drivers.stages.zaber_packet import meaning_of
 from drivers.stages.zaber_pulses import ZaberOutput, ZaberPulses
@@ -78,7 +80,7 @@ class ZaberStage:
         transcript: Path | None = None,
     ) -> None:
         self.name = name
-        self._clock, self._url, self._where, self._counts_per_turn = clock, url, (device, axis), counts_per_turn
+        self._clock, self._url, self._where = clock, url, (device, axis)
         self._speed_unit = speed_unit
         try:
             if not (1 <= device <= 99 and 1 <= axis <= 9):
@@ -87,14 +89,16 @@ class ZaberStage:
                 raise ValueError("a toggled output has no pulse width of its own; leave pulse_width or toggle out")
             width = None if toggle else 1e-3 if pulse_width is None else pulse_width
             chosen = replace(pulses or PulseSettings(), output=output, width=width, active_high=active_high)
-            speed, self._steepest = native_limits(counts_per_turn, max_speed, acceleration, speed_unit)
+            check_figures(counts_per_turn, max_speed, acceleration, low, high)
+            self._fastest, steepest = native_limits(counts_per_turn, max_speed, acceleration, speed_unit)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        self._fastest = speed
-        self._low, self._high = self.to_counts(low), self.to_counts(high)
+        actual = steepest * 1e4 / speed_unit * 2 * math.pi / counts_per_turn
+        self._travel = Travel(name, StageLimits(counts_per_turn, max_speed, actual, low, high, True))
         self._target: int | None = None
         self._homing = False
         self._closed = False
+        self._stops = Stops(name, self._send_stop)
         self._axis = ZaberAxis(
             url,
             device=device,
@@ -109,24 +113,24 @@ class ZaberStage:
         try:
             self._identity = self._axis.open()
             self._check_turn_and_travel()
-            self._axis.set("accel", self._steepest)
+            self._axis.set("accel", steepest)
             if self._identity.has_triggers:
                 self._pulses.disarm()  # of whoever was here before and died
-        except DeviceError:
+        except BaseException:
             self.close()
             raise
-        actual = self._steepest * 1e4 / speed_unit * 2 * math.pi / counts_per_turn
-        self._limits = StageLimits(counts_per_turn, max_speed, actual, low, high, self._identity.has_triggers)
+        limits = replace(self._travel.limits, trigger_output=self._identity.has_triggers)
+        self._travel = replace(self._travel, limits=limits)
 
     @property
     def limits(self) -> StageLimits:
-        return self._limits
+        return self._travel.limits
 
     def to_counts(self, angle: float) -> int:
-        return round(angle * self._counts_per_turn / (2 * math.pi))
+        return self._travel.to_counts(angle)
 
     def to_angle(self, counts: int) -> float:
-        return counts * 2 * math.pi / self._counts_per_turn
+        return self._travel.to_angle(counts)
 
     def position(self) -> float:
         return self.to_angle(self._axis.status().counts)
@@ -137,39 +141,45 @@ class ZaberStage:
         return StageStatus(status.counts, status.moving, status.referenced, "" if fault is None else fault.text)
 
     def start_move(self, angle: float, speed: float) -> None:
-        if not math.isfinite(angle) or not self._low <= self.to_counts(angle) <= self._high:
-            raise DeviceRefused(
-                self.name,
-                f"a move to {math.degrees(angle):g} deg is beyond the soft limits",
-                expected=self._range(),
-                state="Nothing has moved",
-            )
-        native = round(speed * self._counts_per_turn / (2 * math.pi) * self._speed_unit) if math.isfinite(speed) else 0
+        self._start_move(angle, speed, self._stops.count)
+
+    def _start_move(self, angle: float, speed: float, stops: int) -> None:
+        """`stops`: their number before; one that comes from then on wins."""
+        target = self._travel.target(angle)
+        per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._speed_unit
+        native = round(speed * per_radian) if 0 < speed < 2 * self.limits.max_speed else 0
         if not 1 <= native <= self._fastest:
             raise DeviceRefused(
                 self.name,
-                f"a speed of {math.degrees(speed):g} deg/s (native {native}) is not possible",
-                expected=f"native 1 to {self._fastest}, at most {math.degrees(self._limits.max_speed):g} deg/s",
+                f"a speed of {math.degrees(speed):g} deg/s is not possible",
+                expected=f"native 1 to {self._fastest}, at most {math.degrees(self.limits.max_speed):g} deg/s",
                 state="Nothing has moved",
             )
-        status = self._axis.standing("a move")
-        if not status.referenced:
-            raise DeviceRefused(
-                self.name,
-                "a move is not possible: its position is not referenced",
-                reply=status.raw,
-                advice="Search the reference (home) first",
-                state="Nothing has moved",
-            )
-        self._start(status, self.to_counts(angle), native)
+        with self._stops.none_while("the move", stops):
+            status = self._axis.standing("a move")
+            if not status.referenced:
+                raise DeviceRefused(
+                    self.name,
+                    "a move is not possible: its position is not referenced",
+                    reply=status.raw,
+                    advice="Search the reference (home) first",
+                    state="Nothing has moved",
+                )
+            self._pulses.before_move(status.counts, target)
+            if status.flags:
+                self._axis.forget_flags()
+            self._axis.set("maxspeed", native)
+            self._axis.move(target)
+        self._target, self._homing = target, False
 
     def start_home(self) -> None:
         """Begin the search at the speed and acceleration that the controller has for it."""
-        status = self._axis.standing("a search for the reference")
-        self.disarm()
-        if status.flags:
-            self._axis.forget_flags()
-        self._axis.home()
+        with self._stops.none_while("the search for the reference"):
+            status = self._axis.standing("a search for the reference")
+            self.disarm()
+            if status.flags:
+                self._axis.forget_flags()
+            self._axis.home()
         self._target, self._homing = None, True
 
     def moving(self) -> bool:
@@ -177,17 +187,9 @@ class ZaberStage:
 
     def wait(self, timeout: float) -> float:
         status = self._until_standing(timeout)
-        aim = "its reference" if self._homing else "" if self._target is None else self._deg(self._target)
+        aim = "its reference" if self._homing else "" if self._target is None else self._travel.degrees(self._target)
         if status.moving:
-            raise DeviceTimeout(
-                self.name,
-                f"still moving after {timeout:g} s",
-                request=self._axis.last_move,
-                reply=status.raw,
-                expected=f"to stand at {aim}" if aim else "",
-                advice="Allow more time, or stop it",
-                state=f"It was left moving and is at {self._deg(status.counts)}",
-            )
+            raise self._travel.still_moving(timeout, status.counts, aim, self._axis.last_move, status.raw)
         fault = meaning_of(status.flags)
         if self._homing:
             arrived = status.referenced and "NI" not in status.flags
@@ -201,23 +203,18 @@ class ZaberStage:
                 reply=status.raw,
                 expected=f"to stand at {aim} without a fault",
                 advice="Find what stopped it before moving on" if fault is None else fault.advice,
-                state=f"It stands at {self._deg(status.counts)}, {status.counts} counts: "
+                state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts: "
                 + ("no reason given" if fault is None else fault.text),
             )
         self._homing = False
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
-        full_speed = self._limits.max_speed * self._counts_per_turn / (2 * math.pi)
-        within = all(self._low <= at <= self._high for at in (train.start, train.end))
-        if problem := refusal(self._pulses.settings, train, full_speed) or ("" if within else "all within the limits"):
-            raise DeviceRefused(
-                self.name,
-                f"{train.n} pulses every {train.interval} counts from {self._deg(train.start)} cannot be emitted",
-                expected=f"{problem}; the limits are {self._range()}",
-                state="Nothing has moved and nothing was sent",
-            )
-        if not self._limits.trigger_output:
+        full_speed = self.limits.max_speed * self.limits.counts_per_turn / (2 * math.pi)
+        problem = refusal(self._pulses.settings, train, full_speed)
+        if problem or not self._travel.has_room_for(train):
+            raise self._travel.cannot_emit(train, problem or "one pulse or more")
+        if not self.limits.trigger_output:
             raise DeviceRefused(
                 self.name,
                 f"its firmware {self._identity.firmware} has no triggers",
@@ -225,15 +222,9 @@ class ZaberStage:
                 advice="Update the firmware with the vendor's software",
                 state="Nothing has moved and this train is not armed",
             )
-        counts = self._axis.standing("arming").counts
-        if train.interval * (train.start - counts) <= 0:
-            raise DeviceRefused(
-                self.name,
-                f"it stands at {self._deg(counts)}, at or past the first pulse at {self._deg(train.start)}",
-                advice="Move to before the first pulse, then arm",
-                state="Nothing has moved and this train is not armed",
-            )
-        self._pulses.arm(train, counts, self._stand_at)
+        stops, counts = self._stops.count, self._axis.standing("arming").counts
+        self._travel.refuse_late_arming(train, counts)
+        self._pulses.arm(train, counts, lambda there: self._stand_at(there, stops))
 
     def disarm(self) -> None:
         """Legal in every state. The output is put at rest."""
@@ -244,21 +235,16 @@ class ZaberStage:
         return self._pulses.remaining()
 
     def stop(self) -> None:
-        packet = self._axis.stop("stop")
-        longest = self._limits.max_speed / self._limits.acceleration + STOP_MARGIN
+        self._stops.came(hard=False)
+        packet = self._send_stop(hard=False)
+        longest = self.limits.max_speed / self.limits.acceleration + STOP_MARGIN
         status = self._until_standing(longest)
         if status.moving:
-            raise DeviceTimeout(
-                self.name,
-                f"still moving {longest:.1f} s after the stop command",
-                request=packet,
-                reply=status.raw,
-                advice="Abort, or use the emergency stop",
-                state=f"It is moving, at {self._deg(status.counts)}",
-            )
+            raise self._travel.not_stopped(longest, status.counts, packet, status.raw)
 
     def abort(self) -> None:
-        self._axis.stop("estop")
+        self._stops.came(hard=True)
+        self._send_stop(hard=True)
 
     def describe(self) -> dict[str, str | int | float]:
         pulses, (device, axis) = self._pulses.settings, self._where
@@ -273,11 +259,11 @@ class ZaberStage:
             "trigger_position": "encoder" if pulses.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
-            "counts_per_turn": self._counts_per_turn,
-            "max_speed_rad_s": self._limits.max_speed,
-            "acceleration_rad_s2": self._limits.acceleration,
-            "low_rad": self._limits.low,
-            "high_rad": self._limits.high,
+            "counts_per_turn": self.limits.counts_per_turn,
+            "max_speed_rad_s": self.limits.max_speed,
+            "acceleration_rad_s2": self.limits.acceleration,
+            "low_rad": self.limits.low,
+            "high_rad": self.limits.high,
         }
 
     def digital_output(self, number: int) -> ZaberOutput:
@@ -298,41 +284,27 @@ class ZaberStage:
             with contextlib.suppress(DeviceError):
                 self._axis.close()
 
-    def _start(self, status: AxisStatus, target: int, native: int) -> None:
-        """Begin a move from standing."""
-        self._pulses.before_move(status.counts, target)
-        if status.flags:
-            self._axis.forget_flags()
-        self._axis.set("maxspeed", native)
-        self._axis.move(target)
-        self._target, self._homing = target, False
+    def _send_stop(self, hard: bool) -> str:
+        """What was sent."""
+        return self._axis.stop("estop" if hard else "stop")
 
-    def _stand_at(self, counts: int) -> None:
-        """Turn there and wait."""
+    def _stand_at(self, counts: int, stops: int) -> None:
+        """Turn there and wait, unless there are more stops by now."""
         way = abs(self.to_angle(counts - self._axis.standing("arming").counts))
-        self.start_move(self.to_angle(counts), self._limits.max_speed)
-        self.wait(2 * way / self._limits.max_speed + STANDING_IN_PLACE)
+        self._start_move(self.to_angle(counts), self.limits.max_speed, stops)
+        self.wait(2 * way / self.limits.max_speed + STANDING_IN_PLACE)
 
     def _check_turn_and_travel(self) -> None:
         own = self._axis.cycle()
-        if own is None or float(own) != self._counts_per_turn:
+        if own is None or float(own) != self.limits.counts_per_turn:
             raise DeviceRefused(
                 self.name,
                 "it has no limit.cycle.dist, so it does not rotate" if own is None else f"a turn has {own} microsteps",
-                expected=f"{self._counts_per_turn} a turn, as configured",
+                expected=f"{self.limits.counts_per_turn} a turn, as configured",
                 advice="Correct counts_per_turn, or check device and axis",
                 state="Nothing has moved",
             )
-        low, high = self._axis.travel()
-        if self._low < low or self._high > high:
-            raise DeviceRefused(
-                self.name,
-                f"the controller itself is limited to {self._deg(low)} to {self._deg(high)}",
-                expected=f"room for the configured {math.degrees(self.to_angle(self._low)):g} to "
-                f"{math.degrees(self.to_angle(self._high)):g} deg",
-                advice="Narrow low and high in the configuration, or widen the controller's limits",
-                state="Nothing has moved",
-            )
+        self._travel.refuse_narrower(*self._axis.travel(), advice="widen the controller's limits")
 
     def _until_standing(self, timeout: float) -> AxisStatus:
         """The status once the stage stands, or when the time is over."""
@@ -340,9 +312,3 @@ class ZaberStage:
         while (status := self._axis.status()).moving and (left := deadline - self._clock.now()) > 0:
             self._clock.sleep(min(POLL, left))
         return status
-
-    def _range(self) -> str:
-        return f"{math.degrees(self._limits.low):g} to {math.degrees(self._limits.high):g} deg"
-
-    def _deg(self, counts: int) -> str:
-        return f"{math.degrees(self.to_angle(counts)):.4f} deg"

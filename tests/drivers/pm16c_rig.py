@@ -15,8 +15,8 @@ from tests.drivers.stage_conformance import StageBench
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())
 COUNTS = 90_000
-QUERIES_TO_OPEN = 7
-"""VER? STS? STS? SETCH? SETCH? RTE? SETLS?: the faults below count queries from power-on."""
+QUERIES_TO_OPEN = 8
+"""VER? STS? STS? SETCH? SETCH? TMGR? RTE? SETLS?: the faults below count queries from power-on."""
 
 
 class Rig:
@@ -25,7 +25,8 @@ class Rig:
     def __init__(self, **faults: Any) -> None:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
-        self.controller = PM16CController(self.clock, self.line, channel=11, counts_per_turn=COUNTS, **faults)
+        settings = {"channel": 11, "counts_per_turn": COUNTS} | faults
+        self.controller = PM16CController(self.clock, self.line, **settings)
         self.url = register(next(NAMES), self)
         self._lost = b"nothing"
 

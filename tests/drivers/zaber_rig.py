@@ -52,7 +52,7 @@ class Rig:
         return self.controller.transmit()
 
     def open(self, **settings: Any) -> ZaberStage:
-        return ZaberStage(self.url, clock=self.clock, **settings_of(**settings))
+        return ZaberStage(self.url, **({"clock": self.clock} | settings_of(**settings)))
 
     def bench(self, **settings: Any) -> StageBench:
         return StageBench(self.open(**settings), self.clock, self.line)

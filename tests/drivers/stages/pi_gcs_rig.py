@@ -63,7 +63,7 @@ class Rig:
         return unasked + self.controller.transmit()
 
     def open(self, **settings: Any) -> PiGcsStage:
-        return PiGcsStage(self.url, clock=self.clock, **(USUAL | settings))
+        return PiGcsStage(self.url, **(USUAL | {"clock": self.clock} | settings))
 
     def bench(self, **settings: Any) -> StageBench:
         return StageBench(self.open(**settings), self.clock, self.line)

@@ -13,7 +13,7 @@ from drivers.protocols import StageStatus, TriggerTrain
 from drivers.stages.pm16c import PM16CStage
 from simulators.serial_url import register
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed, plans
-from tests.drivers.pm16c_rig import NAMES, Rig
+from tests.drivers.pm16c_rig import NAMES, QUERIES_TO_OPEN, Rig
 
 TIMEOUT = 0.2
 LONG = 2.0
@@ -78,7 +78,7 @@ def test_fuzz_every_call_ends_in_time_and_the_stage_can_be_used_again(
     plan: list[Pieces | None], calls: list[Any]
 ) -> None:
     rig = Rig(home_at=300)
-    quiet: list[Pieces | None] = [None] * 7
+    quiet: list[Pieces | None] = [None] * QUERIES_TO_OPEN
     wire = FuzzedWire(rig.controller, quiet + plan)
     stage = opened(rig, wire)
     assert isinstance(stage, PM16CStage)

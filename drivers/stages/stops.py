@@ -1,0 +1,58 @@
+"""Stops of a stage, from any thread: a move that was just being begun when one came does not go on behind its back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from drivers.errors import DeviceError
+
+
+class Stops:
+    """`count` is the number of stops so far.
+
+    A stop goes out at once, maybe just before the command of a move that another thread has begun to give. So whoever
+    begins a move looks, once the command has gone, whether a stop came meanwhile, and then sends it again.
+
+    Args:
+        send: sends a stop (True: without deceleration) and does not wait until it stands.
+    """
+
+    def __init__(self, name: str, send: Callable[[bool], object]) -> None:
+        self._name, self._send = name, send
+        self.count = 0
+        self._hard = False
+
+    def came(self, *, hard: bool) -> None:
+        """To be called before the stop is sent: then it is either counted in time, or sent after the move's command."""
+        self._hard = hard
+        self.count += 1
+
+    @contextmanager
+    def none_while(self, purpose: str, since: int | None = None) -> Iterator[None]:
+        """Around the commands that begin a move.
+
+        Args:
+            purpose: what is begun, for the error.
+            since: the count before all of it, where it has begun earlier.
+
+        Raises:
+            DeviceError: a stop came; it has been sent again.
+        """
+        before, problem = self.count if since is None else since, None
+        try:
+            yield
+        except DeviceError as error:
+            problem = error
+        finally:
+            if came := self.count != before:
+                self._send(self._hard)
+        if came:
+            raise DeviceError(
+                self._name,
+                f"{purpose} was stopped while it was being begun",
+                advice="Find who stopped it before moving on",
+                state="The stop was sent again: it stands, or slows down to stand",
+            ) from problem
+        if problem is not None:
+            raise problem

@@ -1,0 +1,139 @@
+"""Travel of a stage: radians and whole counts, soft limits, and the refusal of what no stage can have or reach."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+
+from drivers.errors import DeviceRefused, DeviceTimeout
+from drivers.protocols import StageLimits, TriggerTrain
+
+FARTHEST = 1e9
+"""rad."""
+MOST = 2.0**53
+"""counts that a float still tells apart."""
+
+
+def check_figures(counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float) -> None:
+    """The figures configured for a stage: counts for 2π, rad/s, rad/s², rad.
+
+    Raises:
+        ValueError: figures that no stage can have.
+    """
+    if counts_per_turn < 1:
+        raise ValueError(f"a turn cannot have {counts_per_turn} counts")
+    per_radian = counts_per_turn / (2 * math.pi)
+    for meaning, rate in (("speed", max_speed), ("acceleration", acceleration)):
+        if not 0 < rate * per_radian < MOST:
+            raise ValueError(f"{rate:g} rad is no {meaning} that a stage can have")
+    if not -FARTHEST <= low < high <= FARTHEST:
+        raise ValueError(f"from {math.degrees(low):g} to {math.degrees(high):g} deg there is no room to move")
+    if not (high - low) * per_radian < MOST:
+        raise ValueError(f"{(high - low) * per_radian:g} counts are more than can be told apart")
+
+
+@dataclass(frozen=True)
+class Travel:
+    """What a stage of that name may do, in counts and in words."""
+
+    name: str
+    limits: StageLimits
+
+    def to_counts(self, angle: float) -> int:
+        return round(angle * self.limits.counts_per_turn / (2 * math.pi))
+
+    def to_angle(self, counts: int) -> float:
+        return counts * 2 * math.pi / self.limits.counts_per_turn
+
+    @property
+    def low(self) -> int:
+        """counts."""
+        return self.to_counts(self.limits.low)
+
+    @property
+    def high(self) -> int:
+        """counts."""
+        return self.to_counts(self.limits.high)
+
+    @property
+    def span(self) -> str:
+        """The soft limits in words."""
+        return f"{math.degrees(self.limits.low):g} to {math.degrees(self.limits.high):g} deg"
+
+    def degrees(self, counts: Fraction | float) -> str:
+        """A place in words."""
+        return f"{float(counts) * 360 / self.limits.counts_per_turn:.4f} deg"
+
+    def target(self, angle: float) -> int:
+        """The count to go to for an angle in rad.
+
+        Raises:
+            DeviceRefused: it is beyond the soft limits.
+        """
+        near = self.limits.low - 1 <= angle <= self.limits.high + 1  # also refuses what is no number or too large
+        if not near or not self.low <= self.to_counts(angle) <= self.high:
+            raise DeviceRefused(
+                self.name,
+                f"a move to {math.degrees(angle):g} deg is beyond the soft limits",
+                expected=self.span,
+                state="Nothing has moved",
+            )
+        return self.to_counts(angle)
+
+    def has_room_for(self, train: TriggerTrain) -> bool:
+        """Its pulses are within the soft limits."""
+        return all(self.low <= at <= self.high for at in (train.start, train.end))
+
+    def cannot_emit(self, train: TriggerTrain, expected: str, why: str = "") -> DeviceRefused:
+        """The refusal of a train that is not as `expected`."""
+        return DeviceRefused(
+            self.name,
+            f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",
+            expected=f"{expected}, all within {self.span}",
+            state="Nothing has moved and nothing was sent",
+        )
+
+    def refuse_late_arming(self, train: TriggerTrain, counts: int) -> None:
+        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`."""
+        if train.interval * (train.start - counts) <= 0:
+            raise DeviceRefused(
+                self.name,
+                f"it stands at {self.degrees(counts)}, at or past the first pulse at {self.degrees(train.start)}",
+                advice="Move to before the first pulse, then arm",
+                state="Nothing has moved and this train is not armed",
+            )
+
+    def refuse_narrower(self, low: int, high: int, advice: str) -> None:
+        """Refuses a controller whose own limits (counts) leave less room."""
+        if self.low < low or self.high > high:
+            raise DeviceRefused(
+                self.name,
+                f"the controller itself is limited to {self.degrees(low)} to {self.degrees(high)}",
+                expected=f"room for the configured {self.span}",
+                advice=f"Narrow low and high in the configuration, or {advice}",
+                state="Nothing has moved",
+            )
+
+    def still_moving(self, timeout: float, counts: int, aim: str, request: str, reply: str = "") -> DeviceTimeout:
+        """The error of a wait (s) that is over before the stage stands at its aim."""
+        return DeviceTimeout(
+            self.name,
+            f"still moving after {timeout:g} s",
+            request=request,
+            reply=reply,
+            expected=f"to stand at {aim}" if aim else "",
+            advice="Allow more time, or stop it",
+            state=f"It was left moving and is at {self.degrees(counts)}",
+        )
+
+    def not_stopped(self, timeout: float, counts: int, request: str, reply: str = "") -> DeviceTimeout:
+        """The error of a stop after which the stage does not stand within `timeout` s."""
+        return DeviceTimeout(
+            self.name,
+            f"still moving {timeout:.1f} s after the stop command",
+            request=request,
+            reply=reply,
+            advice="Abort, or use the emergency stop",
+            state=f"It is moving, at {self.degrees(counts)}",
+        )

@@ -1,0 +1,40 @@
+"""The simulated controllers of all stages under one roof, for tests that every driver must pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import pytest
+
+from drivers.protocols import RotationStage
+from simulators.clock import VirtualClock
+from simulators.trigger_line import TriggerLine
+from tests.drivers import pm16c_rig, zaber_rig
+from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stages import pi_gcs_rig
+
+
+class AnyRig(Protocol):
+    """A simulated controller on a virtual clock; it is its own wire, and `url` is where that is plugged in."""
+
+    clock: VirtualClock
+    line: TriggerLine
+    url: str
+
+    def receive(self, data: bytes) -> None: ...
+
+    def transmit(self) -> bytes: ...
+
+    def open(self, **settings: Any) -> RotationStage: ...
+
+    def bench(self, **settings: Any) -> StageBench: ...
+
+
+def pi_gcs(**build: Any) -> AnyRig:
+    """Without latency: on a real terminal the virtual clock stands while a reply is on its way."""
+    return pi_gcs_rig.Rig(wire={"latency": 0.0}, **build)
+
+
+RIGS: dict[str, Callable[..., AnyRig]] = {"pm16c": pm16c_rig.Rig, "pi_gcs": pi_gcs, "zaber": zaber_rig.Rig}
+every_stage = pytest.mark.parametrize("rig_of", RIGS.values(), ids=RIGS.keys())
