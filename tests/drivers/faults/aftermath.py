@@ -66,7 +66,7 @@ def assert_kept(scanned: Scanned, views: list[int] | None = None, invalid: int =
 
 
 def assert_complete(scanned: Scanned) -> None:
-    assert scanned.error is None
+    assert scanned.error is None, scanned.error
     assert scanned.rows()[FrameKind.PROJECTION] == list(range(VIEWS))
     assert scanned.status() == "complete"
 

@@ -386,7 +386,7 @@ class Rig:
         wishes = [wish for wish in self.asked if "shutter" in wish]
         return bool(wishes) and wishes[-1].startswith("Open")
 
-    def _connect(self, config: Config, ask: Callable[[str], None], heed: Callable[[], None]) -> Bench:
-        bench = connect(config, self.clock, ask, heed)
+    def _connect(self, config: Config, **how: Any) -> Bench:
+        bench = connect(config, self.clock, **how)
         self.after_connecting()
         return bench
