@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import math
-import os
 import shutil
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +20,9 @@ from beamline.pipeline import Prepared, Selection, prepare
 from beamline.recon_report import facts_of
 from beamline.storage.recon_file import named_on_failure
 from beamline.tradeoff_report import Table, write_figures, write_table
-from beamline.trial_process import Data
-from beamline.trials import Depth, Outcome, Status, Timed, Trial, plan, seconds_left
+from beamline.trial_data import Data
+from beamline.trial_run import compile_kernels, run_trial
+from beamline.trials import Depth, Outcome, Timed, plan, seconds_left
 from drivers.clock import Clock
 from recon.initialise import default_count
 from recon.volume import Grid
@@ -170,104 +165,3 @@ def _each(
         table = table.with_outcome(index, result)
         yield table
         sink(Event("trial", clock.now(), {"n": index + 1, "of": len(table.outcomes), **table.told(result)}))
-
-
-def command(job: Path) -> Sequence[str]:
-    """What runs the job in the file `job`."""
-    return [sys.executable, "-m", "beamline.trial_process", str(job)]
-
-
-def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
-    """Fill the cache of compiled kernels for these trials, so that no trial's memory is that of a compiler.
-
-    Args:
-        work: a folder with data.npz.
-    """
-    kinds = {(trial.method, trial.start): trial for trial in trials if trial.group != "precision"}
-    job = {"data": str(work / "data.npz"), "compile": [asdict(trial) for trial in kinds.values()]}
-    _process(job, work)  # what fails here, a trial will tell
-
-
-def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = None) -> Outcome:
-    """One trial in its own process; it is gone when this returns, whatever ended it.
-
-    Args:
-        work: a folder with data.npz.
-        max_seconds: after which it is ended.
-    """
-    job = {"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed}
-    return _outcome(trial, _process(job, work, max_seconds))
-
-
-@dataclass(frozen=True)
-class _Ended:
-    """A process that has ended: the last thing it said, its code, its last words, and whether its time was over."""
-
-    said: Mapping[str, Any]
-    code: int
-    words: str
-    late: bool
-
-
-def _process(job: Mapping[str, Any], work: Path, max_seconds: float | None = None) -> _Ended:
-    path, words = work / "job.json", work / "stderr.txt"
-    with named_on_failure(path):
-        path.write_text(json.dumps(job), encoding="utf-8")
-    late = threading.Event()
-    with words.open("w", encoding="utf-8") as stderr:
-        process = subprocess.Popen(
-            command(path),
-            stdin=subprocess.PIPE,  # by whose end it knows that this process is gone
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            start_new_session=True,  # Ctrl-C is for this process, which decides what becomes of that one
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
-        )
-
-        def end() -> None:
-            late.set()
-            process.kill()
-
-        alarm = None if max_seconds is None else threading.Timer(max_seconds, end)
-        if alarm is not None:
-            alarm.start()
-        last: Mapping[str, Any] = {}
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                last = _said(line) or last
-            process.wait()
-        finally:
-            if alarm is not None:
-                alarm.cancel()
-            process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
-    return _Ended(last, process.returncode, words.read_text(encoding="utf-8", errors="replace"), late.is_set())
-
-
-def _said(line: str) -> Mapping[str, Any] | None:
-    try:
-        said = json.loads(line)
-    except ValueError:
-        return None  # a library's print
-    return said if isinstance(said, dict) else None
-
-
-def _outcome(trial: Trial, ended: _Ended) -> Outcome:
-    said = dict(ended.said)
-    if said.pop("event", None) == "result":
-        curve = [(float(s), float(q)) for s, q in said.pop("curve", [])]
-        return Outcome(trial, "done", curve=tuple(curve), **said)
-    status: Status = "out of time" if ended.late else "failed"
-    if ended.late:
-        return Outcome(trial, status, message="ended: the time given with --max-seconds was over")
-    lines = ended.words.strip().splitlines()
-    default = f"its process ended with code {ended.code}" + (f": {lines[-1]}" if lines else "")
-    return Outcome(trial, status, math.nan, message=str(said.get("message", default)))

@@ -74,7 +74,7 @@ class Trial:
         parts += [self.loss] if self.loss != "l1+ssim" else []
         parts += [f"cut at {self.sigmas:g} σ"] if self.sigmas != SIGMAS else []
         parts += [f"start {self.start}"] if self.start != "fbp" else []
-        parts += [f"{self.iterations} iterations"] if self.iterations is not None else []
+        parts += [f"{self.iterations} iteration{'s' * (self.iterations != 1)}"] if self.iterations is not None else []
         return ", ".join(parts)
 
 

@@ -6,8 +6,7 @@ import csv
 import errno
 import json
 import math
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,11 @@ import pytest
 from beamline import tradeoff
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event
-from beamline.machine import machine
 from beamline.offline import SourceOptions
 from beamline.pipeline import Selection
-from beamline.tradeoff import TradeoffOptions, run, run_trial
-from beamline.tradeoff_report import Table, text
-from beamline.trial_process import Data
-from beamline.trials import Depth, Outcome, Trial, plan
+from beamline.tradeoff import TradeoffOptions, run
+from beamline.tradeoff_report import text
+from beamline.trials import Outcome, Trial
 from drivers.clock import SystemClock
 from recon.geometry import Geometry
 from recon.volume import Grid
@@ -109,24 +106,6 @@ def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path
     assert marked == best
     assert " ".join(said.split()).count("s a dB") == len(best) - 1
     assert "float64 twin" in " ".join(said.split())
-
-
-@pytest.mark.parametrize("depth", ["quick", "full"])
-def test_the_table_fits_into_120_columns(depth: Depth) -> None:
-    """Also with four-digit numbers of views, and with everything that can be measured."""
-    metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784, "resolution": 0.6221}
-    methods = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
-    outcomes = tuple(
-        Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4)
-        for trial in plan(methods, 1801, 200_000, depth)
-    )
-    said = text(Table(outcomes, "psnr", "mm", machine(), {}, ""))
-    rows = said.split("\n\n")[1].splitlines()[1:]
-    assert len(rows) == sum(o.trial.group != "precision" for o in outcomes)
-    assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's
-    head = next(line for line in said.splitlines() if line.startswith("  trial"))
-    assert {len(row) for row in rows} == {len(head)}
-    assert all(" 12346 " in row and " 40000 " in row for row in rows)
 
 
 def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> None:
@@ -232,17 +211,6 @@ def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_
     assert f"{fbp.seconds:.2e}".replace("e-0", "e-") in said  # 5.40e-05 s: three digits where two decimals say 0.00
 
 
-def test_noise_in_a_cost_puts_no_trial_on_the_front(tmp_path: Path) -> None:
-    trial = Trial("method", "fbp", 10)
-    outcomes = [
-        Outcome(replace(trial, views=views), "done", seconds, memory, {"psnr": psnr})
-        for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
-    ]
-    table = Table(tuple(outcomes), "psnr", "mm", machine(), {}, "")
-    assert table.front("seconds") == [0, 1]
-    assert table.front("memory") == [1]
-
-
 def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any) -> None:
     time = iter(range(0, 10_000, 5))
     limits: list[float] = []
@@ -293,49 +261,3 @@ def test_two_views_leave_none_to_judge_by(tmp_path: Path) -> None:
     write_exchange(tmp_path / "scan.h5", few)
     with pytest.raises(ConfigError, match="--truth"):
         run(_options(tmp_path), lambda e: None, SystemClock())
-
-
-@pytest.mark.parametrize(
-    ("program", "limit", "status", "said"),
-    [
-        ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
-        ("import sys; sys.exit('it broke')", None, "failed", "it broke"),
-        ('print(\'{"event": "failed", "message": "no matter"}\')', None, "failed", "no matter"),
-        ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5, "curve": [[1, 2]]}\')', 60.0, "done", ""),
-    ],
-)
-def test_what_becomes_of_a_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float | None, status: str, said: str
-) -> None:
-    def fake(job: Path) -> Sequence[str]:
-        return [sys.executable, "-c", program]
-
-    monkeypatch.setattr(tradeoff, "command", fake)
-    outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
-    assert (outcome.status, said in outcome.message) == (status, True)
-    assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
-
-
-def test_kernels_are_compiled_once_for_each_method_and_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
-    out = tmp_path / "seen.json"
-    monkeypatch.setattr(tradeoff, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
-    tradeoff.compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
-    job = json.loads(out.read_text())
-    assert sorted((trial["method"], trial["start"]) for trial in job["compile"]) == [
-        ("fbp", "fbp"), ("r2", "fbp"), ("r2", "tv"), ("sirt", "fbp")
-    ]  # fmt: skip
-    assert job["data"] == str(tmp_path / "data.npz")  # whose geometry decides which kernels are used
-
-
-def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
-    """Its memory is its own: this process, which has more, does not show in it."""
-    views = Geometry.parallel(SCAN.angles, SCAN.shape)
-    data = Data(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
-    data.save(tmp_path / "data.npz")
-    ballast = np.ones(90_000_000)  # 720 MB
-    outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
-    assert outcome.status == "done", outcome.message
-    assert outcome.quality("psnr") > 20
-    assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline import trial_process as module
-from beamline.trial_process import Data, main, on_grid, run
+from beamline.trial_data import Data
+from beamline.trial_process import main, on_grid, run
 from beamline.trials import Trial
 from recon.fbp import fbp
 from recon.geometry import Geometry
@@ -43,21 +44,6 @@ def data() -> Data:
 
 def _silent(line: object) -> None:
     pass
-
-
-def test_arrays_survive_the_file(tmp_path: Path, data: Data) -> None:
-    data.save(tmp_path / "data.npz")
-    back = Data.load(tmp_path / "data.npz")
-    assert data.held_out is not None and back.held_out is not None
-    for one, other in ((back.geometry, data.geometry), (back.held_out[1], data.held_out[1])):
-        for f in fields(Geometry):
-            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name))
-    np.testing.assert_array_equal(back.projections, data.projections)
-    np.testing.assert_array_equal(back.held_out[0], data.held_out[0])
-    np.testing.assert_array_equal(back.truth, data.truth)
-    Data(data.projections, data.geometry, None, None).save(tmp_path / "bare.npz")
-    bare = Data.load(tmp_path / "bare.npz")
-    assert bare.held_out is None and bare.truth is None
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: Data) -> None:

@@ -54,6 +54,8 @@ def test_labels_say_what_is_not_the_default() -> None:
         "r2, 60 views, bin 2, 500 steps, 50k Gaussians, l1, cut at 3 σ"
     )
     assert replace(trial, start="tv").label == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
+    assert Trial("iterations", "sart", 9, iterations=1).label == "sart, 9 views, 1 iteration"
+    assert Trial("iterations", "sart", 9, iterations=30).label == "sart, 9 views, 30 iterations"
 
 
 @given(st.floats(0.1, 1e4), st.integers(1, 20), st.floats(0, 10))
