@@ -61,7 +61,8 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
         method: of recon.reconstruct.
         follow: the scan is still running.
     """
-    given = [name for name in (*_PLANS, *_FIT, *_ITERATIVE) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    names = (*_PLANS, *_FIT, *_ITERATIVE)
+    given = [name for name in names if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     if {"steps", "seconds"} <= set(given):
         raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
     for plan in _PLANS:
