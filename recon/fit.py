@@ -23,9 +23,12 @@ from recon.volume import Grid, Volume
 
 NAMES = ("means", "log_scales", "quaternions", "raw")
 
-# Best of 0.05, 0.1, 0.15 and 0.25 on seven scans, to 0.5 dB: little for the clean data of the published protocol (noise
-# 0.0008 to 0.0026), much for a measured walnut (0.003) and photon-starved batteries (0.008 to 0.010).
-_TV_OF_NOISE, _TV_RANGE = 40.0, (0.02, 0.15)
+# Total variation is a prior: it weighs the more, the noisier a pixel (variance) and the fewer pixels a Gaussian has.
+# Factor and bounds from scans of four kinds with 25 to 90 views, see docs/exploration.md.
+_TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
+# A box of a 64th of the grid: seen more seldom, total variation comes in kicks that Adam's moments take for steepness
+# and that brake all the rest (-1.8 dB on a battery of 256³ voxels).
+_TV_SHARE, _TV_SIZES = 4, (32, 96)
 _NORMALISE = 100  # steps between two times that quaternions are made of length 1
 
 
@@ -36,9 +39,10 @@ class FitSettings:
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighed by the transmission).
         ssim_weight: of 1 - SSIM beside it.
-        tv_weight: of total variation; None takes 40 times the noise of a pixel (in units of the half field times the
-            density unit), between 0.02 and 0.15: see docs/exploration.md.
-        tv_size: voxels per side of the random box on which total variation acts.
+        tv_weight: of total variation; None takes 3e5 times the variance of a pixel's noise (in units of the half field
+            times the density unit), divided by the pixels that a Gaussian has, between 0.02 and 0.25.
+        tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
+            side, 32 to 96.
         tv_moves: total variation may move centres. The published code has that gradient too small by the voxel size
             squared, so that in effect it does not (there the weight is 0.05); with the right gradient we measure
             +0.2 dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
@@ -58,7 +62,7 @@ class FitSettings:
     loss: Loss = "l1"
     ssim_weight: float = 0.25
     tv_weight: float | None = None
-    tv_size: int = 32
+    tv_size: int | None = None
     tv_moves: bool = True
     rates: tuple[float, float, float, float] = (2e-4, 5e-3, 1e-3, 1e-2)
     pace: float = 20.0
@@ -74,6 +78,8 @@ class FitSettings:
     def __post_init__(self) -> None:
         for name in ("views_per_step", "coarse", "tv_size"):
             value = getattr(self, name)
+            if value is None and name == "tv_size":
+                continue
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}")
         for name in ("ssim_weight", "tv_weight"):
@@ -156,11 +162,21 @@ def problem_of(
     )  # fmt: skip
 
 
-def tv_weight(settings: FitSettings, problem: Problem) -> float:
-    """The weight of total variation in a fit: as set, or by the noise of the data."""
+def tv_weight(settings: FitSettings, problem: Problem, count: int) -> float:
+    """The weight of total variation in a fit of at most `count` Gaussians: as set, or by the noise of the data."""
     if settings.tv_weight is not None:
         return settings.tv_weight
-    return min(max(_TV_OF_NOISE * problem.noise, _TV_RANGE[0]), _TV_RANGE[1])
+    rows, cols = problem.geometry.detector_shape
+    pixels = problem.geometry.n_views * rows * cols / count
+    return min(max(_TV_OF_NOISE * problem.noise**2 / pixels, _TV_RANGE[0]), _TV_RANGE[1])
+
+
+def tv_size(settings: FitSettings, grid: Grid) -> int:
+    """Voxels per side of the box of total variation: as set, or by the size of the grid."""
+    if settings.tv_size is not None:
+        return settings.tv_size
+    side = round(math.prod(grid.shape) ** (1 / 3) / _TV_SHARE / 16) * 16  # whole lanes of the kernels
+    return min(max(side, _TV_SIZES[0]), _TV_SIZES[1])
 
 
 def growth(settings: FitSettings) -> float:
@@ -225,7 +241,7 @@ def step(
         backend.add_lengths(centres, share * geometry.detector_shape[1] / 2, state.statistic)
         state.seen += 1
         loss = loss + value / share  # type: ignore[operator]
-    weight = tv_weight(settings, problem)
+    weight = tv_weight(settings, problem, state.limit)
     if weight > 0:
         loss = loss + _smooth(state, problem, settings, weight, run)
     state.loss = _running(state.loss, loss)
@@ -307,7 +323,8 @@ def _running(mean: Any, value: Any) -> Any:
 def _smooth(state: FitState, problem: Problem, settings: FitSettings, weight: float, run: Pass[Any]) -> Any:
     """Total variation on a random box of voxels, in normalised density."""
     grid = problem.grid
-    size = tuple(min(settings.tv_size, n) for n in grid.shape)
+    side = tv_size(settings, grid)
+    size = tuple(min(side, n) for n in grid.shape)
     corner = [int(state.rng.integers(0, n - s + 1)) for n, s in zip(grid.shape, size, strict=True)]
     centre = tuple(
         float(axis[c] + (s - 1) / 2 * edge)

@@ -186,7 +186,8 @@ def run_fit(
     record = {
         **asdict(settings), "steps": state.step, "seed": request.seed, "start": request.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": request.held_out, "device": request.device,
-        "polish": request.polish, "tv_weight": fit.tv_weight(settings, problem),
+        "polish": request.polish, "tv_weight": fit.tv_weight(settings, problem, state.limit),
+        "tv_size": fit.tv_size(settings, field_grid),
     }  # fmt: skip
     return Fitted(volume, tuple(history), model, record, arrays_of(last, backend) | watch.arrays())
 

@@ -14,6 +14,7 @@ from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.losses import projection_loss
 from recon.losses import total_variation as twin_tv
+from recon.problem import coarser
 from recon.splat import Truncation, project, voxelize
 from recon.volume import Grid
 from tests.recon.conftest import Make
@@ -328,11 +329,26 @@ def test_quaternions_are_brought_to_length_one_without_a_turn(
     np.testing.assert_allclose(brought.second["quaternions"], kept.second["quaternions"] * length**2, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("noise", "weight"), [(1e-4, 0.02), (2e-3, 0.08), (0.1, 0.15)])
+@pytest.mark.parametrize(("noise", "weight"), [(1e-4, 0.02), (2e-3, 0.05), (4e-3, 0.2), (0.1, 0.25)])
 def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generator, noise: float, weight: float) -> None:
-    flat = np.full((VIEWS.n_views, *VIEWS.detector_shape), 5.0)
-    scale = 0.7 * max(GRID.shape) * GRID.voxel_size / 2
+    """3e5 times its variance, over 24 pixels a Gaussian; and the same on pixels joined two by two."""
+    views = Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (64, 64))
+    grid = Grid.matching(views)
+    flat = np.full((views.n_views, *views.detector_shape), 5.0)
+    scale = 0.7 * max(grid.shape) * grid.voxel_size / 2
     data = flat + rng.normal(0, noise * scale, flat.shape)
-    problem = fit.problem_of(data.astype(np.float32), VIEWS, GRID, 0.7, fit.FitSettings())
-    assert fit.tv_weight(fit.FitSettings(), problem) == pytest.approx(weight, rel=0.1)
-    assert fit.tv_weight(fit.FitSettings(tv_weight=0.0), problem) == 0
+    settings, count = fit.FitSettings(), flat.size // 24
+    problem = fit.problem_of(data.astype(np.float32), views, grid, 0.7, settings)
+    assert fit.tv_weight(settings, problem, count) == pytest.approx(weight, rel=0.1)
+    rough = coarser(problem, 2, settings.loss, settings.ssim_weight)
+    assert fit.tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
+    assert fit.tv_weight(fit.FitSettings(tv_weight=0.0), problem, count) == 0
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [((8, 8, 8), 32), ((128, 128, 128), 32), ((96, 256, 256), 48), ((256,) * 3, 64), ((900,) * 3, 96)],
+)
+def test_total_variation_looks_at_a_64th_of_the_grid(shape: tuple[int, int, int], size: int) -> None:
+    assert fit.tv_size(fit.FitSettings(), Grid(shape)) == size
+    assert fit.tv_size(fit.FitSettings(tv_size=20), Grid(shape)) == 20
