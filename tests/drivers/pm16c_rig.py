@@ -47,7 +47,7 @@ class Rig:
             "low": math.radians(-5),
             "high": math.radians(100),
             "home": 0.0,
-            "home_speed": math.radians(15),
+            "home_speed": min(math.radians(15), settings.get("max_speed", 1.0)),
         }
         return PM16CStage(self.url, **(usual | settings))
 

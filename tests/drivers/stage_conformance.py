@@ -70,6 +70,7 @@ class StageConformance:
         INVERTS: its pulses may be active low.
         HOMES: the stage of the bench has a reference, within its limits.
         STOPS_ARE_TOLD: `status` tells that the last move was stopped.
+        RELATIVE_MOVES: how many of them make the long way; fewer where bytes cost time and the law is tested elsewhere.
     """
 
     WIDTH: float | None = 100e-6
@@ -77,6 +78,7 @@ class StageConformance:
     INVERTS = False
     HOMES = True
     STOPS_ARE_TOLD = True
+    RELATIVE_MOVES = 1000
 
     @pytest.fixture
     def build(self) -> Build:
@@ -187,7 +189,8 @@ class StageConformance:
         assert third != stage.to_angle(counts)
         speed = stage.limits.max_speed
         expected = 0
-        for sign, moves in ((1, 290), (-1, 300), (1, 295), (-1, 115)):
+        for sign, share in ((1, 0.29), (-1, 0.3), (1, 0.295), (-1, 0.115)):
+            moves = round(share * self.RELATIVE_MOVES)
             for _ in range(moves):
                 start_move_by(stage, sign * third, speed)
                 stage.wait(LONG)
@@ -357,6 +360,66 @@ class StageConformance:
         bench.stage.disarm()
         bench.go(10.0)
         assert bench.pulses() == []
+
+    def test_disarming_in_the_middle_of_a_train_ends_it(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 9))
+        bench.go(3.5)
+        bench.stage.disarm()
+        bench.go(7.5)
+        bench.go(0.0)
+        bench.go(20.0)
+        assert len(bench.pulses()) == 3
+        bench.stage.arm(bench.train(21.0, 1.0, 4))
+        bench.go(30.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 21.0, 22.0, 23.0, 24.0)]
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_a_train_that_is_stopped_in_the_middle_goes_on_with_the_next_move(
+        self, bench: StageBench, sign: int
+    ) -> None:
+        bench.go(-4.5 if sign > 0 else 10.0)
+        first = -3.0 if sign > 0 else 8.0
+        bench.stage.arm(bench.train(first, sign * 0.5, 20))
+        for degrees in (first + sign * 1.25, first + sign * 3.1, first + sign * 10.0):
+            bench.go(degrees)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(first) + sign * k * bench.counts(0.5) for k in range(20)]
+
+    def test_arming_again_replaces_the_train(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 9))
+        bench.stage.arm(bench.train(2.0, 3.0, 2))
+        bench.go(20.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(2.0), bench.counts(5.0)]
+
+    def test_arming_again_in_the_middle_of_a_train_replaces_it(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 9))
+        bench.go(3.5)
+        bench.stage.arm(bench.train(2.0, -1.0, 2))
+        bench.go(0.0)
+        bench.go(20.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 2.0, 1.0)]
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_at_a_speed_that_is_low_enough_pulses_come_at_each_of_the_smallest_intervals(
+        self, build: Build, sign: int
+    ) -> None:
+        """A count where pulses have a width, two where fires toggle the output."""
+        bench = build(max_speed=math.radians(0.2))
+        interval = 1
+        try:
+            bench.stage.arm(TriggerTrain(sign * 20, sign, 50))
+        except DeviceRefused as refusal:
+            assert "even number" in str(refusal)
+            interval = 2
+            bench.stage.arm(TriggerTrain(sign * 20, sign * 2, 50))
+        bench.stage.start_move(bench.stage.to_angle(sign * 200), math.radians(0.2))
+        bench.stage.wait(LONG)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [sign * (20 + interval * k) for k in range(50)]
+        bench.stage.close()
 
     def test_disarming_what_is_not_armed_is_fine(self, bench: StageBench) -> None:
         bench.stage.disarm()

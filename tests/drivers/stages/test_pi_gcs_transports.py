@@ -1,14 +1,11 @@
-"""PI GCS 2.0 driver over real transports: the conformance suite on a pseudo-terminal, short moves on real time.
-
-The suite's time is virtual there too: bytes go through the terminal in their own time, the clock stands meanwhile.
-"""
+"""PI GCS 2.0 driver over real transports: short moves on real time, and the plug."""
 
 from __future__ import annotations
 
 import gc
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any
 
@@ -18,12 +15,11 @@ import serial
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError
 from drivers.stages.pi_gcs import PiGcsStage
-from simulators.clock import VirtualClock
 from simulators.serial_url import SCHEME
 from simulators.transports import serve_pty, serve_tcp
 from simulators.trigger_line import TriggerLine
 from simulators.wire import Wire
-from tests.drivers.stage_conformance import Build, StageBench, StageConformance
+from tests.drivers.stage_conformance import StageBench
 from tests.drivers.stages.pi_gcs_rig import USUAL, controller
 
 FAST = math.radians(30)
@@ -32,24 +28,6 @@ SOON = 10.0
 Serve = Callable[[Wire], AbstractContextManager[str]]
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
 transports = pytest.mark.parametrize("serve", [pytest.param(serve_pty, marks=needs_pty), serve_tcp])
-
-
-@needs_pty
-class TestConformanceOnATerminal(StageConformance):
-    WIDTH = None
-    INVERTS = True
-
-    @pytest.fixture
-    def build(self) -> Iterator[Build]:
-        with ExitStack() as plugged:
-
-            def build(**settings: Any) -> StageBench:
-                clock = VirtualClock()
-                line = TriggerLine(clock)
-                url = plugged.enter_context(serve_pty(controller(clock, line, wire={"latency": 0.0})))
-                return StageBench(PiGcsStage(url, clock=clock, **(USUAL | settings)), clock, line)
-
-            yield build
 
 
 def real(serve: Serve, plugged: ExitStack, **build: Any) -> StageBench:
