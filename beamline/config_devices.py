@@ -92,10 +92,6 @@ class StageOutputShutter(Section):
     """How long the blade travels."""
 
 
-class NoBeamMonitor(Section):
-    kind: Literal["none"] = "none"
-
-
 def _finds_a_number(pattern: str) -> str:
     if problem := pattern_problem(pattern):
         raise ValueError(problem)
@@ -112,7 +108,22 @@ Pattern = Annotated[str, AfterValidator(_finds_a_number)]
 Scale = Annotated[float, Field(gt=0)]
 
 
-class ElectrometerConfig(Section):
+class _BeamMonitor(Section):
+    """What every beam monitor has."""
+
+    unit: str
+    scale: Scale = 1.0
+    """What the number is multiplied by to be in `unit`."""
+    timeout_s: PositiveFloat = 2.0
+    period_s: PositiveFloat = 1.0
+    """Between readings while a scan runs (real time); they are kept in the scan's file."""
+
+
+class NoBeamMonitor(Section):
+    kind: Literal["none"] = "none"
+
+
+class ElectrometerConfig(_BeamMonitor):
     """An electrometer or picoammeter on a serial port that answers a query with a line that holds a number."""
 
     kind: Literal["electrometer"]
@@ -122,13 +133,10 @@ class ElectrometerConfig(Section):
     pattern: Pattern = PATTERN
     """Regular expression whose first group is the number."""
     unit: str = "A"
-    scale: Scale = 1.0
-    """What the number is multiplied by to be in `unit`."""
     setup: tuple[str, ...] = ()
     """Commands without a reply, sent once at the start."""
     line_end: Literal["crlf", "cr", "lf"] = "crlf"
     baudrate: PositiveInt = 9600
-    timeout_s: PositiveFloat = 2.0
     transcript: str | None = None
     """As the stage's."""
 
@@ -137,7 +145,7 @@ class ElectrometerConfig(Section):
         return self.port.lower().startswith("sim://")
 
 
-class RingCurrentConfig(Section):
+class RingCurrentConfig(_BeamMonitor):
     """The ring current from a page or a text file."""
 
     kind: Literal["ring_current"]
@@ -146,8 +154,6 @@ class RingCurrentConfig(Section):
     pattern: Pattern
     """Regular expression whose first group is the number."""
     unit: str = "mA"
-    scale: Scale = 1.0
-    timeout_s: PositiveFloat = 2.0
 
 
 BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig

@@ -21,9 +21,9 @@ class Event:
         time: s since the Unix epoch.
         data: numbers and strings that belong to it.
 
-    Vocabulary: run_started, state, block_started, frame (throttled), block_done, flag, warning, snapshot, progress,
-    scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, check, done, failed. What a
-    live reconstruction says carries source="recon".
+    Vocabulary: run_started, state, block_started, frame (throttled), block_done, beam, flag, warning, snapshot,
+    progress, scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, check, done, failed.
+    What a live reconstruction says carries source="recon".
     """
 
     event: str

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from beamline.config import Config, plan_of, resolved_yaml
+from beamline.config_devices import NoBeamMonitor
 from beamline.devices import Bench, camera_settings
 from beamline.digest import digest
 from beamline.dry_run import free_bytes, refuse_violations
@@ -84,7 +85,7 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> Contex
 
 
 def _info(config: Config, bench: Bench, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
-    optics, devices = config.optics, bench.devices
+    optics, devices, monitor = config.optics, bench.devices, config.devices.beam_monitor
     asked = {
         "scheme": plan.scheme,
         "mode": plan.mode,
@@ -107,4 +108,5 @@ def _info(config: Config, bench: Bench, plan: ScanPlan, timeline: Timeline) -> S
         plan=json.dumps(asked),
         config=resolved_yaml(config),
         devices={device.name: device.describe() for device in (devices.stage, devices.camera)},
+        beam_unit=None if isinstance(monitor, NoBeamMonitor) else monitor.unit,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -13,7 +14,9 @@ from typing import Any, TextIO
 
 from beamline.acquire import Acquisition
 from beamline.announce import Announcer
+from beamline.beam_log import BeamLog
 from beamline.config import Config, resolved_yaml
+from beamline.config_devices import NoBeamMonitor
 from beamline.devices import Bench, connect
 from beamline.errors import DataError, ScanStopped, exit_code, in_words
 from beamline.events import JsonLines, Sink
@@ -188,13 +191,15 @@ class _Run:
         recorder = self._recorder(writer)
         acquisition = self._acquisition()
         self._enter(State.ACQUIRING)
-        error = _failure_of(lambda: _acquire(acquisition, recorder))
+        with self._beam_log() as beam:
+            error = _failure_of(lambda: _acquire(acquisition, recorder))
         self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
         disk = _failure_of(recorder.finish)
         error = self._graver(error, disk)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
+        missing = acquisition.missing
         # A write that does not return holds HDF5's lock: to close the file would be to wait for it.
-        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, acquisition.missing))
+        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
         error = self._graver(error, unfinished)
         for remark in writer.remarks:
             self.emit("warning", {"message": remark})
@@ -202,7 +207,7 @@ class _Run:
         result = RunResult(
             path=writer.path,
             n_frames=writer.committed,
-            missing=tuple(acquisition.missing),
+            missing=tuple(missing),
             flags=dict(recorder.flagged),
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
@@ -261,6 +266,12 @@ class _Run:
         return Acquisition(
             bench.devices, prepared.timeline, prepared.settings, settle, bench.clock, self.stop, self.emit
         )
+
+    def _beam_log(self) -> BeamLog:
+        chosen = self.config.devices.beam_monitor
+        if isinstance(chosen, NoBeamMonitor):
+            return BeamLog(None, math.inf, self.emit)
+        return BeamLog(self.bench.beam_monitor, chosen.period_s, self.emit)
 
     def _facts(self, path: Path) -> Mapping[str, Any]:
         timeline = self.prepared.timeline

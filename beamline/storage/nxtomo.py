@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -25,6 +25,7 @@ from beamline.storage.exchange_view import add_exchange_view
 from beamline.storage.nxtomo_layout import ScanInfo
 from drivers.clock import Clock
 from drivers.frame import Frame
+from drivers.protocols import BeamReading
 
 __all__ = ["NXtomoWriter", "ScanInfo"]
 
@@ -136,7 +137,7 @@ class NXtomoWriter:
         self._progress.flush()
         self._committed = self._rows
 
-    def close(self, status: str = "complete", missing: Sequence[int] = ()) -> None:
+    def close(self, status: str = "complete", missing: Sequence[int] = (), beam: Sequence[BeamReading] = ()) -> None:
         """Finish: missing triggers, end time and status, then `finished`, then the /exchange view. Twice is once.
 
         After a failed write the file only gets status "failed" and `finished`, and is not closed.
@@ -144,6 +145,7 @@ class NXtomoWriter:
         Args:
             status: "complete", "stopped" (by the operator) or "failed".
             missing: triggers, counted over the whole scan from 0, that gave no frame.
+            beam: readings of the beam monitor; kept where the file was made for them (ScanInfo.beam_unit).
 
         DataError where the disk does not take it; the frames committed stay readable.
         """
@@ -156,7 +158,7 @@ class NXtomoWriter:
             if self._broken:
                 self._let_go()
                 return
-            self._finish(status, np.asarray(missing, np.int64))
+            self._finish(status, np.asarray(missing, np.int64), beam)
         except FAILURES as error:
             if not self._broken:
                 self._broken = True
@@ -171,11 +173,15 @@ class NXtomoWriter:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close("complete" if kind is None else "failed")
 
-    def _finish(self, status: str, missing: NDArray[np.int64]) -> None:
+    def _finish(self, status: str, missing: NDArray[np.int64], beam: Sequence[BeamReading]) -> None:
         self.flush()
-        triggers = self._file[layout.MISSING]
-        triggers.resize(missing.size, 0)
-        triggers[...] = missing
+        series: dict[str, NDArray[Any]] = {layout.MISSING: missing}
+        if f"{layout.BEAM}/value" in self._file:
+            series[f"{layout.BEAM}/time"] = np.array([reading.time for reading in beam], np.float64)
+            series[f"{layout.BEAM}/value"] = np.array([reading.value for reading in beam], np.float64)
+        for path, values in series.items():
+            self._file[path].resize(values.size, 0)
+            self._file[path][...] = values
         self._file[layout.END_TIME][()] = layout.iso_time(self._clock.now()).encode()
         self._file[layout.STATUS][()] = status.encode()
         self._file.flush()

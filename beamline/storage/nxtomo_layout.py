@@ -8,6 +8,7 @@
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
       frame_log                 kind, trigger, framestamp, time, flags of each frame
       digest                    statistics of each frame, and preview f32 [frame, row, col]
+      record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
@@ -49,6 +50,7 @@ FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 END_TIME = "/entry/end_time"
+BEAM = "/entry/record/beam"
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 
@@ -88,6 +90,7 @@ class ScanInfo:
         axis_col: rotation axis in 0-based pixel-centre columns.
         plan: JSON; config: YAML; both as text for the record.
         devices: what each device says of itself, by its name.
+        beam_unit: of the beam monitor's readings; None: there is none.
     """
 
     sample: str
@@ -101,6 +104,7 @@ class ScanInfo:
     plan: str = "{}"
     config: str = ""
     devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
+    beam_unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -192,6 +196,12 @@ def create(
         if unit:
             file[path].attrs["units"] = unit
     file["/entry/frame_log/time"].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
+    if info.beam_unit is not None:
+        file.create_group(BEAM).attrs["NX_class"] = "NXlog"
+        for name, unit in (("time", "s"), ("value", info.beam_unit)):
+            _growing(file, f"{BEAM}/{name}", (), np.dtype("<f8"))
+            file[f"{BEAM}/{name}"].attrs["units"] = unit
+        file[f"{BEAM}/time"].attrs["description"] = "since 1970-01-01T00:00:00Z"
     _nxdata(file, rows, cols, info.pixel_size_mm)
 
     file[COMMITTED] = np.int64(0)
