@@ -1,0 +1,21 @@
+"""What the tests of `beamline recon` share: a small scan, the command as its user calls it, what is left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from tests.beamline.scans import TwoCylinders
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
+
+
+def beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def left(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}

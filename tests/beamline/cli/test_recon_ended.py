@@ -1,0 +1,155 @@
+"""`beamline recon` ended from outside: it delivers what it has, or leaves nothing; a checkpoint goes on."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline import budget, offline
+from beamline.storage.recon_file import read_reconstruction
+from recon import fit, reconstruction
+from recon.fbp import fbp
+from recon.fit import Progress
+from recon.quality import Speeds
+from tests.beamline.cli.small_scan import beamline, left
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+HANGUP = [] if sys.platform == "win32" else [signal.SIGHUP]
+
+
+def _signal_at_step(monkeypatch: pytest.MonkeyPatch, number: signal.Signals, at: set[int], times: int = 1) -> list[int]:
+    """Raise a signal after some steps of the fit; the steps it has taken."""
+    step, taken = fit.step, []
+
+    def watched(state: fit.FitState, *arguments: Any) -> fit.FitState:
+        state = step(state, *arguments)
+        taken.append(state.step)
+        if state.step in at:
+            for _ in range(times):
+                signal.raise_signal(number)
+        return state
+
+    monkeypatch.setattr(fit, "step", watched)
+    return taken
+
+
+def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the middle of writing: nothing half-written stays, and the last event says why."""
+
+    def interrupted(*_: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("beamline.storage.recon_file._write_entry", interrupted)
+    before = signal.getsignal(signal.SIGTERM)
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--json")
+    assert result.exit_code == 130
+    assert json.loads(result.stdout.splitlines()[-1])["exit_code"] == 130
+    assert left(folder) == {"scan.h5"}
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, *HANGUP])
+def test_a_fit_that_is_interrupted_delivers_what_it_has(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    steps = _signal_at_step(monkeypatch, number, {20})
+    result = beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 4, result.output
+    assert "The fit was ended early" in result.stderr
+    assert steps[-1] == 20
+    parameters = read_reconstruction(folder / "scan_r2.h5").parameters
+    assert parameters["ended_early"] and parameters["steps"] == 20
+
+
+def test_a_fit_that_is_interrupted_twice_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _signal_at_step(monkeypatch, signal.SIGINT, {20}, times=2)
+    result = beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 130
+    assert left(folder) == {"scan.h5"}
+
+
+def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = offline.progress_events
+
+    def watched(*arguments: Any) -> Callable[[Progress], None]:
+        listen = told(*arguments)
+
+        def heard(progress: Progress) -> None:
+            listen(progress)
+            if progress.step == 5:
+                signal.raise_signal(signal.SIGINT)
+
+        return heard
+
+    monkeypatch.setattr(offline, "progress_events", watched)
+    result = beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "100000", "--no-report")
+    assert result.exit_code == 4, result.output
+    assert "The iterations were ended early" in result.stderr
+    record = read_reconstruction(folder / "scan_sirt.h5")
+    assert record.parameters["ended_early"] and record.history["step"][-1] == 5
+
+
+@pytest.mark.parametrize("options", [["-m", "fbp"], ["--budget", "20s"]])
+def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    def interrupted(*arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return fbp(*arguments)
+
+    monkeypatch.setattr(reconstruction, "fbp", interrupted)
+    monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1))
+    result = beamline("recon", "scan.h5", *options, "-o", "out.h5", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "as soon as there is a volume" in result.stderr and "ended early" not in result.output
+    parameters = read_reconstruction(folder / "out.h5").parameters
+    assert parameters["method"] == "fbp" and "ended_early" not in parameters
+
+
+def test_a_fit_that_is_interrupted_in_its_last_step_is_complete(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _signal_at_step(monkeypatch, signal.SIGINT, {20})
+    result = beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "ended_early" not in read_reconstruction(folder / "scan_r2.h5").parameters
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
+def test_a_terminal_that_closes_does_not_end_what_nohup_keeps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _signal_at_step(monkeypatch, signal.SIGHUP, {5})
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        result = beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--no-report")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert result.exit_code == 0, result.output
+
+
+def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ("--steps", "60", "--gaussians", "50", "--axis", "20.7", "--no-report")
+    assert beamline("recon", "scan.h5", *options, "-o", "whole.h5").exit_code == 0
+    with monkeypatch.context() as patched:
+        _signal_at_step(patched, signal.SIGINT, {20})
+        result = beamline("recon", "scan.h5", *options, "-o", "part.h5", "--checkpoint", "fit.h5")
+    assert result.exit_code == 4, result.output
+    result = beamline("recon", "scan.h5", *options, "-o", "rest.h5", "--checkpoint", "fit.h5", "--resume", "fit.h5")
+    assert result.exit_code == 0, result.output
+    assert "Time, since resumed" in result.stdout
+    whole, rest = (read_reconstruction(folder / name) for name in ("whole.h5", "rest.h5"))
+    np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
+    assert left(folder) == {"scan.h5", "whole.h5", "part.h5", "rest.h5", "fit.h5"}
+    result = beamline("recon", "scan.h5", *options, "-o", "other.h5", "--resume", "fit.h5", "--rows", "0:1")
+    assert result.exit_code == 5
+    assert "is of another fit: projections" in result.stderr and "detector_shape" in result.stderr
+    assert "other.h5" not in left(folder)
+    fewer = [*options[2:], "--steps", "20", "-o", "other.h5", "--resume", "fit.h5"]
+    result = beamline("recon", "scan.h5", *fewer)
+    assert result.exit_code == 2
+    assert "60 steps behind it" in result.stderr and "--steps" in result.stderr and "other.h5" not in left(folder)

@@ -1,0 +1,177 @@
+"""`beamline recon` refuses: one sentence, an exit code, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scans import BEAM, DARK, write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+N = SCAN.angles.size
+_VIEWS = (N, 2, 40)
+CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
+    "no flats": ({"data_white": None}, ["--quantity", "counts"], 5, "flats"),
+    "no darks": ({"data_dark": None}, ["--quantity", "counts"], 5, "darks"),
+    "unknown quantity": ({"data_white": None, "data_dark": None}, [], 5, "--quantity"),
+    "wrong shape": ({"data_white": np.full((2, 2, 30), 9000, np.uint16)}, [], 5, "shape"),
+    "two dimensions": ({"data": np.zeros((2, 40), np.uint16)}, [], 5, "shape"),
+    "angles missing": ({"theta": None}, [], 5, "theta"),
+    "too few angles": ({"theta": np.zeros(4)}, [], 5, "4 angles"),
+    "NaN angles": ({"theta": np.full(N, np.nan)}, [], 5, "--angles"),
+    "all NaN": ({"data": np.full(_VIEWS, np.nan, np.float32)}, [], 5, "NaN"),
+    "one view": ({"data": np.full((1, 2, 40), 9000, np.uint16), "theta": np.zeros(1)}, [], 5, "at least 2"),
+    "no beam": ({"data_white": np.full((2, 2, 40), DARK, np.uint16)}, [], 5, "no beam"),
+    "empty field": ({"data": np.full(_VIEWS, DARK + BEAM, np.uint16)}, [], 5, "scan.h5"),
+    "one view chosen": ({}, ["--views", "fixed:1"], 2, "at least 2"),
+    "views misspelt": ({}, ["--views", "every:third"], 2, "every:third"),
+    "too many views": ({}, ["--views", "fixed:31"], 2, "30"),
+    "rows outside": ({}, ["--rows", "1:3"], 2, "0:2"),
+    "rows reversed": ({}, ["--rows", "2:1"], 2, "FIRST:END"),
+    "bins too large": ({}, ["--bin", "3"], 2, "--bin 3"),
+    "axis outside": ({}, ["--axis", "99"], 2, "outside"),
+    "axis misspelt": ({}, ["--axis", "middle"], 2, "auto"),
+    "air misspelt": ({}, ["--air", "some"], 2, "LEFT,RIGHT"),
+    "air too wide": ({}, ["--air", "30,30"], 5, "40 columns"),
+    "two budgets": ({}, ["--steps", "5", "--seconds", "5"], 2, "exclude"),
+    "budget and steps": ({}, ["--budget", "30s", "--steps", "5"], 2, "exclude"),
+    "budget and quality": ({}, ["--budget", "30s", "--quality", "best"], 2, "exclude"),
+    "quality and Gaussians": ({}, ["--quality", "best", "--gaussians", "5"], 2, "exclude"),
+    "budget misspelt": ({}, ["--budget", "soon"], 2, "such as 30s"),
+    "quality misspelt": ({}, ["--quality", "superb"], 2, "preview"),
+    "truth missing": ({}, ["--truth", "truth.npz"], 2, "truth.npz"),
+    "truth of another shape": ({}, ["--truth", "scan.npy"], 2, "shape"),
+    "of the other method": ({}, ["--gaussians", "5"], 2, "r2"),
+    "a loss of fbp": ({}, ["--loss", "l2"], 2, "--loss is of the r2 fit"),
+    "a checkpoint of fbp": ({}, ["--checkpoint", "fit.h5"], 2, "--checkpoint is of the r2 fit"),
+    "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of the iterative methods"),
+    "iterations of a fit": ({}, ["-m", "r2", "--iterations", "5"], 2, "does not go with --method r2"),
+    "steps of iterations": ({}, ["-m", "sirt", "--steps", "5"], 2, "--steps is of the r2 fit"),
+    "smoothing of sirt": ({}, ["-m", "sirt", "--tv-weight", "0.1"], 2, "fista-tv and os-sirt-tv"),
+    "budget and loss": ({}, ["--budget", "30s", "--loss", "l2"], 2, "exclude"),
+    "budget and early stop": ({}, ["--budget", "30s", "--early-stop"], 2, "exclude"),
+    "following with a start": ({}, ["-m", "r2", "--follow", "--start", "tv"], 2, "finished scan"),
+    "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),
+    "no such device": ({}, ["-m", "r2", "--device", "abacus"], 2, "--device abacus"),
+    "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5 is not there"),
+    "not a checkpoint": ({}, ["-m", "r2", "--resume", "scan.npy"], 5, "no checkpoint"),
+    "a checkpoint in the way": ({}, ["-m", "r2", "--checkpoint", "scan.npy"], 5, "never overwritten"),
+    "the scan as checkpoint": ({}, ["-m", "r2", "--checkpoint", "scan.h5"], 2, "FILE and --checkpoint are the same"),
+    "the scan to resume": ({}, ["-m", "r2", "--resume", "./scan.h5"], 2, "FILE and --resume are the same"),
+    "the scan as output": ({}, ["-o", "scan.h5"], 2, "FILE and --output are the same"),
+    "output as checkpoint": ({}, ["-m", "r2", "-o", "a.h5", "--checkpoint", "./a.h5"], 2, "--output and --checkpoint"),
+    "default as checkpoint": ({}, ["-m", "r2", "--checkpoint", "scan_r2.h5"], 2, "--output and --checkpoint"),
+    "report as checkpoint": ({}, ["-m", "r2", "-o", "a.h5", "--checkpoint", "a.html"], 2, "report and --checkpoint"),
+    "output to resume": ({}, ["-m", "r2", "-o", "a.h5", "--resume", "a.h5"], 2, "--output and --resume"),
+    "endless smoothing": ({}, ["-m", "fista-tv", "--tv-weight", "inf"], 2, "finite"),
+    "no smoothing": ({}, ["-m", "fista-tv", "--tv-weight", "nan"], 2, "finite"),
+    "no residual": ({}, ["--max-residual", "nan"], 2, "finite"),
+    "no time": ({}, ["-m", "r2", "--seconds", "nan"], 2, "finite"),
+    "endless time": ({}, ["-m", "r2", "--seconds", "inf"], 2, "finite"),
+    "a pixel of no size": ({}, ["--pixel-size-um", "nan"], 2, "finite"),
+    "a seed below zero": ({}, ["--seed", "-1"], 2, "--seed"),
+    "a nameless checkpoint": ({}, ["-m", "r2", "--checkpoint", ""], 2, "fit.checkpoint.h5"),
+    "no file": ({}, ["-o", "."], 2, "directory"),
+    "nameless": ({}, ["-o", ""], 2, "HDF5"),
+    "a page": ({}, ["-o", "out.html"], 2, "HDF5"),
+    "method misspelt": ({}, ["--method", "r3"], 2, "r3"),
+    "folder missing": ({}, ["-o", "no/out.h5"], 5, "does not exist"),
+    "fbp cannot follow": ({}, ["--follow"], 2, "--follow"),
+}
+
+
+@pytest.mark.parametrize("method", ["fbp"])
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str, method: str) -> None:
+    changes, options, code, said = CASES[case]
+    (folder / "scan.h5").unlink()
+    write_exchange(folder / "scan.h5", SCAN, changes)
+    np.save(folder / "scan.npy", np.arange(8.0).reshape(2, 2, 2))
+    before = left(folder)
+    # A budget and a preset are of the fit, whose settings they choose.
+    chosen = [] if {"--budget", "--quality"} & set(options) else ["-m", method]
+    result = beamline("recon", "scan.h5", *chosen, *options)
+    assert result.exit_code == code, result.output
+    assert result.stdout == ""
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+    assert len([line for line in result.stderr.splitlines() if line.startswith(("beamline:", "Error:"))]) == 1
+    assert left(folder) == before
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--steps 5", "--seconds 5", "--gaussians 5", "--start tv", "--loss l2", "--device cuda", "--early-stop",
+     "--checkpoint fit.h5", "--resume scan.h5", "--budget 30s", "--quality best"],
+)  # fmt: skip
+@pytest.mark.parametrize("method", ["fbp", "sirt"])
+def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str, method: str) -> None:
+    result = beamline("recon", "scan.h5", "-m", method, *option.split())
+    assert result.exit_code == 2 and result.stdout == ""
+    assert f"{option.split()[0]} is of the r2 fit; it does not go with --method {method}." in result.stderr
+    assert left(folder) == {"scan.h5"}
+
+
+@pytest.mark.parametrize("name", ["missing.h5", "text.h5", "empty.h5", "half.h5", "folder"])
+def test_files_that_cannot_be_read(folder: Path, name: str) -> None:
+    (folder / "text.h5").write_text("no scan")
+    (folder / "empty.h5").write_bytes(b"")
+    (folder / "half.h5").write_bytes((folder / "scan.h5").read_bytes()[:3000])
+    (folder / "folder").mkdir()
+    before = left(folder)
+    result = beamline("recon", name)
+    assert result.exit_code == 5, result.output
+    assert name in result.stderr
+    assert result.stderr.startswith("beamline: ")
+    assert left(folder) == before
+
+
+def test_a_failure_is_the_last_json_event(folder: Path) -> None:
+    result = beamline("recon", "missing.h5", "--json")
+    assert result.exit_code == 5
+    last = json.loads(result.stdout.splitlines()[-1])
+    assert (last["event"], last["exit_code"]) == ("failed", 5)
+    assert "missing.h5" in last["message"]
+
+
+def test_results_are_never_overwritten(folder: Path) -> None:
+    (folder / "scan_fbp.h5").write_text("precious")
+    result = beamline("recon", "scan.h5", "-m", "fbp")
+    assert result.exit_code == 5
+    assert (folder / "scan_fbp.h5").read_text() == "precious"
+
+
+def test_as_a_process(folder: Path) -> None:
+    """The same through the operating system: exit code, streams, and no traceback."""
+    root = Path(__file__).parents[3]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    command = [sys.executable, "-m", "beamline.cli.main", "recon", "scan.h5", "--views", "fixed:1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("beamline: --views fixed:1")
+    assert "Traceback" not in done.stderr
+    assert left(folder) == {"scan.h5"}
+
+
+def test_the_beamless_fixture_is_refused(folder: Path, shared_data: Path) -> None:
+    result = beamline("recon", str(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx"))
+    assert result.exit_code == 5
+    assert "no beam" in result.stderr
+    assert left(folder) == {"scan.h5"}
+
+
+@pytest.mark.parametrize("options", [["-m", "fbp"], ["--follow"]])
+def test_budgets_are_of_finished_scans_and_the_fit(folder: Path, options: list[str]) -> None:
+    result = beamline("recon", "scan.h5", "--budget", "1m", *options)
+    assert result.exit_code == 2
+    assert "--budget" in result.stderr and left(folder) == {"scan.h5"}
