@@ -77,6 +77,22 @@ def shape_of(scales, rotations, i, live):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):  # type: ignore[no-untyped-def]
+    """The pixels within hu, hv of (u, v): the whole image where not `bounded`, an empty box where not `hit`."""
+    # Clipped as floats: a box far outside is no int32.
+    row_low, row_high = tl.maximum(tl.ceil(v - hv), 0.0), tl.minimum(tl.floor(v + hv) + 1.0, rows * 1.0)
+    col_low, col_high = tl.maximum(tl.ceil(u - hu), 0.0), tl.minimum(tl.floor(u + hu) + 1.0, cols * 1.0)
+    row_low, row_high = tl.where(bounded, row_low, 0.0), tl.where(bounded, row_high, rows * 1.0)
+    col_low, col_high = tl.where(bounded, col_low, 0.0), tl.where(bounded, col_high, cols * 1.0)
+    hit = hit & (row_high > row_low) & (col_high > col_low)
+    box = boxes + 4 * i
+    tl.store(box, tl.where(hit, row_low, 0.0).to(tl.int32), live)
+    tl.store(box + 1, tl.where(hit, row_high, 0.0).to(tl.int32), live)
+    tl.store(box + 2, tl.where(hit, col_low, 0.0).to(tl.int32), live)
+    tl.store(box + 3, tl.where(hit, col_high, 0.0).to(tl.int32), live)
+
+
+@triton.jit
 def add_to(at, value, live):  # type: ignore[no-untyped-def]
     """*at += value, by the lanes that live."""
     tl.store(at, tl.load(at, live, 0.0) + value, live)
@@ -160,15 +176,7 @@ def _footprints(  # type: ignore[no-untyped-def]
     tl.store(f + W, tl.where(seen, weight, 0.0), live)
     tl.store(f + HU, tl.where(seen, hu, _HIDDEN), live)
     tl.store(f + HV, tl.where(seen, hv, _HIDDEN), live)
-    # Clipped as floats: a box far outside is no int32.
-    row_low, row_high = tl.maximum(tl.ceil(v - hv), 0.0), tl.minimum(tl.floor(v + hv) + 1.0, rows * 1.0)
-    col_low, col_high = tl.maximum(tl.ceil(u - hu), 0.0), tl.minimum(tl.floor(u + hu) + 1.0, cols * 1.0)
-    hit = hit & (row_high > row_low) & (col_high > col_low)
-    box = boxes + 4 * i
-    tl.store(box, tl.where(hit, row_low, 0.0).to(tl.int32), live)
-    tl.store(box + 1, tl.where(hit, row_high, 0.0).to(tl.int32), live)
-    tl.store(box + 2, tl.where(hit, col_low, 0.0).to(tl.int32), live)
-    tl.store(box + 3, tl.where(hit, col_high, 0.0).to(tl.int32), live)
+    store_box(boxes, i, live, hit, hit, u, v, hu, hv, rows, cols)
 
 
 @triton.jit(do_not_specialize=["n"])

@@ -24,10 +24,12 @@ from recon.kernels.gpu.footprints import (
     U,
     V,
     W,
+    add_to,
     along_ray,
     beam_of,
     footprints,
     footprints_backward,
+    store_box,
 )  # fmt: skip
 from recon.kernels.gpu.tiles import tile_lists
 
@@ -87,17 +89,7 @@ def _terms(  # type: ignore[no-untyped-def]
     left = tl.where(bounded, left, 1.0)
     mu, mv = tl.load(f + U) + c2 * gu / left, tl.load(f + V) + c2 * gv / left
     wide, high = tl.sqrt(c2 / left * (suu + c2 * gu * gu / left)), tl.sqrt(c2 / left * (svv + c2 * gv * gv / left))
-    # Clipped as floats: a box far outside is no int32.
-    row_low, row_high = tl.maximum(tl.ceil(mv - high), 0.0), tl.minimum(tl.floor(mv + high) + 1.0, rows * 1.0)
-    col_low, col_high = tl.maximum(tl.ceil(mu - wide), 0.0), tl.minimum(tl.floor(mu + wide) + 1.0, cols * 1.0)
-    row_low, row_high = tl.where(bounded, row_low, 0.0), tl.where(bounded, row_high, rows * 1.0)
-    col_low, col_high = tl.where(bounded, col_low, 0.0), tl.where(bounded, col_high, cols * 1.0)
-    hit = seen & (row_high > row_low) & (col_high > col_low)
-    box = boxes + 4 * i
-    tl.store(box, tl.where(hit, row_low, 0.0).to(tl.int32), live)
-    tl.store(box + 1, tl.where(hit, row_high, 0.0).to(tl.int32), live)
-    tl.store(box + 2, tl.where(hit, col_low, 0.0).to(tl.int32), live)
-    tl.store(box + 3, tl.where(hit, col_high, 0.0).to(tl.int32), live)
+    store_box(boxes, i, live, seen, bounded, mu, mv, wide, high, rows, cols)
 
 
 @triton.jit
@@ -226,20 +218,18 @@ def _bend(  # type: ignore[no-untyped-def]
         xu, xv = (ux * r0 + uy * r1 + uz * r2) * sharp, (vx * r0 + vy * r1 + vz * r2) * sharp
         h = a * xu + b * xv + (dx * r0 + dy * r1 + dz * r2) * sharp
         gh, gxu, gxv = gau * xu + gav * xv + pull * h, gau * h, gav * h
-        at = d_log_scales + 3 * i + k
-        tl.store(at, tl.load(at, hit, 0.0) - (gh * h + gxu * xu + gxv * xv), hit)
+        add_to(d_log_scales + 3 * i + k, -(gh * h + gxu * xu + gxv * xv), hit)
         ga, gb = ga + gh * xu, gb + gh * xv
         gu, gv, gd = (gh * a + gxu) * sharp, (gh * b + gxv) * sharp, gh * sharp
         at = d_rotations + 9 * i + k
-        tl.store(at, tl.load(at, hit, 0.0) + ux * gu + vx * gv + dx * gd, hit)
-        tl.store(at + 3, tl.load(at + 3, hit, 0.0) + uy * gu + vy * gv + dy * gd, hit)
-        tl.store(at + 6, tl.load(at + 6, hit, 0.0) + uz * gu + vz * gv + dz * gd, hit)
+        add_to(at, ux * gu + vx * gv + dx * gd, hit)
+        add_to(at + 3, uy * gu + vy * gv + dy * gd, hit)
+        add_to(at + 6, uz * gu + vz * gv + dz * gd, hit)
     far = -(ga * a + gb * b + 2.0 * bent) / depth
     ga, gb = ga / depth, gb / depth
-    at = d_means + 3 * i
-    tl.store(at, tl.load(at, hit, 0.0) + ux * ga + vx * gb + dx * far, hit)
-    tl.store(at + 1, tl.load(at + 1, hit, 0.0) + uy * ga + vy * gb + dy * far, hit)
-    tl.store(at + 2, tl.load(at + 2, hit, 0.0) + uz * ga + vz * gb + dz * far, hit)
+    add_to(d_means + 3 * i, ux * ga + vx * gb + dx * far, hit)
+    add_to(d_means + 3 * i + 1, uy * ga + vy * gb + dy * far, hit)
+    add_to(d_means + 3 * i + 2, uz * ga + vz * gb + dz * far, hit)
 
 
 class Rays:

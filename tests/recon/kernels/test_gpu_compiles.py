@@ -24,8 +24,8 @@ _ARRAYS = (
 )
 # Those that other kernels call.
 _PARTS = {
-    "along_ray", "turned", "shape_of", "add_to", "add_shape", "_at_pixels", "_slope", "_unit_quaternion", "_softplus",
-    "_sigmoid", "_adam_one",
+    "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion",
+    "_softplus", "_sigmoid", "_adam_one",
 }  # fmt: skip
 
 
