@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
 
 from beamline.cli.main import main
+from beamline.config import config_folder, load
 from beamline.config_devices import DcamOrca, StageOutputShutter
 from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, ZaberStageConfig
+from beamline.dry_run import dry_run
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 DEVICES: dict[str, tuple[type[BaseModel], ...]] = {
@@ -23,6 +27,14 @@ DEVICES: dict[str, tuple[type[BaseModel], ...]] = {
 @pytest.mark.parametrize("command", sorted(set(re.findall(r"`beamline (\w+)", TEXT))))
 def test_commands(command: str) -> None:
     assert main.get_command(None, command) is not None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("command", re.findall(r"`beamline scan my\.yaml ([^`]*)`", TEXT))
+def test_a_scan_that_the_page_asks_for_breaks_no_limit_of_the_template(command: str) -> None:
+    words = shlex.split(command)
+    overrides = [value for option, value in itertools.pairwise(words) if option == "--set"]
+    assert overrides
+    assert dry_run(load(config_folder() / "instrument.yaml", overrides, {})).timeline.violations == ()
 
 
 @pytest.mark.parametrize(("device", "key"), sorted(set(re.findall(r"devices\.(stage|camera)\.(\w+)", TEXT))))
