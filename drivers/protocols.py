@@ -58,12 +58,14 @@ class StageStatus:
         moving: it has not come to rest.
         homed: its counts are those of the reference; None where this controller cannot tell.
         fault: why the last move ended early, or a fault that stands, in words; "" where there is none.
+        held: count at which a servo holds it after a move that arrived, which may be beside `counts`. None elsewhere.
     """
 
     counts: int
     moving: bool
     homed: bool | None
     fault: str
+    held: int | None = None
 
 
 class Motion(Protocol):

@@ -158,7 +158,8 @@ class PiGcsStage:
 
     def status(self) -> StageStatus:
         status = self._axis.status()
-        return StageStatus(status.counts, status.moving, status.homed, self._fault(status))
+        held = None if status.moving or not status.servo or self._away(status.counts) else self._target
+        return StageStatus(status.counts, status.moving, status.homed, self._fault(status), held)
 
     def start_move(self, angle: float, speed: float) -> None:
         target = self._travel.target(angle)
@@ -202,7 +203,7 @@ class PiGcsStage:
             raise error
         if homing:
             self._homing = False
-        elif target is not None and self._away(status.counts):
+        elif target is not None and (self._away(status.counts) or not status.servo):
             wanted = f"{self._travel.degrees(target)}, {target} counts"
             raise self._stopped_short(f"it stopped short of {self._travel.degrees(target)}", status, wanted)
         return self.to_angle(status.counts)

@@ -149,7 +149,7 @@ class PiGcsAxis:
         self._configure(2, self._axis)
         self._configure(3, "0")
         self._configure(7, f"{active_high:d}")
-        self._configure(1, self.degrees(window.step))
+        self._configure(1, self.degrees(window.step), window.step_tolerance)
         self._configure(8, self.degrees(window.start))
         self._configure(9, self.degrees(window.stop))
         self._switch_trigger(True)
@@ -178,8 +178,8 @@ class PiGcsAxis:
             return self._refused(f"{verb} is not possible: the axis has no reference yet", why, command)
         return self._refused(f"{verb} ended with {meaning(5)}", advice(5), command)
 
-    def _configure(self, parameter: int, value: str) -> None:
-        """One CTO and its read-back, which may have fewer decimals than were sent, but must be the same count."""
+    def _configure(self, parameter: int, value: str, tolerance: Fraction = Fraction(1, 2)) -> None:
+        """One CTO and its read-back, which may have fewer decimals than were sent; `tolerance` in counts."""
         command = f"CTO {self._output} {parameter} {value}"
         self._line.set(command)
         form = r"(\w+)" if parameter == 2 else NUMBER
@@ -189,7 +189,7 @@ class PiGcsAxis:
             same = reply == value or (parameter != 2 and Fraction(reply) == int(value))
         else:
             miss = abs(Fraction(reply) - Fraction(value)) * self._counts_per_turn / 360
-            same = is_rounding_of(reply, value) and miss < Fraction(1, 2)
+            same = is_rounding_of(reply, value) and miss < tolerance
         if not same:
             raise self._line.not_followed(command, reply, value)
 

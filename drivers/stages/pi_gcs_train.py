@@ -13,6 +13,10 @@ from fractions import Fraction
 
 from drivers.protocols import TriggerTrain
 
+PULLED_APART = Fraction(1, 10)
+"""Of an interval: what the last pulse may be off where a controller tells its step rounded. Whether it also keeps it
+rounded cannot be seen; less than this spoils no image."""
+
 
 class FirstPulse(StrEnum):
     """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
@@ -28,11 +32,13 @@ class FirstPulse(StrEnum):
 
 @dataclass(frozen=True)
 class TriggerWindow:
-    """In counts: the distance of pulses, where the window begins (which the stage must stand before) and ends."""
+    """In counts: the distance of pulses, where the window begins (which the stage must stand before) and ends; and how
+    much of a count a step may be wrong, as it adds up over the train."""
 
     step: Fraction
     start: Fraction
     stop: Fraction
+    step_tolerance: Fraction
 
 
 def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
@@ -51,7 +57,8 @@ def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
         )
     before = {FirstPulse.AT_THRESHOLD: Fraction(0), FirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))
-    return TriggerWindow(Fraction(step), train.start - sign * lead, train.end + Fraction(sign * step, 2))
+    tolerance = min(Fraction(1, 2), PULLED_APART * step / max(train.n - 1, 1))
+    return TriggerWindow(Fraction(step), train.start - sign * lead, train.end + Fraction(sign * step, 2), tolerance)
 
 
 def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
