@@ -224,8 +224,8 @@ def write_figures(folder: Path, table: Table) -> None:
     if curves:
         caption = (
             "−20 log₁₀ of the residual that each baseline recorded while it ran: solid where it is of views held out, "
-            "dashed where of the views used, which falls on when the volume already follows their noise. A fit's is that "
-            "of its Gaussians, which may lie between voxels and beyond the volume; the table judges all by the volume."
+            "dashed where of the views used, which falls on when the volume already follows their noise. A fit's is "
+            "that of its Gaussians, which may lie between voxels and beyond the volume; the table judges all by the volume."
         )
         pictures.append(("curves.png", Picture("Each method's own curve", caption, cost_curves(curves))))
     for name, picture in pictures:
