@@ -225,7 +225,7 @@ def write_figures(folder: Path, table: Table) -> None:
         caption = (
             "−20 log₁₀ of the residual that each baseline recorded while it ran: solid where it is of views held out, "
             "dashed where of the views used, which falls on when the volume already follows their noise. A fit's is "
-            "that of its Gaussians, which may lie between voxels and beyond the volume; the table judges all by the volume."
+            "that of its Gaussians, which may lie between voxels and beyond the volume, by which the table judges."
         )
         pictures.append(("curves.png", Picture("Each method's own curve", caption, cost_curves(curves))))
     for name, picture in pictures:
