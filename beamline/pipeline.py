@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -143,12 +144,14 @@ def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
         if finding.severity == "warning":
             warn(finding.message)
     scan_frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    chosen = choose_views(source, scan_frames, selection)
+    choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
     corrector = Corrector(source, selection, warn)
     axis_col, axis = selection.axis_col, None
     if axis_col is None:
         axis_col, axis = locate_axis(source, corrector, scan_frames, warn)
     check_axis(source, axis_col)
+    period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
+    chosen = choose_views(source, scan_frames, selection, period)
     projections = corrector.line_integrals(scan_frames[chosen])
     report_defects(projections, warn)
     if projections.view_ids.size < 2:
@@ -187,14 +190,19 @@ def correction_blockers(source: ScanSource) -> list[Finding]:
     return [finding for rule in (quantity_said, references_present, beam_present) for finding in rule(source)]
 
 
-def choose_views(source: ScanSource, frames: NDArray[np.int64], selection: Selection) -> NDArray[np.int64]:
+def choose_views(
+    source: ScanSource, frames: NDArray[np.int64], selection: Selection, period: float = math.pi
+) -> NDArray[np.int64]:
     """Indices into `frames` of the views that the selection names; at least two.
+
+    Args:
+        period: radians after which views see the same rays, see `Geometry.period`.
 
     Raises:
         ConfigError: the selection is not legal, or leaves fewer than two views.
     """
     try:
-        chosen = parse_views(selection.views, source.angles[frames], selection.seed)
+        chosen = parse_views(selection.views, source.angles[frames], selection.seed, period=period)
     except ValueError as error:
         raise ConfigError(f"--views: {error}") from error
     if chosen.size < 2:

@@ -119,6 +119,17 @@ def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     np.testing.assert_allclose(data, replace(SCAN, angles=geometry.angles).line_integrals(), atol=1e-4)
 
 
+@pytest.mark.parametrize(("axis_col", "turned"), [(20.7, 1 / 2), (8.0, 1)])
+def test_selected_views_of_a_whole_turn_spread_over_it_where_the_axis_is_off_the_middle(
+    tmp_path: Path, axis_col: float, turned: float
+) -> None:
+    whole = replace(SCAN, angles=np.linspace(0, 2 * np.pi, 48, endpoint=False))
+    path = write_exchange(tmp_path / "scan.h5", whole)
+    prepared, _ = _prepare(path, Selection(views="fixed:12", axis_col=axis_col, correction=PLAIN))
+    expected = np.linspace(0, 2 * np.pi * turned, 12, endpoint=False)
+    np.testing.assert_allclose(prepared.geometry.angles, expected, atol=1e-5)
+
+
 def test_only_what_was_asked_for_is_read() -> None:
     counts = SCAN.counts()
     data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
