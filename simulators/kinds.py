@@ -50,7 +50,7 @@ def stand_alone(name: str, clock: Clock) -> Wire:
             raise ValueError(f"{option}={text} of {kind} cannot be read: {problem}") from problem
     try:
         wire: Wire = make(clock, TriggerLine(clock), **options)
-    except (LookupError, ValueError) as problem:
+    except (ArithmeticError, LookupError, ValueError) as problem:
         raise ValueError(f"{name} cannot be made: {problem!r}") from problem
     return wire
 

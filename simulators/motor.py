@@ -60,11 +60,15 @@ class TriggerOutput:
 
     Stopping between points and going on fires the rest; going back over points that fired fires none. A pulse that
     begins while the last one is still high gives no edge: with width >= interval time the output just stays high.
+
+    Args:
+        lost: pulses, counted from 0 since power-on, that never reach the line.
+        fires_at_start: the start point itself is one of the points.
     """
 
-    def __init__(self, lost: Set[int]) -> None:
+    def __init__(self, lost: Set[int], fires_at_start: bool = True) -> None:
         self.settings = TriggerSettings()
-        self._lost = lost
+        self._lost, self._first = lost, 0 if fires_at_start else 1
         self._armed = False
         self._fired = 0
         self._fired_before = 0
@@ -112,7 +116,8 @@ class TriggerOutput:
             time = _arrival(move, entry)
             return [] if time is None or time <= now else [(time, entry)]
         edges, high_until = [], self._last_fired + self.settings.width
-        for index, point in enumerate(self.settings.points[self._fired :] if forwards else (), self._fired):
+        points = self.settings.points[self._first :]
+        for index, point in enumerate(points[self._fired :] if forwards else (), self._fired):
             arrival = _arrival(move, point)
             if arrival is None:
                 break
@@ -138,8 +143,9 @@ class PulseMotor:
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
         stall_at: a move that would pass this count stops there at once (EMERGENCY), as when an interlock trips.
         switch_at: a move that would pass this count stops there at once (LIMIT), as by a limit switch.
+        fires_at_start: a train's start point itself gives a pulse.
 
-    Both may be changed while it stands, as by a person who clears the way.
+    Places may be changed while it stands, as by a person who clears the way.
     """
 
     def __init__(
@@ -151,9 +157,10 @@ class PulseMotor:
         lost: Set[int] = frozenset(),
         stall_at: int | None = None,
         switch_at: int | None = None,
+        fires_at_start: bool = True,
     ) -> None:
         self.stall_at, self.switch_at = stall_at, switch_at
-        self.trigger = TriggerOutput(lost)
+        self.trigger = TriggerOutput(lost, fires_at_start)
         self.limits: tuple[int, int] | None = None
         self.ended = Ended(0)
         self._clock, self._line = clock, line

@@ -210,18 +210,8 @@ class PiGcsStage:
 
     def arm(self, train: TriggerTrain) -> None:
         window = self._window(train)
-        sign = 1 if train.interval > 0 else -1
         self._axis.standing("arming")
-        counts = self._axis.counts()
-        self._travel.refuse_late_arming(train, counts)
-        if sign * (window.start - counts) <= 0:
-            here, begin = self._travel.degrees(counts), self._travel.degrees(window.start)
-            raise DeviceRefused(
-                self.name,
-                f"it stands at {here}, at or past {begin}, where pulses are let through",
-                advice=f"Move back by {self._travel.degrees(abs(train.interval))} at least, then arm",
-                state="Nothing has moved and this train is not armed",
-            )
+        self._travel.refuse_late_arming(train, self._axis.counts(), window.start)
         self._train = None
         self._axis.arm(window, self._active_high)
         self._train = train

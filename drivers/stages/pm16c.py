@@ -13,9 +13,10 @@ from pathlib import Path
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pm16c_channel import MAX_COUNT, MAX_SPEED, RATES, ChannelStatus, PM16CChannel, steepest_code
+from drivers.stages.pm16c_channel import MAX_COUNT, MAX_SPEED, ChannelStatus, PM16CChannel
 from drivers.stages.pm16c_home import HomeSearch
-from drivers.stages.pm16c_train import MODES, PulseWidths
+from drivers.stages.pm16c_rates import RATES, steepest_code
+from drivers.stages.pm16c_train import MODES, FirstPulse, PulseWidths, points_of
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel, check_figures
 
@@ -25,9 +26,17 @@ STOP_MARGIN = 2.0
 """s beyond the longest deceleration after which a stop has failed."""
 
 
-def limits_of(counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float) -> StageLimits:
+def limits_of(
+    counts_per_turn: int,
+    max_speed: float,
+    acceleration: float,
+    low: float,
+    high: float,
+    first_pulse: FirstPulse = FirstPulse.AT_START,
+) -> StageLimits:
     """What the controller makes of the figures configured for a stage (rad/s, rad/s², rad): its acceleration is the
-    steepest one that it has and that is not above `acceleration`.
+    steepest one that it has and that is not above `acceleration`. Where the first pulse comes an interval after the
+    start point, the stage must stand more than that before it.
 
     Raises:
         ValueError: a speed or a place that it does not have, or even its gentlest acceleration is above.
@@ -42,7 +51,8 @@ def limits_of(counts_per_turn: int, max_speed: float, acceleration: float, low: 
             f"{math.degrees(max_speed):g} deg/s are {fastest} pulses/s, the controller gives 1 to {MAX_SPEED}"
         )
     acceleration = 1e6 / RATES[steepest_code(acceleration / radians)] * radians
-    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True)
+    run_up = 1 if first_pulse is FirstPulse.INTERVAL_AFTER else 0
+    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True, run_up=run_up)
 
 
 class PM16CStage:
@@ -61,6 +71,7 @@ class PM16CStage:
         baudrate: as set on the controller's panel.
         pulse_width: s, one of the four that the output has; None takes for each train the widest that fits.
         active_high: must be True; the output has no other polarity.
+        first_pulse: where the firmware puts the first pulse; that it is the start point is from memory.
         home: angle of the home switch in radians; None where the stage has none: then a search is refused.
         home_speed: rad/s for the search; None is a tenth of `max_speed`.
         transcript: file to which every byte on the wire is appended; None keeps none.
@@ -85,6 +96,7 @@ class PM16CStage:
         baudrate: int = 9600,
         pulse_width: float | None = None,
         active_high: bool = True,
+        first_pulse: FirstPulse | str = FirstPulse.AT_START,
         home: float | None = None,
         home_speed: float | None = None,
         transcript: Path | None = None,
@@ -98,7 +110,8 @@ class PM16CStage:
                 name, "its trigger output cannot be inverted", expected="active_high", state="Nothing was sent"
             )
         try:
-            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high)
+            self._first_pulse = FirstPulse(first_pulse)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse)
             self._travel = Travel(name, limits)
             self._widths = PulseWidths(pulse_width)
             self._home = self._home_count(home)
@@ -191,11 +204,9 @@ class PM16CStage:
         if train.n < 1 or train.interval == 0 or width is None or not self._travel.has_room_for(train):
             apart = f"one or more, not closer than {2 * self._widths.narrowest:g} s at full speed"
             raise self._travel.cannot_emit(train, apart)
-        self._travel.refuse_late_arming(train, self._channel.standing("arming").counts)
-        sign = 1 if train.interval > 0 else -1
-        # Half an interval of room behind the last pulse: whether the end point itself fires then does not matter.
-        interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)
-        self._channel.arm(MODES[width], train.start, train.end + sign * (interval // 2), interval)
+        points, counts = points_of(train, self._first_pulse), self._channel.standing("arming").counts
+        self._travel.refuse_late_arming(train, counts, points.start)
+        self._channel.arm(MODES[width], points)
 
     def disarm(self) -> None:
         self._channel.disarm()
@@ -224,6 +235,7 @@ class PM16CStage:
             "trigger_output": "TP0",
             "pulse_width_s": self._widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
+            "first_pulse": self._first_pulse.value,
             "counts_per_turn": self.limits.counts_per_turn,
             "max_speed_rad_s": self.limits.max_speed,
             "acceleration_rad_s2": self.limits.acceleration,

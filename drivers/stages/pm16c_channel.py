@@ -12,46 +12,18 @@ from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
-from drivers.serial_line import Probe, SerialLine
+from drivers.stages.pm16c_line import PM16CLine
+from drivers.stages.pm16c_train import TriggerPoints
 
-PROBE = Probe("STQ?", r"[RL][0-4]")
-STOPPED_NOTE = r"STOP[0-9A-F]"
 COUNT = r"([+-]\d{7,10})"
-STATUS = r"([RL])[0-9A-F]([PNS])(?:[0-9A-F]([0-9A-F]{2})|---)" + COUNT
+STATUS_SINCE = (1, 47)
+"""Firmware."""
 MAX_SPEED = 5_000_000
 """pulses/s."""
 MAX_COUNT = 2_147_483_647
 """Of positions, trigger points and limits, either way."""
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
-E24 = (
-    1.0,
-    1.1,
-    1.2,
-    1.3,
-    1.5,
-    1.6,
-    1.8,
-    2.0,
-    2.2,
-    2.4,
-    2.7,
-    3.0,
-    3.3,
-    3.6,
-    3.9,
-    4.3,
-    4.7,
-    5.1,
-    5.6,
-    6.2,
-    6.8,
-    7.5,
-    8.2,
-    9.1,
-)
-RATES = sorted((m * 10.0**e for m in E24 for e in range(-2, 4) if 0.0155 < m * 10.0**e < 1005), reverse=True)
-"""RTE code -> ms per 1000 pulses/s: the preferred numbers of IEC 60063 from 1000 down to 0.016, codes 0 to 115."""
 
 
 @dataclass(frozen=True)
@@ -70,18 +42,6 @@ class ChannelStatus:
         return bool(STOPS & set(self.ending.split(", ")))
 
 
-def steepest_code(acceleration: float) -> int:
-    """The code of the steepest acceleration that is not above `acceleration` (pulses/s²).
-
-    Raises:
-        ValueError: even the gentlest is above it.
-    """
-    codes = [code for code, ms in enumerate(RATES) if 1e6 / ms <= acceleration * (1 + 1e-9)]
-    if not codes:
-        raise ValueError(f"{acceleration:g} pulses/s² is gentler than the controller's gentlest, {1e6 / RATES[0]:g}")
-    return codes[-1]
-
-
 class PM16CChannel:
     """Talks to the controller about one channel; it is put on position controller A, whose trigger output is TP0.
 
@@ -94,51 +54,47 @@ class PM16CChannel:
         self, url: str, *, channel: int, name: str, clock: Clock, timeout: float, baudrate: int, transcript: Path | None
     ) -> None:
         self._name, self._digit = name, f"{channel:X}"
-        self._commanded = False
         self.last_move = ""
         """The command of the last move or search, for errors."""
         self._restore_local = False
-        self._line = SerialLine(
-            url,
-            device=name,
-            probe=PROBE,
-            clock=clock,
-            timeout=timeout,
-            baudrate=baudrate,
-            unsolicited=STOPPED_NOTE,
-            transcript=transcript,
-        )
+        self._line = PM16CLine(url, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript)
 
     def open(self, rate_code: int) -> str:
         """Go to REMOTE, take position controller A without a train, set the acceleration; the firmware's version."""
         c = self._digit
         self._line.send("")  # an empty line ends what another program may have left half said
-        version = self._ask("VER?", r".*PM16C-04X.*", "the version of a PM16C-04XD(L)")[0]
+        version = self._line.ask("VER?", r".*PM16C-04X.*", "the version of a PM16C-04XD(L)")[0]
+        self._refuse_old(version)
         if not self.status().remote:
             self._line.send("REM")
             self._restore_local = True
+            self._line.until(self.status, lambda status: status.remote)
         self.standing("opening")
         self._line.send("ERRC")
-        if not self._ask("SETCH?", r"[0-9A-F]{4}", "four channels")[0].startswith(c):
-            self._line.send(f"SETCH{c}---")
-            self._ask("SETCH?", rf"{c}[0-9A-F]{{3}}", f"channel {c} on position controller A")
-        self._make_ready(f"TMGC{c}", "NO")  # of whoever was here before and died
-        self._set(f"RTE{c}{rate_code:03d}", f"RTE?{c}", rate_code)
+        if not self._channels().startswith(c):
+            self._line.send(command := f"SETCH{c}---")
+            channels = self._line.until(self._channels, lambda channels: channels.startswith(c))
+            if not channels.startswith(c):
+                raise self._line.not_followed(command, channels, f"channel {c} on position controller A")
+        self._line.make_ready(f"TMGC{c}", f"TMGR?{c}", "NO")  # of whoever was here before and died
+        self._line.set(f"RTE{c}{rate_code:03d}", f"RTE?{c}", rate_code)
         return version
 
     def own_limits(self) -> tuple[int, int] | None:
-        """The controller's own soft limits (backward, forward) in counts; None where they are switched off."""
+        """The controller's own soft limits (backward, forward) in counts; None where they are switched off, which the
+        first of the switch bits says [from memory]."""
         c = self._digit
-        if self._ask(f"SETLS?{c}", r"[01]{8}", "eight limit-switch bits")[0][0] == "0":
+        if self._line.ask(f"SETLS?{c}", r"[01]{8}", "eight limit-switch bits")[0][0] == "0":
             return None
-        backward, forward = (self._ask(f"{side}L?{c}", COUNT, "a signed position")[1] for side in "BF")
+        backward, forward = (self._line.ask(f"{side}L?{c}", COUNT, "a signed position")[1] for side in "BF")
         return int(backward), int(forward)
 
     def counts(self) -> int:
-        return int(self._ask(f"PS?{self._digit}", COUNT, "a signed position in pulses")[1])
+        return int(self._line.ask(f"PS?{self._digit}", COUNT, "a signed position in pulses")[1])
 
     def status(self) -> ChannelStatus:
-        match = self._ask(f"STS{self._digit}?", STATUS, "remote flag, channel, motion, status bits and position")
+        form = rf"([RL]){self._digit}([PNS])(?:[0-9A-F]([0-9A-F]{{2}})|---){COUNT}"
+        match = self._line.ask(f"STS{self._digit}?", form, "remote flag, channel, motion, status bits and position")
         bits = int(match[3] or "0", 16)
         ending = ", ".join(text for bit, text in ENDINGS.items() if bits & bit)
         return ChannelStatus(match[1] == "R", match[2] != "S" or bool(bits & 1), ending, int(match[4]), match[0])
@@ -173,7 +129,7 @@ class PM16CChannel:
     def find_home(self, speed: int) -> None:
         """Begin the search for the home switch at `speed` pulses/s; it leaves the trigger output cleared."""
         self.standing("a home search")
-        self._make_ready(f"TMGC{self._digit}", "NO")
+        self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
         self._take_speed(speed)
         self._begin(f"FDHP{self._digit}", None)
 
@@ -183,27 +139,27 @@ class PM16CChannel:
 
     def home(self) -> int | None:
         """Where the home switch was found, in counts; None where no search has found it."""
-        reply = self._ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
+        reply = self._line.ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
         return None if reply[1] is None else int(reply[1])
 
     def preset(self, counts: int) -> None:
         """Call the place where it stands `counts`."""
         self.standing("a preset")
-        self._set(f"PS{self._digit}{counts:+d}", f"PS?{self._digit}", counts)
+        self._line.set(f"PS{self._digit}{counts:+d}", f"PS?{self._digit}", counts)
 
-    def arm(self, mode: int, start: int, end: int, interval: int) -> None:
-        """Set up the trigger output (counts) and make it ready."""
+    def arm(self, mode: int, points: TriggerPoints) -> None:
+        """Set up the trigger output and make it ready."""
         c = self._digit
-        self._line.send(f"TMGC{c}")
-        self._set(f"TMGM{c}{mode}", f"TMGM?{c}", mode)
-        self._set(f"TMGS{c}{start:+d}", f"TMGS?{c}", start)
-        self._set(f"TMGE{c}{end:+d}", f"TMGE?{c}", end)
-        self._set(f"TMGI{c}{interval}", f"TMGI?{c}", interval)
-        self._make_ready(f"TMGR{c}", "YES")
+        self._line.make_ready(f"TMGC{c}", f"TMGR?{c}", "NO")
+        self._line.set(f"TMGM{c}{mode}", f"TMGM?{c}", mode)
+        self._line.set(f"TMGS{c}{points.start:+d}", f"TMGS?{c}", points.start)
+        self._line.set(f"TMGE{c}{points.end:+d}", f"TMGE?{c}", points.end)
+        self._line.set(f"TMGI{c}{points.interval}", f"TMGI?{c}", points.interval)
+        self._line.make_ready(f"TMGR{c}", f"TMGR?{c}", "YES")
 
     def disarm(self) -> None:
         self.standing("disarming")
-        self._make_ready(f"TMGC{self._digit}", "NO")
+        self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
 
     def slow_stop(self) -> str:
         """Send the stop command; what was sent. It waits for nothing."""
@@ -223,59 +179,44 @@ class PM16CChannel:
         finally:
             self._line.close()
 
+    def _channels(self) -> str:
+        """On position controllers A to D."""
+        return self._line.ask("SETCH?", r"[0-9A-F]{4}", "four channels")[0]
+
+    def _refuse_old(self, version: str) -> None:
+        number = re.match(r"(\d+)\.(\d+) ", version)
+        if number is not None and (int(number[1]), int(number[2])) < STATUS_SINCE:
+            raise DeviceRefused(
+                self._name,
+                f"its firmware {number[1]}.{number[2]} does not tell the status of one channel (STSx?)",
+                request="VER?",
+                reply=version,
+                expected="{}.{} or later".format(*STATUS_SINCE),
+                advice="Have the firmware updated by the vendor",
+                state="Nothing has moved",
+            )
+
     def _take_speed(self, speed: int) -> None:
         c = self._digit
-        self._set(f"SPDH{c}{speed}", f"SPDH?{c}", speed)
-        self._line.send(f"SPDH{c}")
-        self._ask(f"SPD?{c}", "HSPD", "HSPD, the speed just selected")
+        self._line.set(f"SPDH{c}{speed}", f"SPDH?{c}", speed)
+        self._line.make_sure(f"SPDH{c}", f"SPD?{c}", "[HML]SPD", "HSPD", str)
 
     def _begin(self, command: str, target: int | None) -> None:
         """Send a command that moves and see that it does, or that it is at its target (None: no target) already."""
-        self._commanded, self.last_move = True, command
+        self._line.commanded, self.last_move = True, command
         self._line.send(command)
-        status = self.status()
-        there = self.home() == status.counts if target is None else status.counts == target
-        if not status.moving and not there:
+
+        def begun(status: ChannelStatus) -> bool:
+            return status.moving or status.counts == (self.home() if target is None else target)
+
+        status = self._line.until(self.status, begun)
+        if not begun(status):
             raise DeviceError(
                 self._name,
-                f"the move did not start ({status.ending or self._complaint()})",
+                f"the move did not start ({status.ending or self._line.complaint()})",
                 request=command,
                 reply=status.raw,
                 expected="a moving motor",
                 advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
                 state=f"The stage stands at {status.counts} counts",
             )
-
-    def _make_ready(self, command: str, wanted: str) -> None:
-        self._line.send(command)
-        reply = self._ask(f"TMGR?{self._digit}", "YES|NO", "YES or NO")[0]
-        if reply != wanted:
-            raise self._not_followed(command, reply, wanted)
-
-    def _set(self, command: str, query: str, value: int) -> None:
-        """Send a setting and read it back."""
-        self._line.send(command)
-        reply = self._ask(query, r"[+-]?\d+", f"{value}, as just set")[0]
-        if int(reply) != value:
-            raise self._not_followed(command, reply, str(value))
-
-    def _not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
-        return DeviceError(
-            self._name,
-            f"a setting was not taken ({self._complaint()})",
-            request=command,
-            reply=reply,
-            expected=wanted,
-            advice="Check that no other program or person drives this controller",
-            state="Nothing has moved",
-        )
-
-    def _complaint(self) -> str:
-        """The controller's own error text, then cleared."""
-        text = self._ask("ERR?", r".*", "an error text")[0]
-        self._line.send("ERRC")
-        return f"the controller says {text}"
-
-    def _ask(self, request: str, form: str, meaning: str) -> re.Match[str]:
-        state = "A move was started before; the stage may be turning" if self._commanded else "Nothing has moved"
-        return self._line.query(request, form, meaning, state)

@@ -1,9 +1,10 @@
-"""The PM16C's trigger output: which of its pulse widths fits a train."""
+"""The PM16C's trigger output: which of its pulse widths fits a train, and the points that it is set to."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 from drivers.protocols import TriggerTrain
 
@@ -22,14 +23,14 @@ class PulseWidths:
     chosen: float | None = None
 
     def __post_init__(self) -> None:
-        if self.chosen is not None and self.chosen not in MODES:
+        if self.chosen is not None and not self.allowed:
             raise ValueError(
                 f"the trigger output has no pulses of {self.chosen:g} s; it has {', '.join(f'{w:g}' for w in MODES)} s"
             )
 
     @property
     def allowed(self) -> list[float]:
-        return list(MODES) if self.chosen is None else [self.chosen]
+        return [width for width in MODES if self.chosen is None or math.isclose(width, self.chosen)]
 
     @property
     def narrowest(self) -> float:
@@ -43,3 +44,33 @@ class PulseWidths:
         """
         pitch = math.inf if train.n == 1 else abs(train.interval) / fastest
         return next((width for width in self.allowed if 2 * width <= pitch), None)
+
+
+class FirstPulse(StrEnum):
+    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
+
+    AT_START = "at_start"
+    """The start point itself fires."""
+    INTERVAL_AFTER = "interval_after"
+    """The first pulse comes one interval behind the start point: the stage must stand before that."""
+
+
+@dataclass(frozen=True)
+class TriggerPoints:
+    """In counts, as TMGS, TMGE and TMGI take them."""
+
+    start: int
+    end: int
+    interval: int
+
+
+def points_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerPoints:
+    """The points for a train of at least one pulse and an interval that is not 0.
+
+    The end point lies half an interval behind the last pulse, so that it does not matter whether it fires itself. At an
+    interval of one count there is no room for that: there it is the last pulse.
+    """
+    sign = 1 if train.interval > 0 else -1
+    interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)
+    lead = interval if first_pulse is FirstPulse.INTERVAL_AFTER else 0
+    return TriggerPoints(train.start - sign * lead, train.end + sign * (interval // 2), interval)

@@ -94,13 +94,22 @@ class Travel:
             state="Nothing has moved and nothing was sent",
         )
 
-    def refuse_late_arming(self, train: TriggerTrain, counts: int) -> None:
-        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`."""
+    def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
+        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`, or that has passed
+        the count before that from which on pulses are let through."""
         if train.interval * (train.start - counts) <= 0:
             raise DeviceRefused(
                 self.name,
                 f"it stands at {self.degrees(counts)}, at or past the first pulse at {self.degrees(train.start)}",
                 advice="Move to before the first pulse, then arm",
+                state="Nothing has moved and this train is not armed",
+            )
+        if opening is not None and train.interval * (opening - counts) <= 0:
+            here, begin = self.degrees(counts), self.degrees(opening)
+            raise DeviceRefused(
+                self.name,
+                f"it stands at {here}, at or past {begin}, where pulses are let through",
+                advice=f"Move back by {self.degrees(abs(train.interval))} at least, then arm",
                 state="Nothing has moved and this train is not armed",
             )
 

@@ -55,6 +55,8 @@ class PiGcsController:
             build = replace(build, counts_per_turn=counts_per_turn)
         if referenced is not None:
             build = replace(build, referenced=referenced)
+        if build.counts_per_turn < 1:
+            raise ValueError(f"a turn cannot have {build.counts_per_turn} counts")
         self.clock = clock
         self.replies = 0
         outputs = {number: Output(axis=axis) for number in range(1, OUTPUTS + 1)}

@@ -50,7 +50,7 @@ def _set_mode(box: PM16CBox, c: str, digit: str) -> None:
 
 
 QUERIES: tuple[tuple[str, Query], ...] = (
-    (r"VER\?", lambda box: VERSION),
+    (r"VER\?", lambda box: box.version),
     (r"VERH\?", lambda box: "HD-VER2"),
     (r"SETCH\?", lambda box: box.mapped),
     (rf"PS\?{_C}", lambda box, c: f"{box.channels[c].motor.position():+08d}"),
@@ -117,6 +117,8 @@ class PM16CController:
         lost: trigger pulses (from 0, since power-on) that never reach the line.
         stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
             interlock or a limit switch.
+        version: what it says of its firmware.
+        fires_at_start: a train's start point itself gives a pulse [from memory: it does].
         silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
     """
 
@@ -131,6 +133,8 @@ class PM16CController:
         lost: Set[int] = frozenset(),
         stall_at: int | None = None,
         switch_at: int | None = None,
+        version: str = VERSION,
+        fires_at_start: bool = True,
         silent: Set[int] = frozenset(),
         garbled: Set[int] = frozenset(),
     ) -> None:
@@ -147,6 +151,8 @@ class PM16CController:
             stall_at=stall_at,
             switch_at=switch_at,
             home_at=home_at,
+            version=version,
+            fires_at_start=fires_at_start,
         )
         self._silent, self._garbled = silent, garbled
         self._in, self._out = bytearray(), bytearray()

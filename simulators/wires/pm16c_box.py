@@ -91,7 +91,8 @@ class PM16CBox:
         channel: the motor that turns the sample; the others turn nothing.
         line: what the TP0 connector, the output of position controller A, is wired to.
         home_at: where its home switch is, in pulses since power-on; None plugs none in.
-        lost, stall_at, switch_at: faults of the sample's motor, see `PulseMotor`.
+        lost, stall_at, switch_at, fires_at_start: of the sample's motor, see `PulseMotor`.
+        version: what it says of its firmware.
     """
 
     def __init__(
@@ -105,8 +106,10 @@ class PM16CBox:
         stall_at: int | None,
         switch_at: int | None,
         home_at: int | None,
+        version: str,
+        fires_at_start: bool,
     ) -> None:
-        self.clock = clock
+        self.clock, self.version = clock, version
         self.remote = False
         self.errors = Error(0)
         self.mapped = "0123"
@@ -119,7 +122,13 @@ class PM16CBox:
             return line if self.mapped[0] == sample else None
 
         self.sample = PulseMotor(
-            clock, tp0, counts_per_turn=counts_per_turn, lost=lost, stall_at=stall_at, switch_at=switch_at
+            clock,
+            tp0,
+            counts_per_turn=counts_per_turn,
+            lost=lost,
+            stall_at=stall_at,
+            switch_at=switch_at,
+            fires_at_start=fires_at_start,
         )
         self.channels[sample] = Channel(self.sample, home_at)
 

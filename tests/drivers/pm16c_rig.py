@@ -15,8 +15,8 @@ from tests.drivers.stage_conformance import StageBench
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())
 COUNTS = 90_000
-QUERIES_TO_OPEN = 8
-"""VER? STS? STS? SETCH? SETCH? TMGR? RTE? SETLS?: the faults below count queries from power-on."""
+QUERIES_TO_OPEN = 9
+"""VER? STS? STS? STS? SETCH? SETCH? TMGR? RTE? SETLS?: the faults below count queries from power-on."""
 
 
 class Rig:

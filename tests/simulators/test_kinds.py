@@ -94,6 +94,10 @@ def test_options_are_read_by_their_type(everything: None) -> None:
         ("everything?a", "bad query field"),
         ("everything?a=-1", "cannot be made.*a is negative"),
         ("pm16c?channel=16", "cannot be made|no channel"),
+        ("pm16c?counts_per_turn=0", "cannot be made"),
+        ("pi_gcs?counts_per_turn=0", "cannot be made"),
+        ("zaber?counts_per_turn=0", "cannot be made"),
+        ("zaber?firmware=new", "cannot be made"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_and_named(everything: None, name: str, problem: str) -> None:

@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
 from drivers.stages.pm16c import limits_of
-from drivers.stages.pm16c_channel import RATES, steepest_code
+from drivers.stages.pm16c_rates import RATES, steepest_code
 from tests.drivers.pm16c_rig import COUNTS, Rig
 from tests.drivers.stage_conformance import LONG, SPEED, Build, StageConformance
 
