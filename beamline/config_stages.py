@@ -52,6 +52,8 @@ class PM16CStageConfig(_Stage):
     kind: Literal["pm16c"]
     channel: Annotated[int, Field(ge=0, le=15)] = 0
     baudrate: PositiveInt = 9600
+    first_pulse: Literal["at_start", "interval_after"] = "at_start"
+    """Where the firmware puts a train's first pulse: at its start point (from memory), or an interval behind it."""
     home_deg: FiniteFloat | None = None
     """Where its home switch is; null: it has none, and no search is made."""
     home_speed_deg_s: PositiveFloat | None = None

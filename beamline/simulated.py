@@ -72,7 +72,11 @@ def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, C
         case PM16CStageConfig():
             from simulators.wires.pm16c import PM16CController
 
-            return PM16CController(clock, line, channel=config.channel, counts_per_turn=counts), lambda number: False
+            at_start = config.first_pulse == "at_start"
+            pm16c = PM16CController(
+                clock, line, channel=config.channel, counts_per_turn=counts, fires_at_start=at_start
+            )
+            return pm16c, lambda number: False
         case PiGcsStageConfig():
             from simulators.wires.pi_gcs import PiGcsController
             from simulators.wires.pi_gcs_axis import Build

@@ -52,7 +52,15 @@ def make_stage(config: StageConfig, url: str, clock: Clock) -> RotationStage:
             from drivers.stages.pm16c import PM16CStage
 
             home, speed = (None if v is None else math.radians(v) for v in (config.home_deg, config.home_speed_deg_s))
-            return PM16CStage(url, channel=config.channel, home=home, home_speed=speed, **wiring, **figures)
+            return PM16CStage(
+                url,
+                channel=config.channel,
+                first_pulse=config.first_pulse,
+                home=home,
+                home_speed=speed,
+                **wiring,
+                **figures,
+            )
         case PiGcsStageConfig():
             from drivers.stages.pi_gcs import PiGcsStage
 
@@ -101,11 +109,10 @@ def stage_limits(config: StageConfig) -> StageLimits:
     figures = _figures(config)
     match config:
         case PM16CStageConfig():
-            from drivers.stages import pm16c
-            from drivers.stages.pm16c_train import PulseWidths
+            from drivers.stages import pm16c, pm16c_train
 
-            PulseWidths(config.pulse_width_s)
-            return pm16c.limits_of(**figures)
+            pm16c_train.PulseWidths(config.pulse_width_s)
+            return pm16c.limits_of(**figures, first_pulse=pm16c_train.FirstPulse(config.first_pulse))
         case PiGcsStageConfig():
             from drivers.stages import pi_gcs
             from drivers.stages.pi_gcs_train import FirstPulse

@@ -99,7 +99,8 @@ def test_every_alternative_in_a_template_is_one(name: str) -> None:
     for key, flow in offered:
         tree = yaml.safe_load(text)
         mine = yaml.safe_load(flow)
-        old = {"stage": ("channel", "home_deg", "home_speed_deg_s")}.get(key, tuple(tree["devices"][key]))
+        of_the_pm16c = ("channel", "first_pulse", "home_deg", "home_speed_deg_s")
+        old = {"stage": of_the_pm16c}.get(key, tuple(tree["devices"][key]))
         tree["devices"][key] = {k: v for k, v in tree["devices"][key].items() if k not in old} | mine
         if mine["kind"] == "stage_output":  # which the PM16C has not
             stage = yaml.safe_load(next(flow for _, flow in offered if "zaber" in flow))

@@ -78,6 +78,7 @@ COMMON = "counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60,
 STAGES = {
     "pm16c": f"{{kind: pm16c, port: 'sim://pm16c', channel: 3, {COMMON}}}",
     "pm16c, 10 us": f"{{kind: pm16c, port: 'sim://pm16c', pulse_width_s: 1.0e-5, {COMMON}}}",
+    "pm16c, an interval after": f"{{kind: pm16c, port: 'sim://pm16c', first_pulse: interval_after, {COMMON}}}",
     "pi_gcs": f"{{kind: pi_gcs, port: 'sim://pi_gcs', axis: A, trigger_line: 2, {COMMON}}}",
     "pi_gcs, a step after": f"{{kind: pi_gcs, port: 'sim://pi_gcs', first_pulse: step_after, {COMMON}}}",
     "zaber": f"{{kind: zaber, port: 'sim://zaber', device: 2, output: 3, {COMMON}}}",
