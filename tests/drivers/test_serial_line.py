@@ -130,6 +130,29 @@ def test_the_timeout_is_for_the_whole_reply_however_it_trickles() -> None:
     assert echo.clock.now() == pytest.approx(1.0, abs=0.1)
 
 
+def test_a_reply_that_is_whole_at_the_very_deadline_is_taken_or_not_but_never_taken_for_another() -> None:
+    """To the last millisecond it is the reply; beyond, a late one. From the deadline itself either is right."""
+    for late in (-0.06, -0.002, -0.001, 0.0, 0.001, 0.002, 0.06):
+        echo = Echo({0: [(0.0, b"1"), (0.5, b"1"), (1.0 + late, b"1\r\n")]})
+        line = connect(echo, timeout=1.0)
+        try:
+            assert ask(line, 111) == 111
+            assert late < 0.06
+        except DeviceTimeout:
+            assert late >= 0.0
+        assert [ask(line, n) for n in (222, 333)] == [222, 333]
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.049, 0.051, 0.1])
+def test_a_reply_byte_by_byte_is_whole_however_slowly_they_come(gap: float) -> None:
+    whole = b"-123456\r\n"
+    echo = Echo({0: [(gap * k, whole[k : k + 1]) for k in range(len(whole))]})
+    line = connect(echo, timeout=1.5)
+    assert ask(line, 0) == -123456
+    assert echo.clock.now() == pytest.approx(gap * (len(whole) - 1), abs=0.06)
+    assert ask(line, 7) == 7
+
+
 def test_a_late_reply_is_not_taken_for_the_next_ones() -> None:
     line = connect(Echo({0: [(1.3, b"111\r\n")]}))
     with pytest.raises(DeviceTimeout):

@@ -7,6 +7,7 @@ import math
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import pytest
@@ -15,11 +16,13 @@ from drivers.errors import DeviceError, DeviceRefused
 from drivers.motion import start_move_by
 from drivers.protocols import TriggerTrain
 from simulators.serial_url import register
+from simulators.transports import serve_pty
 from tests.drivers.stages.rigs import RIGS, AnyRig, every_stage
 
 SPEED = math.radians(10)
 SOON = 60.0
 NAMES = (f"every-stage-test-{number}" for number in itertools.count())
+needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
 RigOf = Callable[..., AnyRig]
 
 
@@ -132,6 +135,23 @@ def test_another_makers_controller_is_an_error_in_time_and_turns_nothing(rig_of:
     assert theirs.line.angle_at(theirs.clock.now()) == 0.0
     assert theirs.line.next_after(-math.inf) is None
     theirs.open().close()
+
+
+@pytest.mark.parametrize("serve", [None, pytest.param(serve_pty, marks=needs_pty)], ids=["sim", "pty"])
+@every_stage
+def test_a_second_driver_does_not_get_the_port_and_does_not_disturb_the_first(
+    rig_of: RigOf, serve: Callable[[Any], AbstractContextManager[str]] | None
+) -> None:
+    rig = rig_of()
+    with nullcontext(rig.url) if serve is None else serve(rig) as rig.url:
+        bench = rig.bench()
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+        with pytest.raises(DeviceError, match=r"does not open.*Nothing was sent"):
+            rig.open()
+        bench.go(10.0)
+        assert len(bench.pulses()) == 3
+        bench.stage.close()
+        rig.open().close()
 
 
 # a stop from another thread
