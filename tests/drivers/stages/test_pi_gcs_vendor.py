@@ -54,8 +54,13 @@ def bench() -> Iterator[Bench]:
     clock = SystemClock()
     line = TriggerLine(clock)
     box = controller(clock, line, referenced=False, found_at=1.0)
-    with serve_pty(box) as url, PISerial(port=url, baudrate=115200) as gateway:
-        yield Bench(GCSCommands(GCSMessages(gateway)), clock, line)
+    # Left without its context, that library's device is called again when the next one connects.
+    with (
+        serve_pty(box) as url,
+        PISerial(port=url, baudrate=115200) as gateway,
+        GCSCommands(GCSMessages(gateway)) as device,
+    ):
+        yield Bench(device, clock, line)
 
 
 def test_it_knows_the_controller_and_its_axis(bench: Bench) -> None:
