@@ -38,7 +38,7 @@ def simulated_devices(
         opened: takes what closes them.
 
     Raises:
-        ConfigError: the scene is wrong.
+        ConfigError: the scene is wrong, or the simulated controller has no such output.
     """
     from simulators.camera import SimulatedOrcaQuest
     from simulators.serial_url import register
@@ -48,7 +48,14 @@ def simulated_devices(
     scene = scene_of(config)
     line = TriggerLine(clock)
     settings, wanted = config.devices.stage, config.devices.shutter
-    wire, high = _wire(settings, clock, line)
+    try:
+        wire, high = _wire(settings, clock, line)
+    except LookupError as error:
+        key = "output" if isinstance(settings, ZaberStageConfig) else "trigger_line"
+        raise ConfigError(
+            f"devices.stage.{key}: the simulated {settings.kind} controller has no such digital output; set 1 for a "
+            "simulation. Nothing was started."
+        ) from error
     # A name of its own for every bench: two in one process must not share a controller.
     stage = make_stage(settings, register(f"{settings.kind}-{uuid4().hex}", wire), clock)
     opened.callback(stage.close)

@@ -112,6 +112,14 @@ def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
     assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
 
 
+@pytest.mark.parametrize("output", ["kind: pi_gcs, trigger_line", "kind: zaber, output"])
+def test_an_output_that_a_simulated_controller_lacks_is_refused_in_words(output: str) -> None:
+    kind, key = output.removeprefix("kind: ").split(", ")
+    settings = small(f"devices.stage={{{output}: 9, port: 'sim://{kind}', {COMMON}}}")
+    with pytest.raises(ConfigError, match=rf"{key}: the simulated {kind} controller has no such digital output"):
+        devices.connect(settings)
+
+
 @pytest.mark.parametrize("stage", ["pi_gcs", "zaber, falling"])
 def test_a_simulated_camera_that_takes_the_other_edge_is_refused_with_the_one_it_needs(stage: str) -> None:
     """It would expose at every pulse's end; a real cable may have an inverter, so a real camera may."""
