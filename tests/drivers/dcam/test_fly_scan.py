@@ -147,6 +147,32 @@ def test_three_thousand_views_are_three_thousand_pulses_frames_and_rows(world, t
     assert scanned.cpu_seconds < 20  # the clock on the wall also counts what else the machine does
 
 
+def test_the_camera_captures_before_the_stage_is_armed_and_until_it_is_disarmed(
+    world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pulse that comes before the camera is ready is lost without a word."""
+    capturing: dict[str, list[bool]] = {}
+
+    with FlyRig(world) as rig:
+
+        def spied(call: str) -> None:
+            real = getattr(rig.stage, call)
+
+            def spy(*arguments: object) -> object:
+                running = world.calls("dcamcap_start") - world.calls("dcamcap_stop")
+                capturing.setdefault(call, []).append(running == 1)
+                return real(*arguments)
+
+            monkeypatch.setattr(rig.stage, call, spy)
+
+        for call in ("arm", "disarm"):
+            spied(call)
+        passes = "scan.angles={scheme: interlaced, views: 24, passes: 3, start_deg: 60, span_deg: 24}"
+        assert Scanned(rig, small(24, "scan.period_s=0.2", passes), tmp_path).error is None
+    assert capturing["arm"] == [True] * 3
+    assert capturing["disarm"][:3] == [True] * 3
+
+
 @pytest.mark.parametrize(
     ("break_it", "missing"),
     [
