@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 
 import pytest
 import serial
@@ -96,8 +97,16 @@ def test_notes_that_nobody_asked_for_are_passed_over() -> None:
     assert ask(line, 1) == 1
 
 
+class Crossing(Echo):
+    """Lets another thread go on between a request and its reply."""
+
+    def receive(self, data: bytes) -> None:
+        super().receive(data)
+        time.sleep(0)
+
+
 def test_threads_do_not_take_each_others_replies() -> None:
-    line = connect(Echo())
+    line = connect(Crossing())
     wrong: list[int] = []
 
     def many(first: int) -> None:
