@@ -212,7 +212,7 @@ def test_a_whole_fit_of_published_length(steps: int, side: int) -> None:
     g = _model(N, side)
     views = Geometry.parallel(np.linspace(0, math.pi, 50, endpoint=False), (side, side))
     data = project(g, views).numpy() * np.random.default_rng(2).normal(1, 0.02, (50, side, side)).astype(np.float32)
-    settings = fit.FitSettings(views_per_step=1, pace=1.0, policy=DensityPolicy(growth=1.0))
+    settings = fit.FitSettings(views_per_step=1, pace=1.0, tv_size=32, policy=DensityPolicy(growth=1.0))
     warm_up()
     problem = fit.problem_of(data, views, Grid.matching(views), g.density_unit, settings)
     start = replace(g, means=g.means + 0.3 * torch.randn(g.means.shape, generator=torch.Generator().manual_seed(0)))
