@@ -91,7 +91,7 @@ class Travel:
             self.name,
             f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",
             expected=f"{expected}, all within {self.span}",
-            state="Nothing has moved and nothing was sent",
+            state="This train is not armed and nothing was sent for it; the stage stands where the last move left it",
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:

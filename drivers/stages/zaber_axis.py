@@ -32,7 +32,8 @@ REPEATS = 3
 """Times that a command is sent again where the device says AGAIN."""
 PAUSE = 0.05
 """s before that."""
-TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d+", r"-?\d+(?:\.\d+)?"
+TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
+"""A number with more digits is no position that an axis can have, and none that a float holds."""
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 """Settings of the axis that survive a power cycle: as they were found they are left."""
 

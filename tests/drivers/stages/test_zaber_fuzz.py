@@ -27,7 +27,7 @@ WITHIN = 60.0
 """s; far more than all queries of a call can take, each of which ends by its timeout."""
 HEAD, SEAL = b"@ID", b"~"
 """Stand for device, axis and id of the reply that is waited for, and for the checksum of what is before it."""
-NUMBERS = ("0", "1", "360000", "-100000", "7.38", "9" * 12)
+NUMBERS = ("0", "1", "360000", "-100000", "7.38", "9" * 12, "9" * 400)
 DATA = (*NUMBERS, "BADDATA", "AGAIN", "2 WR FS", "01 NI", "d d d d d d", "e 5 d d d d")
 SAMPLES = [
     b" ".join((HEAD, answer, data.encode())) + SEAL + b"\r\n"
