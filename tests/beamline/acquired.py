@@ -1,0 +1,66 @@
+"""A scan by the fake instrument run to its end, and what must be true of its frames and of what it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from beamline.acquire import Acquisition
+from beamline.plan import Timeline
+from beamline.stop import StopRequest
+from drivers.frame import Frame, FrameKind
+from drivers.protocols import CameraSettings, TriggerSource
+from tests.beamline.fakes import COUNT, HOME, Instrument, seen
+
+SETTLE = 0.05
+
+
+class Run:
+    """A scan run to its end, whatever that is."""
+
+    def __init__(self, bench: Instrument, timeline: Timeline, stop: StopRequest | None = None) -> None:
+        self.events: list[tuple[str, Mapping[str, Any]]] = []
+        self.frames: list[Frame] = []
+        self.error: BaseException | None = None
+        self.scan = Acquisition(
+            bench.devices,
+            timeline,
+            CameraSettings(1.0, TriggerSource.INTERNAL),
+            SETTLE,
+            bench.clock,
+            stop or StopRequest(),
+            lambda event, data: self.events.append((event, data)),
+        )
+        try:
+            self.frames.extend(self.scan.frames())
+        except BaseException as error:
+            self.error = error
+
+    def of(self, kind: FrameKind) -> list[Frame]:
+        return [frame for frame in self.frames if frame.kind is kind]
+
+    @property
+    def views(self) -> list[int]:
+        return [frame.trigger for frame in self.of(FrameKind.PROJECTION)]
+
+
+def assert_true_angles(run: Run) -> None:
+    """Against what the fake camera wrote into the pixels at the moment of the trigger."""
+    for frame in run.frames:
+        count, is_open, is_in, _ = seen(frame)
+        assert is_open is (frame.kind is not FrameKind.DARK)
+        assert is_in is (frame.kind is not FrameKind.FLAT)
+        if frame.kind is not FrameKind.INVALID:
+            assert frame.angle == pytest.approx(count * COUNT, abs=COUNT / 2)
+
+
+def assert_safe(bench: Instrument, home: bool = True) -> None:
+    assert not bench.is_open
+    assert not bench.camera.armed
+    assert not bench.stage.moving()
+    assert (bench.stage.train, bench.stage.pulses) == (None, [])  # disarmed
+    if home:
+        assert bench.stage.position() == pytest.approx(HOME * COUNT)
+        assert bench.is_in
