@@ -21,13 +21,10 @@ from drivers.stages.pi_gcs_digital import GcsOutput
 from drivers.stages.pi_gcs_errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs_line import GcsLine
 from drivers.stages.pi_gcs_train import FirstPulse, TriggerWindow, is_spent_by, window_of
+from drivers.stages.standing import POLL, longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel, check_figures
 
-POLL = 0.02
-"""s between looks at a moving stage."""
-STOP_MARGIN = 2.0
-"""s beyond the longest deceleration after which a stop has failed."""
 SLOWEST = 1e-6
 """degrees/s that can still be written."""
 
@@ -227,7 +224,7 @@ class PiGcsStage:
     def stop(self) -> None:
         self._stops.came(hard=False)
         command = self._axis.brake()
-        longest = self.limits.max_speed / self.limits.acceleration + STOP_MARGIN
+        longest = longest_stop(self.limits)
         if self._until_standing(longest):
             raise self._travel.not_stopped(longest, self._axis.counts(), command)
 
@@ -245,11 +242,7 @@ class PiGcsStage:
             "trigger_polarity": "active high" if self._active_high else "active low",
             "first_pulse": self._first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
-            "counts_per_turn": self.limits.counts_per_turn,
-            "max_speed_rad_s": self.limits.max_speed,
-            "acceleration_rad_s2": self.limits.acceleration,
-            "low_rad": self.limits.low,
-            "high_rad": self.limits.high,
+            **self._travel.described(),
         }
 
     def digital_output(self, number: int) -> GcsOutput:
@@ -292,10 +285,7 @@ class PiGcsStage:
 
     def _until_standing(self, timeout: float) -> bool:
         """Whether it still moves when the time is over."""
-        deadline = self._clock.now() + timeout
-        while (moving := self.moving()) and (left := deadline - self._clock.now()) > 0:
-            self._clock.sleep(min(POLL, left))
-        return moving
+        return until_standing(self._clock, self.moving, bool, timeout)
 
     def _until_settled(self, target: int) -> None:
         """Let the servo bring it on target, where it is near it."""

@@ -17,13 +17,9 @@ from drivers.stages.pm16c_channel import MAX_COUNT, MAX_SPEED, ChannelStatus, PM
 from drivers.stages.pm16c_home import HomeSearch
 from drivers.stages.pm16c_rates import RATES, steepest_code
 from drivers.stages.pm16c_train import MODES, FirstPulse, PulseWidths, points_of
+from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel, check_figures
-
-POLL = 0.02
-"""s between looks at a moving stage."""
-STOP_MARGIN = 2.0
-"""s beyond the longest deceleration after which a stop has failed."""
 
 
 def limits_of(
@@ -217,7 +213,7 @@ class PM16CStage:
     def stop(self) -> None:
         self._stops.came(hard=False)
         command = self._send_stop(hard=False)
-        longest = self.limits.max_speed / self.limits.acceleration + STOP_MARGIN
+        longest = longest_stop(self.limits)
         status = self._until_standing(longest)
         if status.moving:
             raise self._travel.not_stopped(longest, status.counts, command, status.raw)
@@ -236,11 +232,7 @@ class PM16CStage:
             "pulse_width_s": self._widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._first_pulse.value,
-            "counts_per_turn": self.limits.counts_per_turn,
-            "max_speed_rad_s": self.limits.max_speed,
-            "acceleration_rad_s2": self.limits.acceleration,
-            "low_rad": self.limits.low,
-            "high_rad": self.limits.high,
+            **self._travel.described(),
         }
 
     def close(self) -> None:
@@ -277,7 +269,4 @@ class PM16CStage:
 
     def _until_standing(self, timeout: float) -> ChannelStatus:
         """The status once the stage stands, or when the time is over."""
-        deadline = self._clock.now() + timeout
-        while (status := self._channel.status()).moving and (left := deadline - self._clock.now()) > 0:
-            self._clock.sleep(min(POLL, left))
-        return status
+        return until_standing(self._clock, self._channel.status, lambda status: status.moving, timeout)

@@ -65,6 +65,16 @@ class Travel:
         """A place in words."""
         return f"{float(counts) * 360 / self.limits.counts_per_turn:.4f} deg"
 
+    def described(self) -> dict[str, str | int | float]:
+        """The limits, for a file's metadata."""
+        return {
+            "counts_per_turn": self.limits.counts_per_turn,
+            "max_speed_rad_s": self.limits.max_speed,
+            "acceleration_rad_s2": self.limits.acceleration,
+            "low_rad": self.limits.low,
+            "high_rad": self.limits.high,
+        }
+
     def target(self, angle: float) -> int:
         """The count to go to for an angle in rad.
 

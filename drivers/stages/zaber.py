@@ -14,6 +14,7 @@ from pathlib import Path
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel, check_figures
 from drivers.stages.zaber_axis import SPEED_UNIT, AxisStatus, ZaberAxis, native_limits
@@ -21,12 +22,8 @@ from drivers.stages.zaber_packet import meaning_of
 from drivers.stages.zaber_pulses import ZaberOutput, ZaberPulses
 from drivers.stages.zaber_train import PulseSettings, refusal
 
-POLL = 0.02
-"""s between looks at a moving stage."""
 STANDING_IN_PLACE = 10.0
 """s beyond twice the time of a short move after which it has failed."""
-STOP_MARGIN = 2.0
-"""s beyond the longest deceleration after which a stop has failed."""
 
 
 class ZaberStage:
@@ -237,7 +234,7 @@ class ZaberStage:
     def stop(self) -> None:
         self._stops.came(hard=False)
         packet = self._send_stop(hard=False)
-        longest = self.limits.max_speed / self.limits.acceleration + STOP_MARGIN
+        longest = longest_stop(self.limits)
         status = self._until_standing(longest)
         if status.moving:
             raise self._travel.not_stopped(longest, status.counts, packet, status.raw)
@@ -259,11 +256,7 @@ class ZaberStage:
             "trigger_position": "encoder" if pulses.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
-            "counts_per_turn": self.limits.counts_per_turn,
-            "max_speed_rad_s": self.limits.max_speed,
-            "acceleration_rad_s2": self.limits.acceleration,
-            "low_rad": self.limits.low,
-            "high_rad": self.limits.high,
+            **self._travel.described(),
         }
 
     def digital_output(self, number: int) -> ZaberOutput:
@@ -308,7 +301,4 @@ class ZaberStage:
 
     def _until_standing(self, timeout: float) -> AxisStatus:
         """The status once the stage stands, or when the time is over."""
-        deadline = self._clock.now() + timeout
-        while (status := self._axis.status()).moving and (left := deadline - self._clock.now()) > 0:
-            self._clock.sleep(min(POLL, left))
-        return status
+        return until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)
