@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -13,10 +14,13 @@ from drivers.stages.standing import POLL, STOP_MARGIN, longest_stop, until_stand
 from simulators.clock import VirtualClock
 
 
-@given(end=st.floats(-1, 2), timeout=st.floats(-1, 1))
-def test_the_last_look_is_the_first_of_a_standing_stage_or_that_of_the_deadline(end: float, timeout: float) -> None:
-    """Looks fall on every POLL and on the deadline; where there is no time left, there is one all the same."""
-    clock = VirtualClock()
+@given(polls=st.integers(-10, 100), part=st.floats(0.01, 0.99), timeout=st.floats(-1, 1))
+def test_the_last_look_is_the_first_of_a_standing_stage_or_that_of_the_deadline(
+    polls: int, part: float, timeout: float
+) -> None:
+    """Looks fall on every POLL and on the deadline; where there is no time left, there is one all the same. The move
+    ends between two of them."""
+    clock, end = VirtualClock(), (polls + part) * POLL
     begun, looks = clock.now(), []
 
     def look() -> float:
@@ -24,10 +28,10 @@ def test_the_last_look_is_the_first_of_a_standing_stage_or_that_of_the_deadline(
         return looks[-1]
 
     last = until_standing(clock, look, lambda now: now < end, timeout)
-    due = max(0.0, min(math.ceil(end / POLL) * POLL, timeout))
+    due = max(0.0, min((polls + 1) * POLL, timeout))
     assert last == looks[-1] == pytest.approx(due, abs=1e-6)
-    assert all(b - a <= POLL + 1e-6 for a, b in zip(looks, looks[1:], strict=False))
-    assert len(looks) <= due / POLL + 2
+    assert all(b - a <= POLL + 1e-6 for a, b in itertools.pairwise(looks))
+    assert len(looks) <= due / POLL + 3
 
 
 def test_a_stop_may_take_the_ramp_from_full_speed() -> None:
