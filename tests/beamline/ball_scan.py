@@ -1,0 +1,69 @@
+"""A small scan of a ball off the axis by any simulated stage, on a virtual clock: its pictures show its angles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beamline import config, devices
+from beamline.config_models import Config
+from beamline.plan import Block
+from beamline.timeline import pass_ends
+from drivers.protocols import TriggerSource
+
+# A ball off the axis and no effects: every frame is Beer-Lambert, so that its angle can be read off the picture.
+BALL = {
+    "phantom": {
+        "kind": "solids",
+        "solids": [
+            {"kind": "ellipsoid", "semi_axes": [0.02, 0.02, 0.02], "attenuation": 30.0, "centre": [0.06, 0, 0.01]}
+        ],
+    },
+    "beam": {"photons_per_s": 1.0e5},
+}
+
+
+def shipped(name: str, *overrides: str) -> Config:
+    return config.load(config.config_folder() / f"{name}.yaml", overrides, {})
+
+
+def small(*overrides: str) -> Config:
+    loaded = shipped("simulated", "devices.camera.roi=[1136, 2028, 32, 40]", "simulation.clock=virtual", *overrides)
+    simulation = loaded.simulation.model_copy(update={"scene": BALL})  # type: ignore[union-attr]
+    return loaded.model_copy(update={"simulation": simulation})
+
+
+def fly(bench: devices.Bench, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:
+    """The block's passes by hand, as acquisition does it: framestamps and counts [frame, row, col]."""
+    stage, camera = bench.devices.stage, bench.devices.camera
+    camera.configure(devices.camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))
+    stamps, images = [], []
+    camera.arm(block.n)
+    for train, (start, stop) in zip(block.trains, pass_ends(block), strict=True):
+        stage.start_move(start, stage.limits.max_speed)
+        stage.wait(60.0)
+        stage.arm(train)
+        stage.start_move(stop, block.speed)
+        for _ in range(train.n):
+            frame = camera.next_frame(10.0)
+            stamps.append(frame.framestamp)
+            images.append(frame.counts)
+        stage.wait(60.0)
+    camera.disarm()
+    return stamps, np.array(images)
+
+
+COMMON = "counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60, low_deg: -20"
+
+
+STAGES = {
+    "pm16c": f"{{kind: pm16c, port: 'sim://pm16c', channel: 3, {COMMON}}}",
+    "pm16c, 10 us": f"{{kind: pm16c, port: 'sim://pm16c', pulse_width_s: 1.0e-5, {COMMON}}}",
+    "pm16c, an interval after": f"{{kind: pm16c, port: 'sim://pm16c', first_pulse: interval_after, {COMMON}}}",
+    "pi_gcs": f"{{kind: pi_gcs, port: 'sim://pi_gcs', axis: A, trigger_line: 2, {COMMON}}}",
+    "pi_gcs, a step after": f"{{kind: pi_gcs, port: 'sim://pi_gcs', first_pulse: step_after, {COMMON}}}",
+    "zaber": f"{{kind: zaber, port: 'sim://zaber', device: 2, output: 3, {COMMON}}}",
+    "pi_gcs, falling": f"{{kind: pi_gcs, port: 'sim://pi_gcs', active_high: false, firmware_pulse_s: 0.1, {COMMON}}}",
+    "zaber, falling": f"{{kind: zaber, port: 'sim://zaber', active_high: false, {COMMON}}}",
+    "zaber, toggled": f"{{kind: zaber, port: 'sim://zaber', toggle: true, {COMMON}}}",
+    "zaber, unchained": f"{{kind: zaber, port: 'sim://zaber', chained: false, {COMMON}}}",
+}

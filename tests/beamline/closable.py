@@ -1,0 +1,15 @@
+"""A device that can only be closed: it stands in for one on a port that this computer has not."""
+
+from __future__ import annotations
+
+
+class Closable:
+    """It counts how often it was closed."""
+
+    name = "stage"
+
+    def __init__(self) -> None:
+        self.closed = 0
+
+    def close(self) -> None:
+        self.closed += 1
