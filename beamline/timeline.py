@@ -63,7 +63,7 @@ def work_out(
         stage=stage,
         camera=camera,
         axis_col=axis_col,
-        reach=_reach(views, scale),
+        reach=_reach(views),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
         total_bytes=(frame_bytes + preview_bytes) * sum(block.n for block in blocks),
@@ -174,7 +174,7 @@ def _half_width(camera: CameraTiming, axis_col: float | None) -> float:
     return cols / 2 if axis_col is None else max(axis_col + 0.5, cols - 0.5 - axis_col)
 
 
-def _reach(views: Block, scale: Scale) -> tuple[float, float]:
+def _reach(views: Block) -> tuple[float, float]:
     """The smallest and the largest angle that the stage would be sent to."""
     ends = np.array(pass_ends(views)).ravel() if views.trains else views.angles
     return float(ends.min()), float(ends.max())

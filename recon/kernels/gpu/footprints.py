@@ -181,7 +181,7 @@ def _footprints(  # type: ignore[no-untyped-def]
 
 @triton.jit(do_not_specialize=["n"])
 def _footprints_backward(  # type: ignore[no-untyped-def]
-    means, scales, rotations, densities, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n,
+    means, scales, rotations, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n,
     ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, fixed, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -282,6 +282,6 @@ def footprints_backward(
     axes, focal, sod = beam_of(geometry, view)
     if n > 0:
         _footprints_backward[(triton.cdiv(n, _BLOCK),)](
-            means, scales, rotations, densities, found.table, moments, d_means, d_log_scales, d_rotations, d_densities,
-            d_centres, n, *axes, focal, sod, length, CONE=geometry.is_cone, BLOCK=_BLOCK,
+            means, scales, rotations, found.table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres,
+            n, *axes, focal, sod, length, CONE=geometry.is_cone, BLOCK=_BLOCK,
         )  # fmt: skip
