@@ -1,4 +1,4 @@
-"""Device Protocols: what acquisition asks of a rotation stage, a camera and a shutter; angles in radians, time in s."""
+"""Device Protocols: what acquisition asks of stage, camera, shutter, sample mover and beam monitor, in rad and s."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class CameraSettings:
         trigger: who starts an exposure.
         roi: (row0, col0, rows, cols) of the sensor; None is the full sensor.
         binning: pixels summed per side.
-        readout: "standard" or "ultra_quiet".
+        readout: a mode of the camera by name: "standard", "ultra_quiet" or "photon_number".
     """
 
     exposure: float
