@@ -44,9 +44,9 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
         try:
             stage.start_home()
             angle = stage.wait(timeout)
-        except BaseException as error:
+        except BaseException:
             # Also after a search that failed: what the controller thinks of it is not known. Why it failed is told.
             with suppress(DeviceError):
                 stage.stop()
-            raise error
+            raise
         click.echo(f"The stage has its reference and stands at {math.degrees(angle):.4f} deg.")
