@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beamline.config_devices import ElectrometerConfig, RingCurrentConfig
+from beamline.simulated import simulated_electrometer
 from drivers.beam_monitor import TextBeamMonitor, TextSource
 from drivers.beam_monitor_page import PageSource
 from drivers.beam_monitor_serial import SerialSource
@@ -18,8 +19,6 @@ def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig, clock: Clo
     Raises:
         DeviceError: the electrometer's port does not open.
     """
-    from beamline.simulated import simulated_electrometer
-
     source: TextSource
     if isinstance(config, RingCurrentConfig):
         source = PageSource(config.url, clock, timeout=config.timeout_s)
