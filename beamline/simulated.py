@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from recon.volume import Grid, Volume
     from simulators.camera import SimulatedOrcaQuest
     from simulators.scene import Scene
-    from simulators.serial_url import Wire
     from simulators.shutter import BeamGate
     from simulators.trigger_line import TriggerLine
+    from simulators.wire import Wire
 
 
 def simulated_devices(

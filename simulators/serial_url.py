@@ -16,8 +16,6 @@ from drivers.clock import SystemClock
 from simulators.kinds import KINDS, stand_alone
 from simulators.wire import Wire
 
-__all__ = ["SCHEME", "SimulatedSerial", "Wire", "register"]
-
 SCHEME = "sim://"
 POLL = 1e-3
 """s on the device's clock between looks for a reply that has not come yet."""

@@ -98,7 +98,6 @@ class ZaberController:
         self._address, self._echo = address, echo
         self._faults: Mapping[int, Fault] = {} if faults is None else faults
         self._reader = PacketReader()
-        self._information: dict[str, list[str]] = {}
         self._out = bytearray()
         self._lock = threading.RLock()
         line.attach_angle(self._angle_at)
