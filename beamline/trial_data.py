@@ -37,7 +37,7 @@ class Data:
             arrays |= {"held_out": self.held_out[0], **_geometry_arrays("held_out_geometry", self.held_out[1])}
         if self.truth is not None:
             arrays["truth"] = self.truth
-        np.savez(path, **arrays)  # type: ignore[arg-type]
+        np.savez(path, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Data:
