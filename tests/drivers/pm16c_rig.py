@@ -11,7 +11,7 @@ from simulators.clock import VirtualClock
 from simulators.serial_url import register
 from simulators.trigger_line import TriggerLine
 from simulators.wires.pm16c import PM16CController
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())
 COUNTS = 90_000
@@ -65,3 +65,27 @@ class Rig:
             self.controller.receive(command.encode() + b"\r\n")
             reply = self.controller.transmit()
         return reply.decode().strip()
+
+
+class Slow:
+    """A controller whose settings and moves take effect `seconds` after they came: it is writing its memory, for which
+    KEK's driver waits 40 ms. Stops act, and queries are answered, at once, from what holds by then."""
+
+    def __init__(self, rig: Rig, seconds: float) -> None:
+        self.clock, self._rig, self._seconds = rig.clock, rig, seconds
+        self._coming: list[tuple[float, bytes]] = []
+
+    def receive(self, data: bytes) -> None:
+        self._settle()
+        if b"?" in data or b"STP" in data:
+            self._rig.receive(data)
+        else:
+            self._coming.append((self.clock.now() + self._seconds, data))
+
+    def transmit(self) -> bytes:
+        self._settle()
+        return self._rig.transmit()
+
+    def _settle(self) -> None:
+        while self._coming and self._coming[0][0] <= self.clock.now():
+            self._rig.receive(self._coming.pop(0)[1])

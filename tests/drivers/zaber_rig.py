@@ -11,7 +11,7 @@ from simulators.clock import VirtualClock
 from simulators.serial_url import register
 from simulators.trigger_line import TriggerLine
 from simulators.wires.zaber import ZaberController
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 
 NAMES = (f"zaber-test-{number}" for number in itertools.count())
 COUNTS = 360_000

@@ -13,7 +13,7 @@ from simulators.serial_url import register
 from simulators.trigger_line import TriggerLine
 from simulators.wires.pi_gcs import PiGcsController
 from simulators.wires.pi_gcs_axis import Build
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 
 NAMES = (f"pi-gcs-test-{number}" for number in itertools.count())
 COUNTS = 90_000

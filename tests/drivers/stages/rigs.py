@@ -11,7 +11,7 @@ from drivers.protocols import RotationStage
 from simulators.clock import VirtualClock
 from simulators.trigger_line import TriggerLine
 from tests.drivers import pm16c_rig, zaber_rig
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages import pi_gcs_rig
 
 

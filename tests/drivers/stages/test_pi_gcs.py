@@ -1,4 +1,4 @@
-"""PI GCS 2.0 driver: the shared conformance suite over the simulated wire, and what is this controller's own."""
+"""PI GCS 2.0 driver: what is this controller's own; what every stage does stands in conformance."""
 
 from __future__ import annotations
 
@@ -13,36 +13,13 @@ from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
 from drivers.stages.pi_gcs import limits_of
 from simulators.wires.pi_gcs_trigger import FirstPulse
-from tests.drivers.stage_conformance import LONG, SPEED, Build, StageConformance
+from tests.drivers.stage_bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
 
 
 @pytest.fixture
 def rig() -> Rig:
     return Rig()
-
-
-class TestConformance(StageConformance):
-    WIDTH = None
-    INVERTS = True
-
-    @pytest.fixture
-    def build(self) -> Build:
-        return lambda **settings: Rig(wire={"latency": 0.0}).bench(**settings)
-
-
-class TestConformanceByLimitSwitch(StageConformance):
-    """Another axis, reference by the negative limit switch, a servo that looks once in 50 µs and no ACC and DEC."""
-
-    WIDTH = None
-    INVERTS = True
-
-    @pytest.fixture
-    def build(self) -> Build:
-        wire = {"axis": "ROT_A", "output": 1, "latency": 0.0, "unknown": {"ACC", "DEC"}}
-        build = {"low": -5.0, "reference_switch": False, "servo_period": 50e-6}
-        usual = {"axis": "ROT_A", "trigger_line": 1, "reference": "FNL"}
-        return lambda **settings: Rig(wire=wire, **build).bench(**(usual | settings))
 
 
 # opening and closing

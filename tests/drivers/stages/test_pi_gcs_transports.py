@@ -19,7 +19,7 @@ from simulators.serial_url import SCHEME
 from simulators.transports import serve_pty, serve_tcp
 from simulators.trigger_line import TriggerLine
 from simulators.wire import Wire
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages.pi_gcs_rig import USUAL, controller
 
 FAST = math.radians(30)

@@ -1,4 +1,4 @@
-"""PM16C-04XD driver: the shared conformance suite over the simulated wire, and what is this controller's own."""
+"""PM16C-04XD driver: what is this controller's own; what every stage does stands in conformance."""
 
 from __future__ import annotations
 
@@ -14,32 +14,12 @@ from drivers.protocols import RotationStage, TriggerTrain
 from drivers.stages.pm16c import limits_of
 from drivers.stages.pm16c_rates import RATES, steepest_code
 from tests.drivers.pm16c_rig import COUNTS, Rig
-from tests.drivers.stage_conformance import LONG, SPEED, Build, StageConformance
+from tests.drivers.stage_bench import LONG, SPEED
 
 
 @pytest.fixture
 def rig() -> Rig:
     return Rig()
-
-
-class TestConformance(StageConformance):
-    NO_WIDTH = 50e-6
-
-    @pytest.fixture
-    def build(self) -> Build:
-        return lambda **settings: Rig(home_at=500).bench(**({"home": math.radians(2.0)} | settings))
-
-
-class TestConformanceWithoutHome(StageConformance):
-    """A stage without a home switch; and a width chosen for all trains."""
-
-    HOMES = False
-    WIDTH = 1e-3
-    NO_WIDTH = 2e-3
-
-    @pytest.fixture
-    def build(self) -> Build:
-        return lambda **settings: Rig(home_at=None).bench(**({"home": None} | settings))
 
 
 # opening and closing

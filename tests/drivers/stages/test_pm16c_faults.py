@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.protocols import TriggerTrain
 from tests.drivers.pm16c_rig import QUERIES_TO_OPEN, Rig
-from tests.drivers.stage_conformance import LONG, SPEED
+from tests.drivers.stage_bench import LONG, SPEED
 
 
 @pytest.fixture

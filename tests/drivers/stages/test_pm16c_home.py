@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import TriggerTrain
 from tests.drivers.pm16c_rig import Rig
-from tests.drivers.stage_conformance import LONG, SPEED
+from tests.drivers.stage_bench import LONG, SPEED
 
 SWITCH = 2500
 """Pulses since power-on: 10 degrees of the sample's true angle."""

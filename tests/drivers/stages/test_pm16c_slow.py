@@ -2,57 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-from typing import Any
-
 import pytest
 
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import TriggerTrain
 from drivers.stages.pm16c_train import FirstPulse
-from simulators.serial_url import register
 from tests.drivers.pm16c_rig import Rig
-from tests.drivers.stage_conformance import Build, StageBench, StageConformance
-
-NAMES = (f"pm16c-slow-test-{number}" for number in itertools.count())
-
-
-class Slow:
-    """A controller whose settings and moves take effect `seconds` after they came: it is writing its memory, for which
-    KEK's driver waits 40 ms. Stops act, and queries are answered, at once, from what holds by then."""
-
-    def __init__(self, rig: Rig, seconds: float) -> None:
-        self.clock, self._rig, self._seconds = rig.clock, rig, seconds
-        self._coming: list[tuple[float, bytes]] = []
-
-    def receive(self, data: bytes) -> None:
-        self._settle()
-        if b"?" in data or b"STP" in data:
-            self._rig.receive(data)
-        else:
-            self._coming.append((self.clock.now() + self._seconds, data))
-
-    def transmit(self) -> bytes:
-        self._settle()
-        return self._rig.transmit()
-
-    def _settle(self) -> None:
-        while self._coming and self._coming[0][0] <= self.clock.now():
-            self._rig.receive(self._coming.pop(0)[1])
-
-
-class TestASlowController(StageConformance):
-    NO_WIDTH = 50e-6
-
-    @pytest.fixture
-    def build(self) -> Build:
-        def build(**settings: Any) -> StageBench:
-            rig = Rig(home_at=500)
-            rig.url = register(next(NAMES), Slow(rig, 0.04))
-            return rig.bench(**({"home": math.radians(2.0)} | settings))
-
-        return build
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -23,7 +23,7 @@ from simulators.transports import serve_pty, serve_tcp
 from simulators.trigger_line import TriggerLine
 from simulators.wire import Wire
 from simulators.wires.pm16c import PM16CController
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 
 COUNTS = 36_000
 FAST = math.radians(60)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import TriggerTrain
 from drivers.stages.zaber_train import PulseSettings, refusal, remaining, set_up
-from tests.drivers.stage_conformance import LONG, SPEED, StageBench
+from tests.drivers.stage_bench import LONG, SPEED, StageBench
 from tests.drivers.zaber_rig import Rig
 
 

@@ -22,7 +22,7 @@ from simulators.transports import serve_pty, serve_tcp
 from simulators.trigger_line import TriggerLine
 from simulators.wire import Wire
 from simulators.wires.zaber import ZaberController
-from tests.drivers.stage_conformance import StageBench
+from tests.drivers.stage_bench import StageBench
 from tests.drivers.zaber_rig import settings_of
 
 FAST = math.radians(60)

@@ -1,0 +1,52 @@
+"""A stage and its trigger cable on a bench, for tests that know no protocol: moves, trains, pulses in degrees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.clock import Clock
+from drivers.protocols import RotationStage, TriggerTrain
+from simulators.trigger_line import Pulse, TriggerLine
+
+SPEED = math.radians(10)
+LONG = 60.0
+
+
+@dataclass
+class StageBench:
+    """A stage at angle 0 that can go from -5 to 100 degrees at 10 degrees/s or faster, and its trigger cable."""
+
+    stage: RotationStage
+    clock: Clock
+    line: TriggerLine
+
+    def pulses(self) -> list[Pulse]:
+        """Those that have been emitted by now."""
+        found: list[Pulse] = []
+        after = -math.inf
+        while (pulse := self.line.next_after(after)) is not None and pulse.time <= self.clock.now():
+            found.append(pulse)
+            after = pulse.time
+        return found
+
+    def go(self, degrees: float) -> float:
+        """Move and wait; where it stands, in degrees."""
+        self.stage.start_move(math.radians(degrees), SPEED)
+        return math.degrees(self.stage.wait(LONG))
+
+    def counts(self, degrees: float) -> int:
+        return self.stage.to_counts(math.radians(degrees))
+
+    def train(self, first: float, step: float, n: int) -> TriggerTrain:
+        """A train in degrees."""
+        return TriggerTrain(self.counts(first), self.counts(step), n)
+
+    @property
+    def count(self) -> float:
+        """One count in degrees."""
+        return 360.0 / self.stage.limits.counts_per_turn
+
+
+Build = Callable[..., StageBench]

@@ -1,0 +1,122 @@
+"""Benches of every stage for the shared suite: each controller in each of its ways, also on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+
+from drivers.stages.zaber_train import PulseSettings
+from simulators.serial_url import register
+from simulators.transports import serve_pty
+from tests.drivers import pm16c_rig, zaber_rig
+from tests.drivers.stage_bench import Build, StageBench
+from tests.drivers.stages import pi_gcs_rig
+from tests.drivers.stages.rigs import AnyRig
+
+RigOf = Callable[[dict[str, Any]], AnyRig]
+"""A fresh controller for a driver with these settings."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A stage under test.
+
+    Attributes:
+        rig: what makes the controller.
+        usual: settings of the driver's constructor.
+        width: a pulse width (s) that the output has, at most 1 ms; None where it has no choice.
+        no_width: one that it has not, or has not beside others.
+        inverts: its pulses may be active low.
+        homes: it has a reference, within its limits.
+        stops_are_told: `status` tells that the last move was stopped.
+        turning_back_ends: a train ends where the stage turns back inside it; elsewhere its rest comes later.
+        relative_moves: how many of them make the long way; fewer where bytes cost time and the law is tested elsewhere.
+        terminal: its bytes go through a pseudo-terminal. Time is virtual all the same: they take their own time, the
+            clock stands meanwhile.
+    """
+
+    rig: RigOf
+    usual: dict[str, Any]
+    width: float | None = 100e-6
+    no_width: float = 0.0
+    inverts: bool = False
+    homes: bool = True
+    stops_are_told: bool = True
+    turning_back_ends: bool = True
+    relative_moves: int = 1000
+    terminal: bool = False
+
+    def build(self, plugged: ExitStack) -> Build:
+        """A function that opens the stage on a fresh wire, with settings that differ; `plugged` pulls the cables."""
+
+        def build(**settings: Any) -> StageBench:
+            rig = self.rig(settings)
+            if self.terminal:
+                rig.url = plugged.enter_context(serve_pty(rig))
+            return rig.bench(**(self.usual | settings))
+
+        return build
+
+
+def _slow_pm16c(settings: dict[str, Any]) -> AnyRig:
+    rig = pm16c_rig.Rig(home_at=500)
+    rig.url = register(next(pm16c_rig.NAMES), pm16c_rig.Slow(rig, 0.04))
+    return rig
+
+
+def _pi_gcs(settings: dict[str, Any]) -> AnyRig:
+    """Without latency: on a real terminal the virtual clock stands while a reply is on its way."""
+    return pi_gcs_rig.Rig(wire={"latency": 0.0})
+
+
+def _pi_gcs_by_limit_switch(settings: dict[str, Any]) -> AnyRig:
+    """Another axis, reference by the negative limit switch, a servo that looks once in 50 µs and no ACC and DEC."""
+    wire = {"axis": "ROT_A", "output": 1, "latency": 0.0, "unknown": {"ACC", "DEC"}}
+    return pi_gcs_rig.Rig(wire=wire, low=-5.0, reference_switch=False, servo_period=50e-6)
+
+
+def _zaber(**device: Any) -> RigOf:
+    """The device's output is cabled for the polarity that the driver is told."""
+    return lambda settings: zaber_rig.Rig(active_high=settings.get("active_high", True), **device)
+
+
+_PM16C = Kind(
+    lambda _: pm16c_rig.Rig(home_at=500), {"home": math.radians(2.0)}, no_width=50e-6, turning_back_ends=False
+)
+_PI_GCS = Kind(_pi_gcs, {}, width=None, inverts=True)
+_ZABER = Kind(_zaber(), {}, width=1e-3, no_width=0.5e-3, inverts=True)
+KINDS = {
+    "pm16c": _PM16C,
+    "pm16c, a width for all trains and no home switch": replace(
+        _PM16C, rig=lambda _: pm16c_rig.Rig(home_at=None), usual={"home": None}, homes=False, width=1e-3, no_width=2e-3
+    ),
+    "pm16c, slow": replace(_PM16C, rig=_slow_pm16c),
+    "pi_gcs": _PI_GCS,
+    "pi_gcs, limit switch": replace(
+        _PI_GCS, rig=_pi_gcs_by_limit_switch, usual={"axis": "ROT_A", "trigger_line": 1, "reference": "FNL"}
+    ),
+    "zaber": _ZABER,
+    "zaber, toggled": replace(
+        _ZABER, rig=_zaber(can_schedule=False), usual={"toggle": True}, width=None, no_width=1e-3
+    ),
+    "zaber, fires when enabled": replace(
+        _ZABER,
+        rig=_zaber(fires_when_enabled=True),
+        usual={"pulses": PulseSettings(fires_when_enabled=True)},
+        no_width=0.0,
+    ),
+    "zaber, encoder": replace(
+        _ZABER, rig=_zaber(identity="deviceid"), usual={"pulses": PulseSettings(measured=True)}, no_width=0.0
+    ),
+}
+needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
+BENCHES = [pytest.param(kind, id=name) for name, kind in KINDS.items()] + [
+    pytest.param(replace(KINDS[name], relative_moves=200, terminal=True), id=f"{name} on a terminal", marks=needs_pty)
+    for name in ("pm16c", "pi_gcs", "zaber")
+]

@@ -1,0 +1,135 @@
+"""Every stage: a train gives exactly its pulses at its angles, once, until it is disarmed, replaced or over."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+
+from drivers.protocols import TriggerTrain
+from tests.drivers.stage_bench import StageBench
+
+
+@pytest.mark.parametrize(("first", "step", "n"), [(2.0, 0.5, 37), (-1.0, -0.25, 9), (1.0, 0.1, 1), (-1.0, -0.1, 1)])
+def test_a_train_gives_exactly_its_pulses_at_its_angles(bench: StageBench, first: float, step: float, n: int) -> None:
+    train = bench.train(first, step, n)
+    bench.stage.arm(train)
+    bench.clock.sleep(1.0)
+    assert bench.pulses() == []
+    bench.go(first + n * step + math.copysign(1.0, step))
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [train.start + k * train.interval for k in range(n)]
+    for k, pulse in enumerate(bench.pulses()):
+        asked = bench.stage.to_angle(train.start + k * train.interval)
+        assert pulse.angle == pytest.approx(asked, abs=math.radians(bench.count))
+        assert bench.line.angle_at(pulse.time) == pytest.approx(asked, abs=math.radians(bench.count))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_single_pulse_may_have_any_interval(bench: StageBench, sign: int) -> None:
+    bench.stage.arm(TriggerTrain(sign * 100, sign, 1))
+    bench.go(sign * 3.0)
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [sign * 100]
+
+
+def test_at_constant_speed_pulses_are_equally_spaced_in_time(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(5.0, 0.5, 21))
+    bench.go(20.0)
+    times = [pulse.time for pulse in bench.pulses()]
+    periods = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert periods == pytest.approx([0.05] * 20, rel=1e-3)
+
+
+def test_the_train_ends_with_its_last_pulse_however_far_it_turns(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.go(30.0)
+    assert len(bench.pulses()) == 3
+
+
+def test_a_train_fires_once(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.go(5.0)
+    bench.go(0.0)
+    bench.go(5.0)
+    assert len(bench.pulses()) == 3
+
+
+def test_one_train_after_another(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.go(5.0)
+    bench.stage.arm(bench.train(4.5, -1.0, 4))
+    bench.go(0.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 4.5, 3.5, 2.5, 1.5)]
+
+
+def test_no_pulse_without_arming(bench: StageBench) -> None:
+    bench.go(10.0)
+    assert bench.pulses() == []
+
+
+def test_no_pulse_after_disarming(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.stage.disarm()
+    bench.go(10.0)
+    assert bench.pulses() == []
+
+
+def test_disarming_in_the_middle_of_a_train_ends_it(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 9))
+    bench.go(3.5)
+    bench.stage.disarm()
+    bench.go(7.5)
+    bench.go(0.0)
+    bench.go(20.0)
+    assert len(bench.pulses()) == 3
+    bench.stage.arm(bench.train(21.0, 1.0, 4))
+    bench.go(30.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 21.0, 22.0, 23.0, 24.0)]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_train_that_is_stopped_in_the_middle_goes_on_with_the_next_move(bench: StageBench, sign: int) -> None:
+    bench.go(-4.5 if sign > 0 else 10.0)
+    first = -3.0 if sign > 0 else 8.0
+    bench.stage.arm(bench.train(first, sign * 0.5, 20))
+    for degrees in (first + sign * 1.25, first + sign * 3.1, first + sign * 10.0):
+        bench.go(degrees)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [bench.counts(first) + sign * k * bench.counts(0.5) for k in range(20)]
+
+
+def test_arming_again_replaces_the_train(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 9))
+    bench.stage.arm(bench.train(2.0, 3.0, 2))
+    bench.go(20.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [bench.counts(2.0), bench.counts(5.0)]
+
+
+def test_arming_again_in_the_middle_of_a_train_replaces_it(bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 9))
+    bench.go(3.5)
+    bench.stage.arm(bench.train(2.0, -1.0, 2))
+    bench.go(0.0)
+    bench.go(20.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 2.0, 1.0)]
+
+
+def test_disarming_what_is_not_armed_is_fine(bench: StageBench) -> None:
+    bench.stage.disarm()
+    bench.stage.disarm()
+
+
+def test_pulses_still_to_come_are_counted_where_the_controller_tells(bench: StageBench) -> None:
+    told = [bench.stage.remaining_pulses()]
+    bench.stage.arm(bench.train(1.0, 1.0, 5))
+    told.append(bench.stage.remaining_pulses())
+    bench.go(2.5)
+    told.append(bench.stage.remaining_pulses())
+    bench.go(10.0)
+    told.append(bench.stage.remaining_pulses())
+    assert told in ([0, 5, 3, 0], [None] * 4)
