@@ -4,107 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import recon
 from beamline.budget import within
-from beamline.checkpoints import Keeper, made_from
-from beamline.deliver import Target, deliver
+from beamline.checkpoints import made_from
+from beamline.deliver import deliver
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event, Sink
 from beamline.fit_progress import progress_events
 from beamline.held_out import keep_back, with_held_out
 from beamline.measure import fit_truth, read_truth
-from beamline.pipeline import Prepared, Selection, prepare
+from beamline.pipeline import Prepared, prepare
+from beamline.recon_options import ReconOptions
 from beamline.recon_report import Context, Made, facts_of
 from beamline.stop import Heeded, Stoppable, never_stopped
-from beamline.storage.source import Quantity, ScanSource, open_scan
 from drivers.clock import Clock
 from recon.backend import backend_for
-from recon.fbp import Filter
 from recon.fit import FitSettings, Progress
-from recon.initialise import Start, default_count
-from recon.problem import Loss
-from recon.quality import PRESETS, Quality
-from recon.reconstruction import DEFAULT_STEPS, Method
+from recon.initialise import default_count
+from recon.quality import PRESETS
+from recon.reconstruction import DEFAULT_STEPS
 from recon.volume import Grid
 from recon.warm_up import warm_up
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """Which scan, and what to take instead of what its file says (see storage.source.open_scan)."""
-
-    path: Path
-    quantity: Quantity | None = None
-    angles: Path | None = None
-    angle_rows: str | None = None
-    darks: Path | None = None
-    flats: Path | None = None
-
-    def open(self, *, follow: bool = False) -> ScanSource:
-        return open_scan(
-            self.path,
-            angles=self.angles,
-            angle_rows=self.angle_rows,
-            darks=self.darks,
-            flats=self.flats,
-            quantity=self.quantity,
-            follow=follow,
-        )
-
-
-@dataclass(frozen=True)
-class ReconOptions:
-    """What to reconstruct and how.
-
-    Attributes:
-        source: the scan.
-        target: where results go.
-        selection: which part of the scan, and its correction.
-        method: of recon.reconstruct.
-        steps: of the fit; None takes the reconstructor's own number.
-        seconds: at most, for the fit; for a followed scan, after its end.
-        budget: s for everything from line integrals to volume; chooses all settings of the fit.
-        quality: a preset instead of steps and Gaussians.
-        gaussians: how many to start from; None derives it from the volume.
-        start, loss, device: of the fit.
-        early_stop: end the fit when views held out no longer gain; some are kept back where all were chosen.
-        polish: sweeps on voxels after the fit.
-        keeper: of the fit's state.
-        iterations, tv_weight: of an iterative method; None takes its own.
-        filter: of the FBP.
-        seed: of everything random.
-        truth: FILE or FILE:first:end to compare with.
-        unfinished: take the frames that there are, where the scan still runs or died.
-        command: that repeats this, for the record.
-    """
-
-    source: SourceOptions
-    target: Target
-    selection: Selection
-    method: Method = "r2"
-    steps: int | None = None
-    seconds: float | None = None
-    budget: float | None = None
-    quality: Quality | None = None
-    gaussians: int | None = None
-    start: Start = "fbp"
-    loss: Loss = "l1"
-    device: str = "cpu"
-    early_stop: bool = False
-    polish: int = 0
-    keeper: Keeper = field(default_factory=Keeper)
-    iterations: int | None = None
-    tv_weight: float | None = None
-    filter: Filter = "hann"
-    seed: int = 0
-    truth: str | None = None
-    unfinished: bool = False
-    command: str = ""
 
 
 class Warnings:

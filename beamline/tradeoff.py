@@ -15,8 +15,9 @@ from beamline.errors import ConfigError, DataError
 from beamline.events import Event, Sink
 from beamline.machine import machine
 from beamline.measure import fit_truth, read_truth
-from beamline.offline import SourceOptions, Warnings
+from beamline.offline import Warnings
 from beamline.pipeline import Prepared, Selection, prepare
+from beamline.recon_options import SourceOptions
 from beamline.recon_report import facts_of
 from beamline.storage.recon_file import named_on_failure
 from beamline.tradeoff_report import Table, write_figures, write_table

@@ -22,7 +22,8 @@ from beamline.deliver import Target
 from beamline.errors import QualityError, ScanStopped
 from beamline.events import Event, fan_out
 from beamline.follow import follow as follow_scan
-from beamline.offline import ReconOptions, run
+from beamline.offline import run
+from beamline.recon_options import ReconOptions
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock
 from recon.fbp import Filter

@@ -14,8 +14,9 @@ from beamline import budget as module
 from beamline.budget import Budgeted, joined, within
 from beamline.deliver import Target
 from beamline.events import Event
-from beamline.offline import ReconOptions, SourceOptions, run
+from beamline.offline import run
 from beamline.pipeline import Prepared, Selection, prepare
+from beamline.recon_options import ReconOptions, SourceOptions
 from beamline.storage.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.geometry import Geometry

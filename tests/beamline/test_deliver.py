@@ -13,8 +13,8 @@ import recon
 from beamline import figures
 from beamline.deliver import Target, deliver
 from beamline.events import Event
-from beamline.offline import SourceOptions
 from beamline.pipeline import Prepared, Selection, prepare
+from beamline.recon_options import SourceOptions
 from beamline.recon_report import Context, Made, facts_of
 from drivers.clock import SystemClock
 from recon.geometry import Geometry

@@ -11,14 +11,14 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline import follow as module
+from beamline import growing as module
 from beamline.deliver import Target
 from beamline.digest import digest
 from beamline.errors import BeamlineError, ConfigError, DataError
 from beamline.events import Event
 from beamline.follow import Rhythm, follow
-from beamline.offline import ReconOptions, SourceOptions
 from beamline.pipeline import Selection
+from beamline.recon_options import ReconOptions, SourceOptions
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.recon_file import read_reconstruction
 from drivers.frame import Frame, FrameKind

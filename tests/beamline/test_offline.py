@@ -19,8 +19,9 @@ from beamline.deliver import Target
 from beamline.digest import digest
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event
-from beamline.offline import ReconOptions, SourceOptions, run
+from beamline.offline import run
 from beamline.pipeline import Selection
+from beamline.recon_options import ReconOptions, SourceOptions
 from beamline.recon_report import METHOD_NAMES
 from beamline.storage.checkpoint_file import read_checkpoint
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
