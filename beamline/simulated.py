@@ -146,7 +146,7 @@ def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]
         detector = camera.detector
         up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
         z, y, x = grid.centre
-        return Volume(scene.phantom.attenuation(replace(grid, centre=(z + up, y, x))), grid)
+        return Volume(scene.sample.attenuation(replace(grid, centre=(z + up, y, x))), grid)
 
     return truth
 

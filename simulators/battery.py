@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,19 @@ from simulators.solids import Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
 WALL, ELECTROLYTE, PARTICLE = 0.9, 0.15, 1.9
 
 CANDIDATES, ROUNDS = 256, 40
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Arguments of `battery`, with the seed of its generator, as a scene gives them."""
+
+    field_of_view: tuple[float, float]
+    n_particles: int = 150
+    fill: float = 0.12
+    seed: int = 0
+
+    def solids(self) -> tuple[Solid, ...]:
+        return battery(np.random.default_rng(self.seed), self.field_of_view, self.n_particles, self.fill)
 
 
 def battery(

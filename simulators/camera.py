@@ -18,9 +18,9 @@ from drivers import orca_quest
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
-from simulators.effects.chain import Shot
+from simulators.detector import Detector
+from simulators.effects.shot import Shot
 from simulators.exposure import expose
-from simulators.phantom import Detector
 from simulators.scene import Scene
 from simulators.sensor import CONVERSION, OFFSET, READ_NOISE
 from simulators.shutter import BeamGate, SimulatedSampleMover
@@ -43,6 +43,7 @@ class _Exposed:
     ready: float
     beam: bool
     sample: bool
+    view: int
 
 
 class SimulatedOrcaQuest:
@@ -87,7 +88,7 @@ class SimulatedOrcaQuest:
         self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
         self._timing = orca_quest.timing(self._settings)
         self._connected = clock.now()
-        self._triggers = self._frames = 0  # over the camera's life
+        self._triggers = self._frames = self._views = 0  # over the camera's life
         self._ring: deque[_Exposed] = deque()
         self._armed_for = self._framestamp = 0  # frames asked for (0: not armed), next framestamp
         self._seen, self._accepted = 0.0, -np.inf  # time of the last trigger looked at, and of the last accepted
@@ -111,6 +112,7 @@ class SimulatedOrcaQuest:
             pitch=self._pitch * binning,
             axis_col=(axis_col - col0 - middle) / binning,
             axis_row=(axis_row - row0 - middle) / binning,
+            sod=self._scene.beam.source_distance,
         )
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
@@ -203,7 +205,7 @@ class SimulatedOrcaQuest:
             "roi_col": col0,
             "roi_rows": rows,
             "roi_cols": cols,
-            "conversion_factor": CONVERSION,
+            "conversion_factor": CONVERSION[self._settings.readout],
             "conversion_offset": OFFSET,
             "sensor_pitch_mm": orca_quest.PITCH_MM,
             "min_period": self._timing.min_period,
@@ -262,9 +264,10 @@ class SimulatedOrcaQuest:
         ready = time + self._settings.exposure + self._timing.readout
         beam, sample = self._shutter.is_open(), self._sample.is_in()
         if self._frames not in self._lost:
-            self._ring.append(_Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample))
+            self._ring.append(_Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
         self._framestamp += 1
         self._frames += 1
+        self._views += beam and sample
 
     def _check_overrun(self, now: float) -> None:
         over = sum(frame.ready <= now for frame in self._ring) - self._ring_frames
@@ -283,12 +286,18 @@ class SimulatedOrcaQuest:
             exposure=self._settings.exposure,
             time=frame.time,
             angle=frame.angle,
+            angle_at=self._line.angle_at,
             elapsed=frame.time - self._connected,
             row_period=self._timing.row_period,
             roi=self._roi(),
             binning=self._settings.binning,
-            read_noise=READ_NOISE[self._settings.readout],
-            rng=np.random.default_rng([self._seed, frame.number]),
+            readout=self._settings.readout,
+            beam=frame.beam,
+            sample=frame.sample,
+            radius=self._scene.sample.radius,
+            seed=self._seed,
+            frame=frame.number,
+            view=frame.view,
         )
-        counts = expose(self._scene, shot, self._line.angle_at, beam=frame.beam, sample=frame.sample)
+        counts = expose(self._scene, shot)
         return CameraFrame(counts, frame.framestamp, frame.time)

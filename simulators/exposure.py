@@ -5,60 +5,76 @@ Without effects a frame is photons x exposure x exp(-line integral) / conversion
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import nullcontext
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from simulators.effects.chain import Domain, Image, Shot
+from simulators.effects.chain import Watch
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+from simulators.pose import Pose
 from simulators.scene import Scene
 from simulators.sensor import CONVERSION, digitise
 
-AngleAt = Callable[[float], float]
 
-
-def expose(scene: Scene, shot: Shot, angle_at: AngleAt, *, beam: bool, sample: bool) -> NDArray[np.uint16]:
+def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.uint16]:
     """One frame, counts uint16 [row, col].
 
     Args:
-        shot: the circumstances; its rng is used up: the same frame again needs the same seed anew.
-        angle_at: true angle in radians at a time in s; asked only where the scene names a motion effect.
-        beam: the shutter is open (otherwise a dark).
-        sample: the sample is in the beam (otherwise a flat).
+        shot: the circumstances; the same shot makes the same frame again.
+        watch: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects'.
     """
     chain = scene.chain
-    if beam:
-        photons = np.full(shot.detector.shape, scene.beam.photons_per_s * shot.exposure * shot.binning**2)
-        if sample:
-            photons *= _transmission(scene, shot, angle_at)
-        electrons = chain.apply(Domain.PHOTONS, photons, shot)
+    if shot.beam:
+        photons = _photons(scene, shot, watch)
+        electrons = chain.apply(Domain.PHOTONS, photons, shot, watch)
     else:
         electrons = np.zeros(shot.detector.shape)
-    electrons = chain.apply(Domain.ELECTRONS, electrons, shot)
-    return digitise(chain.apply(Domain.COUNTS, electrons / CONVERSION, shot))
+    electrons = chain.apply(Domain.ELECTRONS, electrons, shot, watch)
+    with watch("digitise"):
+        electrons /= CONVERSION[shot.readout]
+    counts = chain.apply(Domain.COUNTS, electrons, shot, watch)
+    with watch("digitise"):
+        return digitise(counts)
 
 
-def _transmission(scene: Scene, shot: Shot, angle_at: AngleAt) -> Image:
-    """exp(-line integral), averaged over the moments that the motion effects ask for; float64 [row, col]."""
+def _photons(scene: Scene, shot: Shot, watch: Watch) -> Image:
+    """Photons that arrive, averaged over the moments at which the effects of motion look; float64 [row, col]."""
+    open_beam = scene.beam.photons_per_s * shot.exposure * shot.binning**2
+    if not shot.sample:
+        with watch("beer_lambert"):
+            return np.full(shot.detector.shape, open_beam)
+    if not scene.chain.moves:
+        angle = np.full(shot.detector.shape[0], shot.angle)
+        return _seen(scene, shot, angle, np.zeros_like(angle), open_beam, watch)
+    moments = scene.chain.moments(shot)
+    photons = np.zeros(shot.detector.shape)
+    for times, weight in zip(moments.times, moments.weights, strict=True):
+        photons += _seen(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
+    return photons
 
-    def at(angle: ArrayLike) -> Image:
-        depth = scene.line_integrals(angle, shot.detector)
-        return np.exp(-scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot))
 
-    if not scene.chain.motion:
-        return at(shot.angle)
-    times = np.zeros((1, shot.detector.shape[0]))
-    for effect in scene.chain.motion:
-        times = effect.times(times, shot)
-    return np.mean([at(_row_angles(row, shot.time, angle_at)) for row in times], axis=0)
+def _seen(
+    scene: Scene, shot: Shot, angles: NDArray[np.float64], times: NDArray[np.float64], open_beam: float, watch: Watch
+) -> Image:
+    """open_beam x exp(-line integral) with the sample as it stands at one moment of each row."""
+    pose = scene.chain.pose(Pose(angles), times, shot)
+    with watch("line_integrals"):
+        depth = scene.sample.line_integrals(pose, shot.detector)
+    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot, watch)
+    with watch("beer_lambert"):
+        np.exp(np.negative(depth, out=depth), out=depth)
+        depth *= open_beam
+    return depth
 
 
-def _row_angles(times: NDArray[np.float64], start: float, angle_at: AngleAt) -> NDArray[np.float64]:
-    """Angles of the rows at `times` after `start`, float64 [row].
+def _row_angles(times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
+    """Angles of the rows at `times` after the trigger, float64 [row].
 
     Only the first and the last row are asked for: within the milliseconds of a readout the angle is straight to 1e-5
     rad even while the stage speeds up at 1 rad/s2.
     """
-    first, last = angle_at(start + times[0]), angle_at(start + times[-1])
+    first, last = shot.angle_at(shot.time + times[0]), shot.angle_at(shot.time + times[-1])
     span = times[-1] - times[0]
     return first + (last - first) * (times - times[0]) / (span if span > 0 else 1.0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -18,13 +19,14 @@ class SceneError(ValueError):
 
 
 def build(cls: type[T], where: str, mapping: Any) -> T:
-    """`cls(**mapping)` for a dataclass whose fields are float, int or tuples of floats.
+    """`cls(**mapping)` for a dataclass of plain fields: numbers, words, true or false, lists of these, and None for
+    what may be left out.
 
     Raises:
         SceneError: naming the key (`where` is its path) and the legal ones.
     """
-    declared = fields(cls)
-    needed = [field.name for field in declared if field.default is MISSING]
+    declared = [field for field in fields(cls) if field.init]
+    needed = [field.name for field in declared if field.default is MISSING and field.default_factory is MISSING]
     entries = keys(where, mapping, legal=[field.name for field in declared], needed=needed)
     hints = get_type_hints(cls)
     values = {key: _value(f"{where}.{key}", hints[key], value) for key, value in entries.items()}
@@ -45,14 +47,27 @@ def keys(where: str, mapping: Any, *, legal: Sequence[str], needed: Sequence[str
     return mapping
 
 
+def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[str, Any]]:
+    """The kind that an entry names and the rest of its keys: a bare name, or a mapping with a `kind`."""
+    kind = entry.get("kind") if isinstance(entry, Mapping) else entry
+    if not isinstance(kind, str) or kind not in legal:
+        raise SceneError(f"{where}: kind {kind!r} is unknown; legal: {', '.join(legal)}")
+    rest = {key: value for key, value in entry.items() if key != "kind"} if isinstance(entry, Mapping) else {}
+    return kind, rest
+
+
 def choose(where: str, choices: Mapping[str, type[Any]], entry: Any) -> Any:
-    """The dataclass that an entry names, built from the rest: a bare name, or a mapping with a `kind`."""
-    entry = {"kind": entry} if isinstance(entry, str) else entry
-    if not isinstance(entry, Mapping) or entry.get("kind") not in choices:
-        given = entry.get("kind") if isinstance(entry, Mapping) else entry
-        raise SceneError(f"{where}: kind {given!r} is unknown; legal: {', '.join(choices)}")
-    rest = {key: value for key, value in entry.items() if key != "kind"}
-    return build(choices[entry["kind"]], f"{where} ({entry['kind']})", rest)
+    """The dataclass that an entry names, built from the rest."""
+    kind, rest = named(where, list(choices), entry)
+    return build(choices[kind], f"{where} ({kind})", rest)
+
+
+def items(where: str, key: str, mapping: Mapping[str, Any]) -> list[tuple[int, Any]]:
+    """The entries of a list, numbered; an absent one is empty."""
+    entries = mapping.get(key) or []
+    if not isinstance(entries, list | tuple):
+        raise SceneError(f"{where}: {key} must be a list, got {entries!r}")
+    return list(enumerate(entries))
 
 
 def number(where: str, value: Any) -> float:
@@ -67,13 +82,32 @@ def number(where: str, value: Any) -> float:
 
 
 def _value(where: str, kind: Any, value: Any) -> Any:
-    if get_origin(kind) is tuple:
-        n = len(get_args(kind))
-        if not isinstance(value, list | tuple) or len(value) != n:
-            raise SceneError(f"{where} must be a list of {n} numbers, got {value!r}")
-        return tuple(number(f"{where}[{i}]", v) for i, v in enumerate(value))
+    origin, choices = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):  # only "something | None" is declared
+        (inner,) = (choice for choice in choices if choice is not NoneType)
+        return None if value is None else _value(where, inner, value)
+    if origin is Literal:
+        if value not in choices:
+            raise SceneError(f"{where} must be one of {', '.join(map(str, choices))}, got {value!r}")
+        return value
+    if origin is tuple:
+        return _values(where, choices, value)
+    if kind is bool or kind is str:
+        if not isinstance(value, kind):
+            raise SceneError(f"{where} must be {'true or false' if kind is bool else 'text'}, got {value!r}")
+        return value
     if kind is int:
         if isinstance(value, bool) or not isinstance(value, int):
             raise SceneError(f"{where} must be a whole number, got {value!r}")
         return value
     return number(where, value)
+
+
+def _values(where: str, kinds: tuple[Any, ...], value: Any) -> tuple[Any, ...]:
+    """A list as a tuple; `kinds` are those of its items, or one and an ellipsis for a list of any length."""
+    endless = kinds[-1] is Ellipsis
+    if not isinstance(value, list | tuple) or not (endless or len(value) == len(kinds)):
+        what = "numbers" if all(kind in (int, float) for kind in kinds if kind is not Ellipsis) else "entries"
+        raise SceneError(f"{where} must be a list of {'' if endless else f'{len(kinds)} '}{what}, got {value!r}")
+    each = kinds[:1] * len(value) if endless else kinds
+    return tuple(_value(f"{where}[{i}]", kind, v) for i, (kind, v) in enumerate(zip(each, value, strict=True)))

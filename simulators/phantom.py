@@ -1,4 +1,4 @@
-"""Phantom: analytic solids seen by parallel rays with exact chord lengths, and their true attenuation on a grid."""
+"""Phantom: analytic solids seen with exact chord lengths, and their true attenuation on a grid."""
 
 from __future__ import annotations
 
@@ -10,35 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.volume import Grid
 from simulators.chords import add_attenuation, add_line_integrals
+from simulators.detector import Detector
+from simulators.pose import Pose
 from simulators.solids import Packed, Solid, pack
-
-
-@dataclass(frozen=True)
-class Detector:
-    """Where a frame's rays run: pixel (j, i) is at u = (i - axis_col) * pitch, v = (j - axis_row) * pitch.
-
-    Attributes:
-        shape: (rows, cols).
-        pitch: mm at the sample.
-        axis_col: column of the rotation axis, 0 at the centre of the first column.
-        axis_row: row of z = 0, 0 at the centre of the first row.
-    """
-
-    shape: tuple[int, int]
-    pitch: float
-    axis_col: float
-    axis_row: float
-
-    @classmethod
-    def centred(cls, shape: tuple[int, int], pitch: float) -> Detector:
-        """Rotation axis and z = 0 in the middle of the frame."""
-        return cls(shape, pitch, (shape[1] - 1) / 2, (shape[0] - 1) / 2)
-
-    def u(self) -> NDArray[np.float64]:
-        return (np.arange(self.shape[1], dtype=np.float64) - self.axis_col) * self.pitch
-
-    def v(self) -> NDArray[np.float64]:
-        return (np.arange(self.shape[0], dtype=np.float64) - self.axis_row) * self.pitch
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +26,24 @@ class Phantom:
     def of(cls, solids: Sequence[Solid]) -> Phantom:
         return cls(tuple(solids), pack(solids))
 
-    def line_integrals(self, angle: ArrayLike, detector: Detector) -> NDArray[np.float64]:
-        """Line integrals of the attenuation, float64 [row, col], dimensionless, at the pixels' centres.
+    @property
+    def radius(self) -> float:
+        """mm from the rotation axis to the farthest matter (of the boxes around the bodies)."""
+        p = self.packed
+        reach = np.abs(p.centre[:, :2]) + p.extent[:, :2]
+        return float(np.hypot(reach[:, 0], reach[:, 1]).max(initial=0.0))
 
-        Args:
-            angle: radians; one for the frame, or one a row [row].
-        """
-        rows = detector.shape[0]
-        theta = np.ascontiguousarray(np.broadcast_to(np.asarray(angle, dtype=np.float64), (rows,)))
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(type(solid).__name__.lower() for solid in self.solids))
+
+    def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> NDArray[np.float64]:
+        """See Sample.line_integrals."""
+        pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
         out = np.zeros(detector.shape)
         p = self.packed
         u0, v0 = -detector.axis_col * detector.pitch, -detector.axis_row * detector.pitch
-        add_line_integrals(np.cos(theta), np.sin(theta), u0, v0, detector.pitch,
+        add_line_integrals(np.cos(pose.angle), np.sin(pose.angle), u0, v0, detector.pitch,
                            p.kind, p.attenuation, p.centre, p.extent, p.planes, p.half, out)  # fmt: skip
         return out
 
@@ -76,3 +56,15 @@ class Phantom:
         add_attenuation(x[0], y[0], z[0], grid.voxel_size, supersample,
                         p.kind, p.attenuation, p.centre, p.extent, p.planes, p.half, out)  # fmt: skip
         return out.astype(np.float32)
+
+    def labels(self, grid: Grid) -> NDArray[np.uint8]:
+        """See Sample.labels; where solids overlap, the later one is what is there."""
+        out = np.zeros(grid.shape, np.uint8)
+        z, y, x = grid.coordinates()
+        for solid in self.solids:
+            p = pack([solid])
+            share = np.zeros(grid.shape)
+            add_attenuation(x[0], y[0], z[0], grid.voxel_size, 1,
+                            p.kind, np.sign(p.attenuation), p.centre, p.extent, p.planes, p.half, share)  # fmt: skip
+            out[share != 0] = self.names.index(type(solid).__name__.lower()) + 1
+        return out

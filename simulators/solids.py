@@ -8,8 +8,9 @@ rotation axis), orientations quaternions (w, x, y, z) of any length that turn th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,6 +115,9 @@ class Octahedron:
 
 
 Solid = Cylinder | Tube | Ellipsoid | Box | Octahedron
+SOLIDS: Mapping[str, type[Solid]] = MappingProxyType(
+    {cls.__name__.lower(): cls for cls in (Cylinder, Tube, Ellipsoid, Box, Octahedron)}
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.effects.chain import Domain, Image, Shot
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
 
 
 @dataclass(frozen=True)

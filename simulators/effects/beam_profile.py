@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.chain import Domain, Image, Shot
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
 
 
 @dataclass(frozen=True)

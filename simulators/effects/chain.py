@@ -2,62 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.phantom import Detector
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Moments, Shot
+from simulators.pose import Pose
 
-Image = NDArray[np.float64]
-
-
-class Domain(IntEnum):
-    """What an effect acts on, in the order of physics."""
-
-    MOTION = 0
-    OPTICAL_DEPTH = 1
-    PHOTONS = 2
-    ELECTRONS = 3
-    COUNTS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """The circumstances of one exposure.
-
-    Attributes:
-        detector: where the frame's pixels are (after ROI and binning).
-        exposure: s.
-        time: s since the Unix epoch, at the trigger.
-        angle: true angle of the sample at the trigger, radians.
-        elapsed: s since the camera was connected; what drifts runs on it.
-        row_period: s by which each row starts later than the one above.
-        roi: (row0, col0, rows, cols) of the sensor.
-        binning: sensor pixels summed per side.
-        read_noise: electrons rms a sensor pixel.
-        rng: this exposure's own generator.
-    """
-
-    detector: Detector
-    exposure: float
-    time: float
-    angle: float
-    elapsed: float
-    row_period: float
-    roi: tuple[int, int, int, int]
-    binning: int
-    read_noise: float
-    rng: np.random.Generator
+Watch: TypeAlias = Callable[[str], AbstractContextManager[object]]
+"""Entered around each step of an exposure with its name: what measures the cost of effects."""
 
 
 class Effect(Protocol):
     """An effect is a frozen dataclass of its parameters.
 
-    `final` marks the effect that ends its domain: photon noise, after which the photons have been counted.
+    `name` is that of its module; `final` marks what ends its domain: photon noise, after which the photons are counted.
     """
 
     name: ClassVar[str]
@@ -66,28 +30,58 @@ class Effect(Protocol):
 
 
 @runtime_checkable
-class MotionEffect(Effect, Protocol):
-    def times(self, times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
-        """When each row sees the sample: float64 [sample, row] in s after the trigger, averaged over the samples."""
+class SamplingEffect(Effect, Protocol):
+    def moments(self, moments: Moments, shot: Shot) -> Moments:
+        """When each row sees the sample, refined: a frame is the weighted mean over the moments."""
+        ...
+
+
+@runtime_checkable
+class PoseEffect(Effect, Protocol):
+    def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
+        """How the sample stands at `times` (float64 [row], s after the trigger), changed."""
         ...
 
 
 @runtime_checkable
 class ImageEffect(Effect, Protocol):
     def apply(self, image: Image, shot: Shot) -> Image:
-        """The image float64 [row, col] in the effect's domain, changed; a new array."""
+        """The image float64 [row, col] in the effect's domain, changed. The image is the effect's own: it may write
+        over it and give it back."""
         ...
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a monitor should find in a frame.
+
+    Attributes:
+        kind: the anomaly's name.
+        region: (first row, row after the last, first column, column after the last) in pixels of the frame.
+    """
+
+    kind: str
+    region: tuple[int, int, int, int]
+
+
+@runtime_checkable
+class Anomaly(Effect, Protocol):
+    def label(self, shot: Shot) -> Label | None:
+        """Where the anomaly shows in this frame; None where it does not."""
+        ...
+
+
+AnyEffect: TypeAlias = SamplingEffect | PoseEffect | ImageEffect
 
 
 @dataclass(frozen=True)
 class Chain:
     """Effects in an order that physics allows. Make one with `Chain.of`."""
 
-    motion: tuple[MotionEffect, ...]
-    images: tuple[ImageEffect, ...]
+    effects: tuple[AnyEffect, ...]
 
     @classmethod
-    def of(cls, effects: Sequence[MotionEffect | ImageEffect]) -> Chain:
+    def of(cls, effects: Sequence[AnyEffect]) -> Chain:
         """Check the order: motion, optical depth, photons (noise last), electrons, counts; each effect once.
 
         Raises:
@@ -99,29 +93,44 @@ class Chain:
                     raise ValueError(f"effect {effect.name!r} is named twice; name it once")
                 if earlier.domain > effect.domain:
                     raise ValueError(
-                        f"effect {effect.name!r} acts on {_words(effect.domain)} and cannot follow {earlier.name!r}, "
-                        f"which acts on {_words(earlier.domain)}; the order is {', '.join(map(_words, Domain))}"
+                        f"effect {effect.name!r} acts on {effect.domain.words} and cannot follow {earlier.name!r}, "
+                        f"which acts on {earlier.domain.words}; the order is "
+                        f"{', '.join(domain.words for domain in Domain)}"
                     )
                 if earlier.final and earlier.domain == effect.domain:
                     raise ValueError(
                         f"effect {effect.name!r} must come before {earlier.name!r}, which ends the "
-                        f"{_words(effect.domain)}"
+                        f"{effect.domain.words}"
                     )
-        return cls(
-            tuple(effect for effect in effects if isinstance(effect, MotionEffect)),
-            tuple(effect for effect in effects if isinstance(effect, ImageEffect)),
-        )
+        return cls(tuple(effects))
 
-    def apply(self, domain: Domain, image: Image, shot: Shot) -> Image:
+    @property
+    def moves(self) -> bool:
+        """Whether a frame looks at other moments than the trigger."""
+        return any(isinstance(effect, SamplingEffect) for effect in self.effects)
+
+    def moments(self, shot: Shot) -> Moments:
+        moments = Moments.at_trigger(shot.detector.shape[0])
+        for effect in self.effects:
+            if isinstance(effect, SamplingEffect):
+                moments = effect.moments(moments, shot)
+        return moments
+
+    def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
+        for effect in self.effects:
+            if isinstance(effect, PoseEffect):
+                pose = effect.pose(pose, times, shot)
+        return pose
+
+    def apply(self, domain: Domain, image: Image, shot: Shot, watch: Watch = nullcontext) -> Image:
         """The image after the effects of one domain."""
-        for effect in _of(self.images, domain):
-            image = effect.apply(image, shot)
+        for effect in self.effects:
+            if effect.domain == domain and isinstance(effect, ImageEffect):
+                with watch(effect.name):
+                    image = effect.apply(image, shot)
         return image
 
-
-def _of(effects: Iterable[ImageEffect], domain: Domain) -> Iterable[ImageEffect]:
-    return (effect for effect in effects if effect.domain == domain)
-
-
-def _words(domain: Domain) -> str:
-    return domain.name.lower().replace("_", " ")
+    def labels(self, shot: Shot) -> tuple[Label, ...]:
+        """The anomalies that show in a frame."""
+        found = (effect.label(shot) for effect in self.effects if isinstance(effect, Anomaly))
+        return tuple(label for label in found if label)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
-from simulators.effects.chain import Domain, Image, Shot
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot, draws
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,10 @@ class HotPixels:
         rows, cols, rate = self.pixels()
         row0, col0, height, width = shot.roi
         seen = (rows >= row0) & (rows < row0 + height) & (cols >= col0) & (cols < col0 + width)
-        out = image.copy()
+        rng = draws(self.name, shot)
         at = (rows[seen] - row0) // shot.binning, (cols[seen] - col0) // shot.binning
-        np.add.at(out, at, shot.rng.poisson(rate[seen] * shot.exposure))
-        return out
+        np.add.at(image, at, rng.poisson(rate[seen] * shot.exposure))
+        return image
 
     def pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Sensor rows, sensor columns and dark currents (electrons/s) of the hot pixels."""

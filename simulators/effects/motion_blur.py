@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from simulators.effects.chain import Domain, Shot
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Moments, Shot
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class MotionBlur:
         if self.samples < 2:
             raise ValueError(f"samples must be >= 2 (a mean over the exposure), got {self.samples}")
 
-    def times(self, times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
-        moments = (np.arange(self.samples) + 0.5) / self.samples * shot.exposure
-        return (moments[:, None, None] + times).reshape(-1, times.shape[1])
+    def moments(self, moments: Moments, shot: Shot) -> Moments:
+        within = (np.arange(self.samples) + 0.5) / self.samples * shot.exposure
+        times = (within[:, None, None] + moments.times).reshape(-1, moments.times.shape[1])
+        return Moments(times, np.tile(moments.weights / self.samples, self.samples))

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from simulators.effects.chain import Domain, Shot
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Moments, Shot
 
 
 @dataclass(frozen=True)
@@ -19,5 +19,5 @@ class RollingShutter:
     domain: ClassVar[Domain] = Domain.MOTION
     final: ClassVar[bool] = False
 
-    def times(self, times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
-        return times + np.arange(times.shape[1]) * shot.row_period
+    def moments(self, moments: Moments, shot: Shot) -> Moments:
+        return Moments(moments.times + np.arange(moments.times.shape[1]) * shot.row_period, moments.weights)

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.chain import Domain, Image, Shot
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot, draws
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Zingers:
             raise ValueError(f"rate must be >= 0 a second and charge positive, got {self}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        n = int(shot.rng.poisson(self.rate * shot.exposure))
-        out = image.copy()
-        np.add.at(out.reshape(-1), shot.rng.integers(image.size, size=n), shot.rng.exponential(self.charge, n))
-        return out
+        rng = draws(self.name, shot)
+        n = int(rng.poisson(self.rate * shot.exposure))
+        np.add.at(image.reshape(-1), rng.integers(image.size, size=n), rng.exponential(self.charge, n))
+        return image

@@ -17,7 +17,7 @@ from drivers.protocols import TriggerSource
 from recon.geometry import Geometry
 from recon.volume import Grid
 from simulators.clock import ScaledClock, VirtualClock
-from simulators.phantom import Detector
+from simulators.detector import Detector
 from simulators.scene import load_scene
 from tests.beamline.ball_scan import BALL, COMMON, STAGES, fly, shipped, small
 

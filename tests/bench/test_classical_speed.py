@@ -20,7 +20,8 @@ from recon.metrics import psnr
 from recon.operators import Projector
 from recon.volume import Grid
 from simulators.battery import battery
-from simulators.phantom import Detector, Phantom
+from simulators.detector import Detector
+from simulators.phantom import Phantom
 
 F32 = NDArray[np.float32]
 

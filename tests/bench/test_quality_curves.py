@@ -26,7 +26,8 @@ from recon.views import parse_views
 from recon.volume import Grid
 from recon.warm_up import warm_up
 from simulators.battery import battery
-from simulators.phantom import Detector, Phantom
+from simulators.detector import Detector
+from simulators.phantom import Phantom
 
 F32 = NDArray[np.float32]
 STEPS = (30, 60, 125, 250, 500, 1000)

@@ -12,7 +12,8 @@ from recon.geometry import Geometry
 from recon.kernels.voxels_reference import system_matrix
 from recon.operators import Projector, data_residual, project
 from recon.volume import Grid, Volume
-from simulators.phantom import Detector, Phantom
+from simulators.detector import Detector
+from simulators.phantom import Phantom
 from simulators.solids import Ellipsoid
 
 

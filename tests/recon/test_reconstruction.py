@@ -16,7 +16,8 @@ from recon import fit
 from recon.metrics import psnr
 from recon.operators import Projector
 from recon.splat import RayModel, project, voxelize
-from simulators.phantom import Detector, Phantom
+from simulators.detector import Detector
+from simulators.phantom import Phantom
 from simulators.solids import Cylinder, Ellipsoid
 
 SHAPE, PITCH = (20, 40), 0.1

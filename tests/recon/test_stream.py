@@ -12,7 +12,8 @@ from recon.density_control import DensityPolicy
 from recon.initialise import default_count
 from recon.metrics import psnr
 from recon.stream import StreamingFit
-from simulators.phantom import Detector, Phantom
+from simulators.detector import Detector
+from simulators.phantom import Phantom
 from simulators.solids import Cylinder, Ellipsoid
 
 SHAPE, PITCH = (24, 36), 0.1

@@ -23,7 +23,7 @@ from simulators.trigger_line import Pulse, TriggerLine
 from tests.drivers.camera_conformance import SETTINGS, CameraBench, CameraConformance
 
 FLUX = 4e5
-FULL = round(FLUX * SETTINGS.exposure / CONVERSION)  # counts without sample and effects
+FULL = round(FLUX * SETTINGS.exposure / CONVERSION["standard"])  # counts without sample and effects
 BALL = {"kind": "ellipsoid", "semi_axes": [0.03, 0.03, 0.03], "attenuation": 20.0, "centre": [0.08, 0.02, 0.01]}
 
 

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import Geometry
 from recon.volume import Grid
 from simulators.battery import ELECTROLYTE, PARTICLE, battery
-from simulators.phantom import Detector, Phantom
+from simulators.detector import Detector
+from simulators.phantom import Phantom
 from simulators.solids import Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
 
 ANGLES = st.floats(-7.0, 7.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,13 +13,17 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Chain, Domain, Shot
+from simulators import sensor
+from simulators.detector import Detector
+from simulators.effects.catalogue import CATALOGUE, load_effect
+from simulators.effects.chain import Chain
+from simulators.effects.domain import Domain
 from simulators.effects.hot_pixels import HotPixels
-from simulators.exposure import AngleAt, expose
+from simulators.effects.shot import AngleAt, Shot
+from simulators.exposure import expose
 from simulators.mapping import SceneError
-from simulators.phantom import Detector
-from simulators.scene import EFFECTS, SOLIDS, Scene, load_scene
-from simulators.sensor import CONVERSION
+from simulators.scene import Scene, load_scene
+from simulators.solids import SOLIDS
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 PHANTOM = {
@@ -28,6 +33,9 @@ PHANTOM = {
         {"kind": "ellipsoid", "semi_axes": [0.15, 0.05, 0.1], "attenuation": 3.0, "centre": [0.1, 0.05, 0.0]},
     ],
 }
+
+
+CONVERSION = sensor.CONVERSION["standard"]
 
 
 def _scene(*effects: Any, flux: float = 4e5, phantom: Any = PHANTOM) -> Scene:
@@ -44,8 +52,14 @@ def _shot(**changes: Any) -> Shot:
         "row_period": 3.6e-6,
         "roi": (1120, 2008, 60, 80),
         "binning": 1,
-        "read_noise": 0.43,
-        "rng": np.random.default_rng([1, 2]),
+        "readout": "standard",
+        "angle_at": _never,
+        "beam": True,
+        "sample": True,
+        "radius": 0.3,
+        "seed": 1,
+        "frame": 2,
+        "view": 0,
     }
     return Shot(**(values | changes))
 
@@ -55,11 +69,11 @@ def _never(time: float) -> float:
 
 
 def _frame(scene: Scene, shot: Shot | None = None, angle_at: AngleAt = _never, **state: bool) -> NDArray[np.uint16]:
-    return expose(scene, shot or _shot(), angle_at, **({"beam": True, "sample": True} | state))
+    return expose(scene, replace(shot or _shot(), angle_at=angle_at, **state))
 
 
 def _depth(scene: Scene, angle: float) -> NDArray[np.float64]:
-    return scene.line_integrals(angle, _shot().detector)
+    return scene.sample.line_integrals(angle, _shot().detector)
 
 
 def test_without_effects_a_frame_is_exactly_beer_lambert() -> None:
@@ -75,15 +89,20 @@ def test_without_effects_a_frame_is_exactly_beer_lambert() -> None:
 
 
 def test_a_scene_pays_only_for_what_it_names() -> None:
-    shot = _shot()
-    before = shot.rng.bit_generator.state
-    _frame(_scene({"kind": "beam_profile", "sigma": [1, 1]}, {"kind": "beam_decay", "lifetime": 9.0}, "offset"), shot)
-    assert shot.rng.bit_generator.state == before  # nothing random was drawn, and _never was not called
+    """Where no motion is named nobody asks for the stage (_never), and no step is taken that is not named."""
+    steps: list[str] = []
+
+    def watch(step: str) -> AbstractContextManager[None]:
+        steps.append(step)
+        return nullcontext()
+
+    expose(_scene({"kind": "beam_profile", "sigma": [1, 1]}, {"kind": "beam_decay", "lifetime": 9.0}), _shot(), watch)
+    assert [step for step in steps if step in CATALOGUE] == ["beam_profile", "beam_decay"]
 
 
 def test_the_same_seed_makes_the_same_frame_again() -> None:
     scene = load_scene(yaml.safe_load((SCENES / "battery.yaml").read_text(encoding="utf-8")))
-    frames = [_frame(scene, _shot(rng=np.random.default_rng([7, k]))) for k in (3, 4, 3)]
+    frames = [_frame(scene, _shot(frame=k)) for k in (3, 4, 3)]
     np.testing.assert_array_equal(frames[0], frames[2])
     assert (frames[0] != frames[1]).mean() > 0.9
 
@@ -100,7 +119,7 @@ def test_read_noise_and_offset_make_the_dark() -> None:
     dark = _frame(_scene("read_noise", "offset"), beam=False).astype(float)
     assert dark.mean() == pytest.approx(200, abs=0.3)
     assert dark.std() == pytest.approx(math.hypot(0.43 / CONVERSION, 12**-0.5), rel=0.05)
-    quiet = _frame(_scene("read_noise", "offset"), _shot(read_noise=0.27), beam=False).astype(float)
+    quiet = _frame(_scene("read_noise", "offset"), _shot(readout="ultra_quiet"), beam=False).astype(float)
     assert quiet.std() == pytest.approx(math.hypot(0.27 / CONVERSION, 12**-0.5), rel=0.05)
     binned = _frame(_scene("read_noise", "offset"), _shot(binning=4), beam=False).astype(float)
     assert binned.std() == pytest.approx(4 * 0.43 / CONVERSION, rel=0.05)  # √16 pixels
@@ -151,7 +170,7 @@ def test_hot_pixels_stay_on_the_sensor_whatever_the_roi() -> None:
 
 def test_zingers_are_as_many_as_their_rate_says_and_in_one_frame_only() -> None:
     scene = _scene({"kind": "zingers", "rate": 1000.0, "charge": 500.0})
-    frames = np.stack([_frame(scene, _shot(rng=np.random.default_rng(k)), beam=False) for k in range(30)])
+    frames = np.stack([_frame(scene, _shot(frame=k), beam=False) for k in range(30)])
     assert (frames > 0).sum() == pytest.approx(300, abs=4 * math.sqrt(300))  # 30 frames x 10 ms x 1000/s
     assert frames[frames > 0].mean() * CONVERSION == pytest.approx(500, rel=0.3)
     assert ((frames > 0).sum(axis=0) <= 2).all()
@@ -211,21 +230,25 @@ def test_too_much_light_saturates() -> None:
 def test_scenes_that_come_with_the_package_load(name: str) -> None:
     scene = load_scene(yaml.safe_load((SCENES / f"{name}.yaml").read_text(encoding="utf-8")))
     detector = Detector.centred((144, 160), 4.6e-3)
-    views = np.stack([scene.line_integrals(angle, detector) for angle in np.linspace(0, np.pi, 8)])
+    views = np.stack([scene.sample.line_integrals(angle, detector) for angle in np.linspace(0, np.pi, 8)])
     assert 1.0 < views.max() < 3.0
     assert not views[:, :, [0, -1]].any()  # air on both sides
     assert not views[:, [0, -1]].any()
-    assert bool(scene.chain.images) == (name == "battery")
+    assert bool(scene.chain.effects) == (name == "battery")
     flat = _frame(scene, _shot(exposure=0.05), sample=False)
     assert flat.max() < 65535 or name == "battery"  # a zinger may saturate
     assert np.median(flat) < 60_000
 
 
-def test_every_effect_and_solid_can_be_named() -> None:
+def test_every_solid_can_be_named() -> None:
     assert set(SOLIDS) == {"cylinder", "tube", "ellipsoid", "box", "octahedron"}
-    assert {domain.name for domain in {effect.domain for effect in EFFECTS.values()}} == {
-        "MOTION", "PHOTONS", "ELECTRONS", "COUNTS"
-    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_of_the_catalogue_is_what_it_says(name: str) -> None:
+    effect = load_effect(name)
+    assert (effect.name, effect.domain) == (name, CATALOGUE[name].domain)
+    assert effect.__module__ == f"simulators.effects.{name}"
 
 
 def _with(**changes: Any) -> dict[str, Any]:
@@ -236,11 +259,14 @@ def _with(**changes: Any) -> dict[str, Any]:
     ("mapping", "words"),
     [
         ({}, "scene: key 'phantom' is missing; needed: phantom, beam"),
-        (_with(colour="red"), "scene: key 'colour' is unknown; legal: phantom, beam, axis_offset_px, effects"),
-        (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s"),
+        (
+            _with(colour="red"),
+            "scene: key 'colour' is unknown; legal: phantom, beam, axis_offset_px, effects",
+        ),
+        (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s, sod, sdd"),
         (_with(beam={"photons_per_s": -1}), "scene.beam: photons_per_s must be >= 0, got -1.0"),
         (_with(beam={"photons_per_s": "many"}), "scene.beam.photons_per_s must be a finite number, got 'many'"),
-        (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s; got 5"),
+        (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd; got 5"),
         (_with(axis_offset_px=True), "scene.axis_offset_px must be a finite number, got True"),
         (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
         (_with(phantom={"kind": "battery"}), "scene.phantom (battery): key 'field_of_view' is missing"),
@@ -254,17 +280,17 @@ def _with(**changes: Any) -> dict[str, Any]:
         ),
         (
             _with(phantom={"kind": "battery", "field_of_view": [1, 1], "fill": 0.9}),
-            "scene.phantom: only",
+            "scene.phantom (battery): only",
         ),
-        (_with(phantom={"kind": "solids"}), "scene.phantom: key 'solids' is missing"),
-        (_with(phantom={"kind": "solids", "solids": {"a": 1}}), "scene: solids must be a list"),
+        (_with(phantom={"kind": "solids"}), "scene.phantom (solids): key 'solids' is missing"),
+        (_with(phantom={"kind": "solids", "solids": {"a": 1}}), "scene.phantom (solids): solids must be a list"),
         (
             _with(phantom={"kind": "solids", "solids": [{"kind": "cone"}]}),
-            "scene.phantom.solids[0]: kind 'cone' is unknown; legal: cylinder, tube, ellipsoid, box, octahedron",
+            "scene.phantom (solids).solids[0]: kind 'cone' is unknown; legal: cylinder, tube, ellipsoid",
         ),
         (
             _with(phantom={"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 0], "attenuation": 1}]}),
-            "scene.phantom.solids[0] (box): box: edges must be positive",
+            "scene.phantom (solids).solids[0] (box): box: edges must be positive",
         ),
         (_with(effects="offset"), "scene: effects must be a list, got 'offset'"),
         (_with(effects=["fog"]), "scene.effects[0]: kind 'fog' is unknown; legal: motion_blur, rolling_shutter, "),

@@ -15,7 +15,7 @@ def test_counts_are_rounded_and_clipped_to_sixteen_bits() -> None:
 
 
 def test_the_converter_ends_just_below_the_full_well() -> None:
-    electrons = (65535 - OFFSET) * CONVERSION
+    electrons = (65535 - OFFSET) * CONVERSION["standard"]
     assert 6990 < electrons < 7000
     # Dynamic range as the data sheet states it: full well over read noise.
     assert 7000 / READ_NOISE["ultra_quiet"] == pytest.approx(25_900, rel=2e-3)

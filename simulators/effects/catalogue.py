@@ -1,0 +1,43 @@
+"""Catalogue: every effect by name, without importing any: an effect's module is loaded when a scene names it.
+
+The module of effect `photon_noise` is simulators.effects.photon_noise, and its class PhotonNoise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
+
+from simulators.effects.domain import Domain
+
+
+@dataclass(frozen=True)
+class Entry:
+    domain: Domain
+    says: str
+    """What happens, in half a sentence."""
+
+
+CATALOGUE: Mapping[str, Entry] = MappingProxyType(
+    {
+        "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
+        "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later and see the sample turned further"),
+        "beam_profile": Entry(Domain.PHOTONS, "the beam is bright in the middle and striped, and the stripes drift"),
+        "beam_decay": Entry(Domain.PHOTONS, "the ring current falls"),
+        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
+        "dark_current": Entry(Domain.ELECTRONS, "electrons without light"),
+        "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
+        "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
+        "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
+        "offset": Entry(Domain.COUNTS, "the digital bias"),
+    }
+)
+
+
+def load_effect(name: str) -> type[Any]:
+    """The class (see chain.AnyEffect) of an effect of the catalogue; only now is its module imported."""
+    module = import_module(f"simulators.effects.{name}")
+    return getattr(module, name.title().replace("_", ""))

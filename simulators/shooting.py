@@ -1,0 +1,51 @@
+"""Shooting: how a scene is looked at where no instrument is configured: the detector's and the scan's settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Attributes:
+    shape: (rows, cols) of the frame, after binning.
+    pixel_size_um: of an unbinned pixel, at the sample.
+    exposure_s: of a frame.
+    binning: sensor pixels summed per side.
+    readout: the camera's mode.
+    """
+
+    shape: tuple[int, int] = (512, 512)
+    pixel_size_um: float = 4.6
+    exposure_s: float = 0.05
+    binning: int = 1
+    readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
+
+    def __post_init__(self) -> None:
+        if not (min(self.shape) >= 1 and self.pixel_size_um > 0 and self.exposure_s > 0):
+            raise ValueError(f"shape, pixel_size_um and exposure_s must be positive, got {self}")
+        if self.binning not in (1, 2, 4):
+            raise ValueError(f"binning must be 1, 2 or 4, got {self.binning}")
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """Attributes:
+    views: evenly spaced over the range, its end excluded.
+    range_deg: degrees.
+    period_s: s from one trigger to the next; the stage turns steadily, unless `fly` is false: then it stands while
+        a view is exposed.
+    darks, flats: taken before the views.
+    """
+
+    views: int = 180
+    range_deg: float = 180.0
+    period_s: float = 0.1
+    fly: bool = True
+    darks: int = 10
+    flats: int = 10
+
+    def __post_init__(self) -> None:
+        if not (self.views >= 1 and self.period_s > 0 and self.range_deg != 0 and min(self.darks, self.flats) >= 0):
+            raise ValueError(f"views and period_s must be positive, range_deg not 0, darks and flats >= 0, got {self}")
