@@ -41,7 +41,7 @@ def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
         assert bench.devices.stage.remaining_pulses() in (0, None)
     assert stamps == list(range(block.n))
     scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
-    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.line_integrals(a, detector)) for a in block.angles])
+    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.sample.line_integrals(a, detector)) for a in block.angles])
     assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
 
 
@@ -124,7 +124,7 @@ def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
     np.testing.assert_allclose(centre, 0.06 * np.cos(block.angles), atol=2e-4)
     # And each picture is the scene's at that angle, to the rounding of a count; a tenth of a step would show.
     scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
-    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.line_integrals(a, detector)) for a in block.angles])
+    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.sample.line_integrals(a, detector)) for a in block.angles])
     assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
 
 
