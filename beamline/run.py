@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from itertools import count
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from beamline.acquire import Acquisition
 from beamline.announce import Announcer
@@ -26,13 +25,11 @@ from beamline.live import LiveCommand, LiveReconstruction
 from beamline.narration import UserLog
 from beamline.prepare import Prepared, prepare
 from beamline.recorder import Recorder
+from beamline.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
 from drivers.manual import Ask
-
-SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
-EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
 
 
 class State(StrEnum):
@@ -121,8 +118,8 @@ def run_scan(
         with ExitStack() as stack:
             try:
                 (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
-                events = stack.enter_context(_log(folder / EVENTS))
-                log = stack.enter_context(_log(folder / USER_LOG))
+                events = stack.enter_context(new_log(folder / EVENTS))
+                log = stack.enter_context(new_log(folder / USER_LOG))
             except OSError as error:
                 raise DataError(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
@@ -136,18 +133,6 @@ def _heed(stop: StopRequest) -> None:
     """Before the run has begun, a stop is as good as an abort."""
     if stop.stopping:
         raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
-
-
-def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
-    """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
-    stem = f"{time.strftime('%Y-%m-%dT%H-%M-%S', time.gmtime(seconds))}_{sample}"
-    runs.mkdir(parents=True, exist_ok=True)
-    for number in count(1):
-        folder = runs / (stem if number == 1 else f"{stem}-{number}")
-        with suppress(FileExistsError):
-            folder.mkdir()
-            break
-    return folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,17 +269,6 @@ class _Run:
             "total_bytes": timeline.total_bytes,
             "remarks": timeline.remarks,
         }
-
-
-@contextmanager
-def _log(path: Path) -> Iterator[TextIO]:
-    """A new text file. Its last words may be lost to a full disk, which must not replace why the run ended."""
-    file = path.open("x", encoding="utf-8")
-    try:
-        yield file
-    finally:
-        with suppress(OSError):
-            file.close()
 
 
 def _acquire(acquisition: Acquisition, recorder: Recorder) -> None:

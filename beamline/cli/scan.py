@@ -18,7 +18,8 @@ from beamline.config import Config, load
 from beamline.dry_run import dry_run, refuse_violations
 from beamline.events import Event, Sink
 from beamline.live import LiveCommand, follow_command
-from beamline.run import RECON, RunResult, run_scan
+from beamline.run import RunResult, run_scan
+from beamline.run_folder import RECON
 from beamline.stop import StopRequest
 from beamline.terminal import Terminal
 from drivers.clock import SystemClock

@@ -22,7 +22,7 @@ from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
 from beamline.events import Event
 from beamline.ledger import LedgerError
 from beamline.pipeline import Selection, prepare
-from beamline.run import State, create_run_folder, run_scan
+from beamline.run import State, run_scan
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from beamline.storage.source import open_scan
@@ -376,14 +376,6 @@ def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_pa
     np.testing.assert_allclose(prepared.projections.data, np.broadcast_to(expected, (12, 8, 40)), atol=1e-4)
 
 
-@pytest.mark.parametrize("taken", [0, 1, 3])
-def test_a_folder_is_never_used_twice(tmp_path: Path, taken: int) -> None:
-    made = [create_run_folder(tmp_path / "runs", "cell", 1_795_152_753.0) for _ in range(taken + 1)]
-    assert len(set(made)) == taken + 1
-    assert made[0].name == "2026-11-20T05-32-33_cell"
-    assert all(folder.is_dir() for folder in made)
-
-
 @pytest.mark.parametrize("below", ["", "deeper/still"])
 def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> None:
     (tmp_path / "runs").write_text("a file")
@@ -391,8 +383,6 @@ def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> N
     with pytest.raises(ConfigError, match="there is a file at"):
         run_scan(small(), tmp_path / "runs" / below, bench=instrument.bench())
     assert instrument.log == []
-    with pytest.raises(FileExistsError):
-        create_run_folder(tmp_path / "runs", "cell", 0.0)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,36 @@
+"""Run folder: a folder of its own for every run, the names of what lies in it, and logs that are begun, never gone on with."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import TextIO
+
+SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
+EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
+
+
+def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
+    """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
+    stem = f"{time.strftime('%Y-%m-%dT%H-%M-%S', time.gmtime(seconds))}_{sample}"
+    runs.mkdir(parents=True, exist_ok=True)
+    for number in count(1):
+        folder = runs / (stem if number == 1 else f"{stem}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            break
+    return folder
+
+
+@contextmanager
+def new_log(path: Path) -> Iterator[TextIO]:
+    """A new text file. Its last words may be lost to a full disk, which must not replace why the run ended."""
+    file = path.open("x", encoding="utf-8")
+    try:
+        yield file
+    finally:
+        with suppress(OSError):
+            file.close()
