@@ -20,7 +20,8 @@ from beamline.pipeline import Prepared, Selection, prepare
 from beamline.recon_options import SourceOptions
 from beamline.recon_report import facts_of
 from beamline.storage.recon_file import named_on_failure
-from beamline.tradeoff_report import Table, write_figures, write_table
+from beamline.tradeoff_report import write_figures, write_table
+from beamline.tradeoff_table import Table
 from beamline.trial_data import Data
 from beamline.trial_run import compile_kernels, run_trial
 from beamline.trials import Depth, Outcome, Timed, plan, seconds_left

@@ -7,7 +7,6 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
 from html import escape
 from pathlib import Path
 from textwrap import fill
@@ -18,13 +17,12 @@ from beamline.machine import machine_line
 from beamline.report import METRICS, Picture, page, picture_html, table_html
 from beamline.storage.recon_file import named_on_failure, whole_file
 from beamline.tradeoff_figures import cost_curves, pareto_plot
+from beamline.tradeoff_table import Table
 from beamline.trials import Outcome
 from beamline.version import version
 from recon.quality import parts_of
 
 _FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
-
-
 _COLUMNS = 120
 _SHORT = {"psnr": "PSNR", "ssim3d": "SSIM", "residual_held_out": "held out", "resolution": "FSC"}
 _LONG = {
@@ -33,78 +31,6 @@ _LONG = {
     "residual_held_out": "residual of views held out",
     "resolution": "period in {} to which two halves of the views agree",
 }
-
-
-@dataclass(frozen=True)
-class Table:
-    """All trials of a trade-off and what they were made on.
-
-    Attributes:
-        outcomes: in the order of the plan.
-        by: what quality means: "psnr" or "residual_held_out", as dB either way.
-        length_unit: of the resolution, "mm" or "px".
-        machine: of `beamline.machine.machine`.
-        scan: facts for people, by name.
-        command: that repeats it.
-        stopped: somebody ended it before all trials were done.
-    """
-
-    outcomes: tuple[Outcome, ...]
-    by: str
-    length_unit: str
-    machine: Mapping[str, str | int]
-    scan: Mapping[str, str]
-    command: str
-    stopped: bool = False
-
-    def with_outcome(self, index: int, outcome: Outcome) -> Table:
-        return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
-
-    @property
-    def n_done(self) -> int:
-        return sum(outcome.status == "done" for outcome in self.outcomes)
-
-    @property
-    def compared(self) -> tuple[Outcome, ...]:
-        """The trials that reconstruct the scan and did it."""
-        return tuple(o for o in self.outcomes if o.status == "done" and o.trial.group != "precision")
-
-    @property
-    def qualities(self) -> list[float]:
-        """dB of each trial in `compared`."""
-        return [outcome.quality(self.by) for outcome in self.compared]
-
-    @property
-    def quality_name(self) -> str:
-        return "PSNR" if self.by == "psnr" else "−20 log₁₀ of the held-out residual"
-
-    def front(self, cost: str) -> list[int]:
-        """Positions in `compared` that are on the front of `cost`: "seconds" or "memory".
-
-        Costs to 1 %: below that it is chance which of two trials was the cheaper one.
-        """
-        return pareto.front([pareto.rounded(value) for value in self.costs(cost)], self.qualities)
-
-    def costs(self, cost: str) -> list[float]:
-        if cost == "seconds":
-            return [outcome.seconds for outcome in self.compared]
-        return [math.nan if o.peak_bytes is None else float(o.peak_bytes) for o in self.compared]
-
-    def told(self, outcome: Outcome) -> dict[str, Any]:
-        """One trial, for an event; `gaussians` are those at its start, as in its settings."""
-        return {
-            **asdict(outcome.trial),
-            "label": outcome.trial.label,
-            "status": outcome.status,
-            "seconds": outcome.seconds,
-            "cpu_seconds": outcome.cpu_seconds,
-            "gaussians_end": outcome.gaussians,
-            "peak_bytes": outcome.peak_bytes,
-            "quality_db": outcome.quality(self.by),
-            "message": outcome.message,
-            **outcome.metrics,
-            **outcome.details,
-        }
 
 
 def text(table: Table) -> str:

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from beamline.machine import machine
-from beamline.tradeoff_report import Table, conclusions, finite, text, to_csv, to_html, write_figures, write_table
+from beamline.tradeoff_report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
+from beamline.tradeoff_table import Table
 from beamline.trials import Depth, Outcome, Trial, plan
 
 BASE = Trial("method", "fbp", 10)
@@ -43,17 +44,6 @@ def test_the_table_fits_into_120_columns(depth: Depth) -> None:
     head = next(line for line in said.splitlines() if line.startswith("  trial"))
     assert {len(row) for row in rows} == {len(head)}
     assert all(" 12346 " in row and " 40000 " in row for row in rows)
-
-
-def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
-    trial = Trial("method", "fbp", 10)
-    outcomes = [
-        Outcome(replace(trial, views=views), "done", seconds, memory, {"psnr": psnr})
-        for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
-    ]
-    table = Table(tuple(outcomes), "psnr", "mm", machine(), {}, "")
-    assert table.front("seconds") == [0, 1]
-    assert table.front("memory") == [1]
 
 
 def test_each_further_decibel_is_told_with_its_price() -> None:
