@@ -1,4 +1,4 @@
-"""Run folder: a folder of its own for every run, the names of what lies in it, and logs that are begun, never gone on with."""
+"""Run folder: each run has its own, with files of set names, and with logs that are begun and never gone on with."""
 
 from __future__ import annotations
 
