@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
 from beamline.config_section import Section
-from drivers.stages.zaber_train import PulseSettings
+from drivers.stages.zaber_train import PulseSettings, pulses_of
 
 
 class _Stage(Section):
@@ -119,21 +119,23 @@ class ZaberStageConfig(_Stage):
 
     @model_validator(mode="after")
     def _possible_pulses(self) -> Self:
-        width = self.pulse_width_s
-        if self.toggle and width is not None:
-            raise ValueError("a toggled output has no pulse width of its own; set pulse_width_s null or toggle false")
-        try:
-            PulseSettings(
-                self.output,
-                1e-3 if width is None else width,
-                chained=self.chained,
-                fires_when_enabled=self.fires_when_enabled,
-                starter=self.starter,
-                repeater=self.repeater,
-            )
-        except ValueError as problem:
-            raise ValueError(str(problem)) from None
+        assert self.pulses
         return self
+
+    @property
+    def pulses(self) -> PulseSettings:
+        """How the driver is to make them."""
+        rest = PulseSettings(
+            measured=self.measured,
+            chained=self.chained,
+            fires_when_enabled=self.fires_when_enabled,
+            starter=self.starter,
+            repeater=self.repeater,
+            shortest=self.shortest_s,
+        )
+        return pulses_of(
+            rest, output=self.output, width=self.pulse_width_s, active_high=self.active_high, toggle=self.toggle
+        )
 
 
 StageConfig = PM16CStageConfig | PiGcsStageConfig | ZaberStageConfig

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from beamline.plan import Block, FieldPlan, Mode, Place, ScanPlan
 from beamline.triggers import Flight
 from drivers.protocols import CameraTiming, StageLimits
+from drivers.stages.travel import least_interval
 
 ROOM = 1.1
 """Free disk asked for, times pixels and previews: per-frame values and what else grows meanwhile."""
@@ -41,6 +42,8 @@ def violations(facts: Facts) -> Iterator[str]:
         yield from _speed(facts)
         if not facts.stage.trigger_output:
             yield "the stage has no trigger output, which a fly scan needs; use scan.mode: step"
+        elif facts.flight:
+            yield from _spacing(facts.flight.interval, facts.stage)
     yield from _limits(facts)
     cols = facts.camera.shape[1]
     if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
@@ -125,6 +128,24 @@ def _speed(facts: Facts) -> Iterator[str]:
         )
 
 
+def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
+    """The trigger output must be able to tell the pulses apart, whatever the speed at which a train is passed."""
+    least, unit = least_interval(stage), stage.interval_unit
+    if interval % unit:
+        yield (
+            f"views are {interval} counts of the stage apart, and a trigger output that is toggled needs a multiple of "
+            f"{unit}; take another number of views, devices.stage.toggle: false where the firmware can, or "
+            "scan.mode: step"
+        )
+    elif interval < least:
+        fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
+        yield (
+            f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
+            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s; take fewer views, a shorter "
+            f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {_down(fastest):g}"
+        )
+
+
 def _limits(facts: Facts) -> Iterator[str]:
     low, high = facts.reach
     slack = math.pi / facts.stage.counts_per_turn
@@ -160,6 +181,12 @@ def _up(seconds: float) -> float:
     """Rounded up to three digits: advice that works when it is followed."""
     unit = 10.0 ** (math.floor(math.log10(seconds)) - 2)
     return math.ceil(seconds / unit - 1e-9) * unit
+
+
+def _down(value: float) -> float:
+    """Rounded down to three digits, as `_up`."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return math.floor(value / unit + 1e-9) * unit
 
 
 def degrees(angle: float) -> str:

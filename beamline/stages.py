@@ -6,8 +6,9 @@ Each driver is imported where it is asked for.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 from beamline.config_devices import StageOutputShutter
 from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
@@ -16,7 +17,11 @@ from drivers.clock import Clock
 from drivers.protocols import RotationStage, StageLimits
 from drivers.shutter import DigitalOutput, OutputShutter
 
-_REFERENCES = {"switch": "FRF", "negative_limit": "FNL", "positive_limit": "FPL"}
+_REFERENCES: Mapping[str, Literal["FRF", "FNL", "FPL"]] = {
+    "switch": "FRF",
+    "negative_limit": "FNL",
+    "positive_limit": "FPL",
+}
 
 
 class _Figures(TypedDict):
@@ -68,7 +73,7 @@ def make_stage(config: StageConfig, url: str, clock: Clock) -> RotationStage:
                 url,
                 axis=config.axis,
                 trigger_line=config.trigger_line,
-                reference=_REFERENCES[config.reference],  # type: ignore[arg-type]
+                reference=_REFERENCES[config.reference],
                 first_pulse=config.first_pulse,
                 firmware_pulse=config.firmware_pulse_s,
                 tolerance=config.tolerance_counts,
@@ -78,7 +83,6 @@ def make_stage(config: StageConfig, url: str, clock: Clock) -> RotationStage:
             )
         case ZaberStageConfig():
             from drivers.stages.zaber import ZaberStage
-            from drivers.stages.zaber_train import PulseSettings
 
             return ZaberStage(
                 url,
@@ -87,14 +91,7 @@ def make_stage(config: StageConfig, url: str, clock: Clock) -> RotationStage:
                 output=config.output,
                 toggle=config.toggle,
                 speed_unit=config.speed_unit,
-                pulses=PulseSettings(
-                    measured=config.measured,
-                    chained=config.chained,
-                    fires_when_enabled=config.fires_when_enabled,
-                    starter=config.starter,
-                    repeater=config.repeater,
-                    shortest=config.shortest_s,
-                ),
+                pulses=config.pulses,
                 **wiring,
                 **figures,
             )
@@ -109,22 +106,19 @@ def stage_limits(config: StageConfig) -> StageLimits:
     figures = _figures(config)
     match config:
         case PM16CStageConfig():
-            from drivers.stages import pm16c, pm16c_train
+            from drivers.stages import pm16c_limits, pm16c_train
 
-            pm16c_train.PulseWidths(config.pulse_width_s)
-            return pm16c.limits_of(**figures, first_pulse=pm16c_train.FirstPulse(config.first_pulse))
+            begin = pm16c_train.FirstPulse(config.first_pulse)
+            return pm16c_limits.limits_of(**figures, first_pulse=begin, pulse_width=config.pulse_width_s)
         case PiGcsStageConfig():
-            from drivers.stages import pi_gcs
-            from drivers.stages.pi_gcs_train import FirstPulse
+            from drivers.stages import pi_gcs_limits, pi_gcs_train
 
-            return pi_gcs.limits_of(**figures, first_pulse=FirstPulse(config.first_pulse))
+            begins = pi_gcs_train.FirstPulse(config.first_pulse)
+            return pi_gcs_limits.limits_of(**figures, first_pulse=begins, firmware_pulse=config.firmware_pulse_s)
         case ZaberStageConfig():
-            from drivers.stages.zaber_axis import native_limits
+            from drivers.stages import zaber_limits
 
-            counts = config.counts_per_turn
-            _, native = native_limits(counts, figures["max_speed"], figures["acceleration"], config.speed_unit)
-            actual = native * 1e4 / config.speed_unit * 2 * math.pi / counts
-            return StageLimits(counts, figures["max_speed"], actual, figures["low"], figures["high"], True)
+            return zaber_limits.limits_of(**figures, pulses=config.pulses, speed_unit=config.speed_unit)
 
 
 def output_of(config: StageConfig, stage: RotationStage, number: int) -> DigitalOutput:

@@ -21,6 +21,8 @@ class StageLimits:
         low, high: soft limits in radians.
         trigger_output: it can emit position-synchronised trigger pulses.
         run_up: intervals of a train before its first pulse within which the stage cannot be armed.
+        pulse_spacing: s that the pulses of a train must be apart at `max_speed`.
+        interval_unit: counts; intervals of trains must be multiples of it (2 where each fire toggles the output).
     """
 
     counts_per_turn: int
@@ -30,6 +32,8 @@ class StageLimits:
     high: float
     trigger_output: bool
     run_up: int = 0
+    pulse_spacing: float = 0.0
+    interval_unit: int = 1
 
 
 @dataclass(frozen=True)

@@ -19,35 +19,12 @@ from drivers.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.pi_gcs_axis import AxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs_digital import GcsOutput
 from drivers.stages.pi_gcs_errors import EVENTS, STOPPED, advice, meaning
+from drivers.stages.pi_gcs_limits import FIRMWARE_PULSE, SLOWEST, limits_of
 from drivers.stages.pi_gcs_line import GcsLine
-from drivers.stages.pi_gcs_train import FirstPulse, TriggerWindow, is_spent_by, window_of
+from drivers.stages.pi_gcs_train import FirstPulse, is_spent_by, window_of
 from drivers.stages.standing import POLL, longest_stop, until_standing
 from drivers.stages.stops import Stops
-from drivers.stages.travel import Travel, check_figures
-
-SLOWEST = 1e-6
-"""degrees/s that can still be written."""
-
-
-def limits_of(
-    counts_per_turn: int,
-    max_speed: float,
-    acceleration: float,
-    low: float,
-    high: float,
-    first_pulse: FirstPulse = FirstPulse.AT_THRESHOLD,
-) -> StageLimits:
-    """What the controller makes of the figures configured for a stage (rad/s, rad/s², rad); it takes them as they are.
-    Where the first pulse comes a step after the threshold, the stage must stand more than a step before it.
-
-    Raises:
-        ValueError: figures that no stage can have.
-    """
-    check_figures(counts_per_turn, max_speed, acceleration, low, high)
-    if min(math.degrees(max_speed), math.degrees(acceleration)) < SLOWEST:
-        raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
-    run_up = 1 if first_pulse is FirstPulse.STEP_AFTER else 0
-    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True, run_up=run_up)
+from drivers.stages.travel import Travel
 
 
 class PiGcsStage:
@@ -71,7 +48,7 @@ class PiGcsStage:
         transcript: file to which every byte on the wire is appended; None keeps none.
         reference: how `start_home` finds the reference: by its switch, or the negative or positive limit switch.
         first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
-        firmware_pulse: s that the firmware holds a pulse, from memory; trains must leave as long between two.
+        firmware_pulse: s that the firmware holds a pulse; trains must leave as long between two.
         tolerance: counts from the target within which a move has arrived (a servo holds to a few counts, never one).
         settle: s after a move in which the controller may still bring the axis on target.
 
@@ -99,13 +76,13 @@ class PiGcsStage:
         transcript: Path | None = None,
         reference: Literal["FRF", "FNL", "FPL"] = "FRF",
         first_pulse: FirstPulse | str = FirstPulse.AT_THRESHOLD,
-        firmware_pulse: float = 50e-6,
+        firmware_pulse: float = FIRMWARE_PULSE,
         tolerance: int = 10,
         settle: float = 1.0,
     ) -> None:
         self.name = name
         self._clock, self._url, self._axis_name, self._trigger_line = clock, url, axis, trigger_line
-        self._reference, self._active_high, self._pulse = reference, active_high, firmware_pulse
+        self._reference, self._active_high = reference, active_high
         self._tolerance, self._settle = tolerance, settle
         if pulse_width is not None:
             raise DeviceRefused(
@@ -117,7 +94,7 @@ class PiGcsStage:
             )
         try:
             self._first_pulse = FirstPulse(first_pulse)
-            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse, firmware_pulse)
             self._travel = Travel(name, limits)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
@@ -206,7 +183,11 @@ class PiGcsStage:
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
-        window = self._window(train)
+        self._travel.refuse_train(train)
+        try:
+            window = window_of(train, self._first_pulse)
+        except ValueError as problem:
+            raise self._travel.cannot_emit(train, f": {problem}") from problem
         self._axis.standing("arming")
         self._travel.refuse_late_arming(train, self._axis.counts(), window.start)
         self._train = None
@@ -257,18 +238,6 @@ class PiGcsStage:
 
     def close(self) -> None:
         self._line.close()
-
-    def _window(self, train: TriggerTrain) -> TriggerWindow:
-        """Refuses what cannot be emitted."""
-        pitch = math.inf if train.n == 1 else abs(self.to_angle(train.interval)) / self.limits.max_speed
-        why = ""
-        try:
-            if train.n >= 1 and train.interval and 2 * self._pulse <= pitch and self._travel.has_room_for(train):
-                return window_of(train, self._first_pulse)
-        except ValueError as problem:
-            why = f": {problem}"
-        apart = f"one or more, not closer than {2 * self._pulse:g} s at full speed"
-        raise self._travel.cannot_emit(train, apart, why)
 
     @contextmanager
     def _begin(self, purpose: str) -> Iterator[None]:

@@ -13,42 +13,14 @@ from pathlib import Path
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pm16c_channel import MAX_COUNT, MAX_SPEED, ChannelStatus, PM16CChannel
+from drivers.stages.pm16c_channel import MAX_COUNT, ChannelStatus, PM16CChannel
 from drivers.stages.pm16c_home import HomeSearch
-from drivers.stages.pm16c_rates import RATES, steepest_code
+from drivers.stages.pm16c_limits import limits_of
+from drivers.stages.pm16c_rates import steepest_code
 from drivers.stages.pm16c_train import MODES, FirstPulse, PulseWidths, points_of
 from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
-from drivers.stages.travel import Travel, check_figures
-
-
-def limits_of(
-    counts_per_turn: int,
-    max_speed: float,
-    acceleration: float,
-    low: float,
-    high: float,
-    first_pulse: FirstPulse = FirstPulse.AT_START,
-) -> StageLimits:
-    """What the controller makes of the figures configured for a stage (rad/s, rad/s², rad): its acceleration is the
-    steepest one that it has and that is not above `acceleration`. Where the first pulse comes an interval after the
-    start point, the stage must stand more than that before it.
-
-    Raises:
-        ValueError: a speed or a place that it does not have, or even its gentlest acceleration is above.
-    """
-    check_figures(counts_per_turn, max_speed, acceleration, low, high)
-    radians = 2 * math.pi / counts_per_turn
-    if max(abs(low), abs(high)) > MAX_COUNT * radians:
-        raise ValueError(f"the controller counts to {MAX_COUNT}, which is {math.degrees(MAX_COUNT * radians):g} deg")
-    fastest = round(max_speed / radians)
-    if not 1 <= fastest <= MAX_SPEED:
-        raise ValueError(
-            f"{math.degrees(max_speed):g} deg/s are {fastest} pulses/s, the controller gives 1 to {MAX_SPEED}"
-        )
-    acceleration = 1e6 / RATES[steepest_code(acceleration / radians)] * radians
-    run_up = 1 if first_pulse is FirstPulse.INTERVAL_AFTER else 0
-    return StageLimits(counts_per_turn, max_speed, acceleration, low, high, trigger_output=True, run_up=run_up)
+from drivers.stages.travel import Travel
 
 
 class PM16CStage:
@@ -107,7 +79,7 @@ class PM16CStage:
             )
         try:
             self._first_pulse = FirstPulse(first_pulse)
-            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse, pulse_width)
             self._travel = Travel(name, limits)
             self._widths = PulseWidths(pulse_width)
             self._home = self._home_count(home)
@@ -196,13 +168,10 @@ class PM16CStage:
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
-        width = self._widths.widest_for(train, self._fastest)
-        if train.n < 1 or train.interval == 0 or width is None or not self._travel.has_room_for(train):
-            apart = f"one or more, not closer than {2 * self._widths.narrowest:g} s at full speed"
-            raise self._travel.cannot_emit(train, apart)
+        self._travel.refuse_train(train)
         points, counts = points_of(train, self._first_pulse), self._channel.standing("arming").counts
         self._travel.refuse_late_arming(train, counts, points.start)
-        self._channel.arm(MODES[width], points)
+        self._channel.arm(MODES[self._widths.widest_for(train, self.limits)], points)
 
     def disarm(self) -> None:
         self._channel.disarm()

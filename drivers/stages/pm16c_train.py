@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drivers.protocols import TriggerTrain
+from drivers.protocols import StageLimits, TriggerTrain
+from drivers.stages.travel import counts_in
 
 MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}
 """Pulse width in s, the widest first -> TMGM mode."""
@@ -37,13 +38,15 @@ class PulseWidths:
         """s."""
         return min(self.allowed)
 
-    def widest_for(self, train: TriggerTrain, fastest: float) -> float | None:
-        """The widest that leaves the output low as long as high at `fastest` counts/s; None where none does.
+    @property
+    def spacing(self) -> float:
+        """s that pulses must be apart. Nearer ones would run together: the controller leaves the output high then."""
+        return 2 * self.narrowest
 
-        Wider pulses would run together: the controller leaves the output high then.
-        """
-        pitch = math.inf if train.n == 1 else abs(train.interval) / fastest
-        return next((width for width in self.allowed if 2 * width <= pitch), None)
+    def widest_for(self, train: TriggerTrain, limits: StageLimits) -> float:
+        """The widest that leaves the output low as long as high at full speed, for a train that keeps the spacing."""
+        fits = (w for w in self.allowed if train.n == 1 or abs(train.interval) >= counts_in(2 * w, limits))
+        return next(fits, self.narrowest)
 
 
 class FirstPulse(StrEnum):

@@ -13,10 +13,14 @@ FARTHEST = 1e9
 """rad."""
 MOST = 2.0**53
 """counts that a float still tells apart."""
+ROUNDING = 1e-6
+"""counts by which a spacing may be missed: floats give no better where speeds are written in degrees."""
 
 
-def check_figures(counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float) -> None:
-    """The figures configured for a stage: counts for 2π, rad/s, rad/s², rad.
+def check_figures(
+    counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float, pulse_spacing: float
+) -> None:
+    """The figures configured for a stage: counts for 2π, rad/s, rad/s², rad, and s between pulses.
 
     Raises:
         ValueError: figures that no stage can have.
@@ -31,6 +35,19 @@ def check_figures(counts_per_turn: int, max_speed: float, acceleration: float, l
         raise ValueError(f"from {math.degrees(low):g} to {math.degrees(high):g} deg there is no room to move")
     if not (high - low) * per_radian < MOST:
         raise ValueError(f"{(high - low) * per_radian:g} counts are more than can be told apart")
+    if not 0 <= pulse_spacing * max_speed * per_radian < MOST:
+        raise ValueError(f"pulses cannot be {pulse_spacing:g} s apart")
+
+
+def counts_in(seconds: float, limits: StageLimits) -> int:
+    """Whole counts that take this long, or longer, at the stage's full speed."""
+    return math.ceil(seconds * limits.max_speed * limits.counts_per_turn / (2 * math.pi) - ROUNDING)
+
+
+def least_interval(limits: StageLimits) -> int:
+    """Counts between pulses below which they would run together when a train is passed at the stage's full speed."""
+    units = -(-counts_in(limits.pulse_spacing, limits) // limits.interval_unit)
+    return max(units, 1) * limits.interval_unit
 
 
 @dataclass(frozen=True)
@@ -91,16 +108,27 @@ class Travel:
             )
         return self.to_counts(angle)
 
-    def has_room_for(self, train: TriggerTrain) -> bool:
-        """Its pulses are within the soft limits."""
-        return all(self.low <= at <= self.high for at in (train.start, train.end))
+    def refuse_train(self, train: TriggerTrain) -> None:
+        """Refuses a train without pulses or intervals, one whose pulses would run together at full speed or are no
+        multiple of `interval_unit` apart, and one beyond the soft limits. How far apart a single pulse is says nothing.
+        """
+        interval, least = abs(train.interval), least_interval(self.limits)
+        close = train.n > 1 and interval < least
+        uneven = train.n > 1 and interval % self.limits.interval_unit != 0
+        within = all(self.low <= at <= self.high for at in (train.start, train.end))
+        if train.n < 1 or interval == 0 or close or uneven or not within:
+            raise self.cannot_emit(train, advice="A lower max_speed lets pulses be closer" if close else "")
 
-    def cannot_emit(self, train: TriggerTrain, expected: str, why: str = "") -> DeviceRefused:
-        """The refusal of a train that is not as `expected`."""
+    def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
+        """The refusal of a train, with what every train must be."""
+        unit, least = self.limits.interval_unit, least_interval(self.limits)
+        multiple = f" apart by a multiple of {unit} counts (a toggled output: an even number)," if unit > 1 else ""
         return DeviceRefused(
             self.name,
             f"{train.n} pulses every {train.interval} counts from {self.degrees(train.start)} cannot be emitted{why}",
-            expected=f"{expected}, all within {self.span}",
+            expected=f"one or more, not closer than {self.limits.pulse_spacing:g} s at full speed, which are {least} "
+            f"counts,{multiple} all within {self.span}",
+            advice=advice,
             state="This train is not armed and nothing was sent for it; the stage stands where the last move left it",
         )
 

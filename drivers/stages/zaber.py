@@ -16,11 +16,12 @@ from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
-from drivers.stages.travel import Travel, check_figures
-from drivers.stages.zaber_axis import SPEED_UNIT, AxisStatus, ZaberAxis, native_limits
+from drivers.stages.travel import Travel
+from drivers.stages.zaber_axis import AxisStatus, ZaberAxis
+from drivers.stages.zaber_limits import SPEED_UNIT, limits_of, native_limits
 from drivers.stages.zaber_packet import meaning_of
 from drivers.stages.zaber_pulses import ZaberOutput, ZaberPulses
-from drivers.stages.zaber_train import PulseSettings, refusal
+from drivers.stages.zaber_train import PulseSettings, pulses_of
 
 STANDING_IN_PLACE = 10.0
 """s beyond twice the time of a short move after which it has failed."""
@@ -82,16 +83,13 @@ class ZaberStage:
         try:
             if not (1 <= device <= 99 and 1 <= axis <= 9):
                 raise ValueError(f"device {device}, axis {axis} do not exist; they are 1 to 99 and 1 to 9")
-            if toggle and pulse_width is not None:
-                raise ValueError("a toggled output has no pulse width of its own; leave pulse_width or toggle out")
-            width = None if toggle else 1e-3 if pulse_width is None else pulse_width
-            chosen = replace(pulses or PulseSettings(), output=output, width=width, active_high=active_high)
-            check_figures(counts_per_turn, max_speed, acceleration, low, high)
+            rest = pulses or PulseSettings()
+            chosen = pulses_of(rest, output=output, width=pulse_width, active_high=active_high, toggle=toggle)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, chosen, speed_unit)
             self._fastest, steepest = native_limits(counts_per_turn, max_speed, acceleration, speed_unit)
         except ValueError as problem:
             raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        actual = steepest * 1e4 / speed_unit * 2 * math.pi / counts_per_turn
-        self._travel = Travel(name, StageLimits(counts_per_turn, max_speed, actual, low, high, True))
+        self._travel = Travel(name, limits)
         self._target: int | None = None
         self._homing = False
         self._closed = False
@@ -116,8 +114,7 @@ class ZaberStage:
         except BaseException:
             self.close()
             raise
-        limits = replace(self._travel.limits, trigger_output=self._identity.has_triggers)
-        self._travel = replace(self._travel, limits=limits)
+        self._travel = Travel(name, replace(limits, trigger_output=self._identity.has_triggers))
 
     @property
     def limits(self) -> StageLimits:
@@ -207,10 +204,7 @@ class ZaberStage:
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
-        full_speed = self.limits.max_speed * self.limits.counts_per_turn / (2 * math.pi)
-        problem = refusal(self._pulses.settings, train, full_speed)
-        if problem or not self._travel.has_room_for(train):
-            raise self._travel.cannot_emit(train, problem or "one pulse or more")
+        self._travel.refuse_train(train)
         if not self.limits.trigger_output:
             raise DeviceRefused(
                 self.name,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,28 +35,6 @@ TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 """A number with more digits is no position that an axis can have, and none that a float holds."""
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 """Settings of the axis that survive a power cycle: as they were found they are left."""
-
-
-SPEED_UNIT = 1.6384
-"""Native speed of one microstep/s; of acceleration it is a ten-thousandth for one microstep/s²."""
-
-
-def native_limits(
-    counts_per_turn: int, max_speed: float, acceleration: float, speed_unit: float = SPEED_UNIT
-) -> tuple[int, int]:
-    """Native speed nearest to `max_speed` (rad/s) and steepest native acceleration not above `acceleration` (rad/s²).
-
-    Raises:
-        ValueError: less than one native unit.
-    """
-    per_radian = counts_per_turn / (2 * math.pi) * speed_unit
-    speed, steepest = round(max_speed * per_radian), math.floor(acceleration * per_radian / 1e4 * (1 + 1e-9))
-    if speed < 1 or steepest < 1:
-        raise ValueError(
-            f"{math.degrees(max_speed):g} deg/s and {math.degrees(acceleration):g} deg/s² are native values of {speed} "
-            f"and {steepest}; the controller's gentlest are 1, {math.degrees(1e4 / per_radian):g} deg/s² for the latter"
-        )
-    return speed, steepest
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ stands within that step already, the starter gives the first pulse itself. Where
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.protocols import TriggerTrain
 
@@ -57,6 +56,11 @@ class PulseSettings:
         return 0 if self.width is None else max(1, round(self.width * 1000))
 
     @property
+    def spacing(self) -> float:
+        """s that pulses must be apart at full speed; the output then rests as long as it is set."""
+        return 2 * self.shortest if self.width is None else max(self.shortest, 2 * self.width)
+
+    @property
     def rest(self) -> str:
         """The command that puts the output at rest."""
         return f"io set do {self.output} {int(not self.active_high)}"
@@ -75,6 +79,20 @@ class PulseSettings:
         return f"io set do {self.output} {on} schedule {self.milliseconds} {off}"
 
 
+def pulses_of(
+    rest: PulseSettings, *, output: int, width: float | None, active_high: bool, toggle: bool
+) -> PulseSettings:
+    """What was chosen of the output (`width` None: 1 ms, or half an interval where fires toggle it) with the `rest`.
+
+    Raises:
+        ValueError: no output can be so.
+    """
+    if toggle and width is not None:
+        raise ValueError("a toggled output has no pulse width of its own; choose a width or toggle, not both")
+    made = None if toggle else PulseSettings.width if width is None else width
+    return replace(rest, output=output, width=made, active_high=active_high)
+
+
 @dataclass(frozen=True)
 class TriggerSetup:
     """What to send for a train.
@@ -88,23 +106,6 @@ class TriggerSetup:
     commands: tuple[str, ...]
     enable: str
     stand: int | None
-
-
-def refusal(settings: PulseSettings, train: TriggerTrain, full_speed: float) -> str:
-    """What a train must be to be emitted at up to `full_speed` (counts/s), "" where it is that."""
-    if train.n < 1 or train.interval == 0:
-        return "one pulse or more, one after another"
-    if train.n == 1:
-        return ""
-    if settings.width is None and train.interval % 2:
-        return "an even number of counts between pulses of a toggled output; or give pulses a width"
-    seconds = 2 * settings.shortest if settings.width is None else max(settings.shortest, 2 * settings.width)
-    nearest = math.ceil(seconds * full_speed)
-    return (
-        f"pulses not closer than {nearest} counts at full speed, or a lower max_speed"
-        if abs(train.interval) < nearest
-        else ""
-    )
 
 
 def step_of(settings: PulseSettings, train: TriggerTrain) -> int:

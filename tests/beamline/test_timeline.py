@@ -8,14 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from beamline import angles
 from beamline.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.timeline import block_seconds, describe, move_seconds, pass_ends, taxi_angle, work_out
+from drivers.errors import DeviceRefused
 from drivers.frame import FrameKind
 from drivers.protocols import CameraTiming, StageLimits
+from drivers.stages.travel import Travel
 
 DEG = math.pi / 180
 STAGE = StageLimits(360_000, 30 * DEG, 60 * DEG, -5 * DEG, 365 * DEG, True)
@@ -233,6 +235,44 @@ def test_advice_works_when_followed() -> None:
         (violation,) = worked(replace(PLAN, **changes)).violations
         period = float(re.search(r"scan\.period_s >= ([\d.]+)", violation)[1])  # type: ignore[index]
         assert worked(replace(PLAN, **changes | {"period": period})).violations == ()
+
+
+@given(
+    views=st.integers(2, 5000),
+    passes=st.sampled_from([1, 2, 3]),
+    spacing=st.floats(1e-6, 0.1),
+    unit=st.sampled_from([1, 2]),
+)
+def test_a_plan_is_refused_where_its_pulses_would_run_together(
+    views: int, passes: int, spacing: float, unit: int
+) -> None:
+    """A turn has 360 000 counts and takes 12 s at full speed: from the time between two pulses then. A least interval
+    that is all but whole is left out."""
+    assume(abs(spacing * 30_000 - round(spacing * 30_000)) > 1e-3)
+    views = max(2, views // passes) * passes
+    plan = replace(PLAN, angles=angles.interlaced(views, passes, 0.0, math.pi), period=40.0)
+    stage = replace(STAGE, pulse_spacing=spacing, interval_unit=unit)
+    timeline = worked(plan, stage)
+    close, uneven = timeline.step_counts / 30_000 < spacing, timeline.step_counts % unit > 0
+    assert any("trigger output" in sentence for sentence in timeline.violations) == (close or uneven)
+    taken = replace(timeline.views.trains[0], start=0)
+    try:  # a stage with room for the train takes it where the plan breaks nothing, and only there
+        Travel("stage", replace(stage, high=9.0)).refuse_train(taken)
+    except DeviceRefused:
+        assert close or uneven
+    else:
+        assert not (close or uneven)
+
+
+def test_advice_for_pulses_that_would_run_together_works_when_followed() -> None:
+    """500 counts at 30 000 counts/s are 16.7 ms; at 25 deg/s they are 20."""
+    stage = replace(STAGE, pulse_spacing=0.02)
+    (violation,) = worked(stage=stage).violations
+    assert "500 counts of the stage apart, its trigger output needs 600: 0.02 s at its full speed of 30°/s" in violation
+    most = float(re.search(r"max_speed_deg_s <= ([\d.]+)", violation)[1])  # type: ignore[index]
+    assert most == 25
+    assert worked(stage=replace(stage, max_speed=most * DEG)).violations == ()
+    assert worked(stage=replace(stage, max_speed=(most + 0.1) * DEG)).violations != ()
 
 
 def test_no_trigger_output_and_no_room() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
-from drivers.stages.pi_gcs import limits_of
+from drivers.stages.pi_gcs_limits import limits_of
 from simulators.wires.pi_gcs_trigger import FirstPulse
 from tests.drivers.stage_bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig

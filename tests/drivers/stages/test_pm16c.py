@@ -11,7 +11,7 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
-from drivers.stages.pm16c import limits_of
+from drivers.stages.pm16c_limits import limits_of
 from drivers.stages.pm16c_rates import RATES, steepest_code
 from tests.drivers.pm16c_rig import COUNTS, Rig
 from tests.drivers.stage_bench import LONG, SPEED

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage
-from drivers.stages.zaber_axis import native_limits
+from drivers.stages.zaber_limits import native_limits
 from simulators.wires.zaber import Fault
 from tests.drivers.stage_bench import LONG, SPEED
 from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig

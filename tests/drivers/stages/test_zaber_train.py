@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import TriggerTrain
-from drivers.stages.zaber_train import PulseSettings, refusal, remaining, set_up
+from drivers.stages.zaber_train import PulseSettings, pulses_of, remaining, set_up
 from tests.drivers.stage_bench import LONG, SPEED, StageBench
 from tests.drivers.zaber_rig import Rig
 
@@ -94,12 +94,27 @@ def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
         PulseSettings(**wrong)
 
 
-def test_trains_that_would_run_together_are_refused() -> None:
-    for settings, nearest in ((PulseSettings(width=2e-3), 120), (PulseSettings(width=None), 60)):
-        assert refusal(settings, TriggerTrain(0, nearest, 9), 30_000.0) == ""
-        assert str(nearest) in refusal(settings, TriggerTrain(0, 2 - nearest, 9), 30_000.0)
-        assert refusal(settings, TriggerTrain(0, 1, 1), 30_000.0) == ""
-    assert "even" in refusal(PulseSettings(width=None), TriggerTrain(0, 601, 9), 30_000.0)
+@pytest.mark.parametrize(
+    ("made", "nearest"), [({"pulse_width": 2e-3}, 120), ({"toggle": True}, 60), ({"pulse_width": 1e-3}, 60), ({}, 60)]
+)
+def test_trains_that_would_run_together_are_refused(made: dict[str, Any], nearest: int) -> None:
+    """At 30 deg/s = 30 000 counts/s: a width and as long again of rest, or two fires 1 ms apart."""
+    stage = Rig().bench(**made).stage
+    stage.arm(TriggerTrain(1000, nearest, 9))
+    with pytest.raises(DeviceRefused, match=f"at full speed, which are {nearest} counts"):
+        stage.arm(TriggerTrain(1000, nearest - 2, 9))
+    stage.arm(TriggerTrain(1000, 1, 1))
+
+
+def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
+    rest = PulseSettings(chained=False, shortest=2e-3, width=5e-3)
+    made = pulses_of(rest, output=3, width=None, active_high=False, toggle=False)
+    assert made == PulseSettings(3, 1e-3, False, chained=False, shortest=2e-3)
+    assert pulses_of(rest, output=1, width=4e-3, active_high=True, toggle=False).spacing == 8e-3
+    toggled = pulses_of(rest, output=1, width=None, active_high=True, toggle=True)
+    assert (toggled.width, toggled.spacing) == (None, 4e-3)
+    with pytest.raises(ValueError, match="a toggled output has no pulse width"):
+        pulses_of(rest, output=1, width=4e-3, active_high=True, toggle=True)
 
 
 # what comes of it

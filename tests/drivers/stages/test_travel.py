@@ -1,0 +1,71 @@
+"""Travel: how near pulses may be, against fractions, and which trains of pulses a stage is given."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import DeviceRefused
+from drivers.protocols import StageLimits, TriggerTrain
+from drivers.stages.travel import Travel, check_figures, least_interval
+
+LIMITS = StageLimits(360_000, math.radians(30), math.radians(60), 0.0, math.radians(100), True, 0, 2e-3)
+"""30 000 counts/s at full speed, of which 60 take 2 ms."""
+
+
+@given(
+    counts=st.integers(1, 10**9),
+    speed=st.integers(1, 10_000),
+    microseconds=st.integers(0, 10**6),
+    unit=st.sampled_from([1, 2]),
+)
+def test_the_least_interval_is_the_fewest_units_that_take_the_spacing(
+    counts: int, speed: int, microseconds: int, unit: int
+) -> None:
+    """With a speed in thousandths of a degree/s all is a fraction: exact where floats are off by less than a count."""
+    limits = replace(LIMITS, counts_per_turn=counts, max_speed=math.radians(speed / 1000), interval_unit=unit)
+    least = least_interval(replace(limits, pulse_spacing=microseconds / 1e6))
+    exact = Fraction(counts * speed * microseconds, 360 * 1000 * 10**6)
+    slack = Fraction(2, 10**6) + exact / 10**12
+    assert least % unit == 0
+    assert least > 0
+    assert exact - slack <= least
+    assert least == unit or least - unit < exact
+
+
+@pytest.mark.parametrize("unit", [1, 2])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_train_at_the_least_interval_is_taken_and_a_closer_one_is_not(unit: int, sign: int) -> None:
+    travel = Travel("stage", replace(LIMITS, interval_unit=unit))
+    travel.refuse_train(TriggerTrain(5000, sign * 60, 9))
+    with pytest.raises(DeviceRefused, match=r"not closer than 0\.002 s at full speed, which are 60 counts.*max_speed"):
+        travel.refuse_train(TriggerTrain(5000, sign * (60 - unit), 9))
+    travel.refuse_train(TriggerTrain(5000, sign, 1))
+
+
+def test_an_interval_that_is_no_multiple_of_the_unit_is_refused() -> None:
+    Travel("stage", LIMITS).refuse_train(TriggerTrain(5000, 61, 9))
+    with pytest.raises(DeviceRefused, match="multiple of 2 counts") as error:
+        Travel("stage", replace(LIMITS, interval_unit=2)).refuse_train(TriggerTrain(5000, 61, 9))
+    assert "lower max_speed" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "train",
+    [TriggerTrain(0, 100, 0), TriggerTrain(0, 0, 1), TriggerTrain(-1, 100, 3), TriggerTrain(99_801, 100, 3)],
+)
+def test_no_pulse_no_way_between_them_and_a_place_beyond_the_limits_are_refused(train: TriggerTrain) -> None:
+    with pytest.raises(DeviceRefused, match="cannot be emitted"):
+        Travel("stage", LIMITS).refuse_train(train)
+    Travel("stage", LIMITS).refuse_train(TriggerTrain(99_800, 100, 3))
+
+
+@pytest.mark.parametrize("spacing", [-1e-6, math.nan, math.inf, 1e300])
+def test_a_spacing_that_no_pulses_can_have_is_refused(spacing: float) -> None:
+    with pytest.raises(ValueError, match="apart"):
+        check_figures(360_000, 0.5, 1.0, 0.0, 1.0, spacing)
