@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 import recon
+from beamline.corrector import Warn
 from beamline.held_out import with_held_out
-from beamline.pipeline import Prepared, Warn
+from beamline.pipeline import Prepared
 from recon.binning import bin_views
 from recon.calibrate import calibrate
 from recon.fbp import Filter

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.corrector import Warn
 from beamline.errors import ConfigError, DataError
-from beamline.pipeline import Prepared, Warn
+from beamline.pipeline import Prepared
 from beamline.storage.checkpoint_file import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.recon_file import Value, refuse_existing
 from recon.checkpoint import state_from

@@ -14,10 +14,11 @@ from beamline.events import Event, Sink, fan_out
 from beamline.history import history_of
 from beamline.live import follow_command
 from beamline.narration import sentence
-from beamline.pipeline import Selection, prepare
+from beamline.pipeline import prepare
 from beamline.recon_report import Context, Made, facts_of
 from beamline.run import run_scan
 from beamline.run_folder import RECON, RECON_LOG
+from beamline.selection import Selection
 from beamline.stop import StopRequest
 from beamline.storage.recon_file import read_reconstruction
 from beamline.storage.source import open_scan

@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.corrector import Corrector
 from beamline.errors import DataError
 from beamline.events import Event, Sink
 from beamline.fit_progress import progress_events
 from beamline.offline import Warnings
-from beamline.pipeline import Corrector, check_axis, correction_blockers, geometry_of, locate_axis, refuse
+from beamline.pipeline import correction_blockers, locate_axis, refuse
 from beamline.recon_options import ReconOptions
 from beamline.recon_report import Made
+from beamline.selection import check_axis, geometry_of
 from beamline.stop import Heeded
 from beamline.storage.recon_file import ReconRecord, write_reconstruction
 from beamline.storage.scan_source import ScanSource

@@ -2,54 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from beamline.errors import ConfigError, DataError
-from beamline.reading import read_binned, read_references
+from beamline.corrector import Corrector, Warn
+from beamline.errors import DataError
+from beamline.selection import Selection, check_axis, choose_views, geometry_of, pixel_size, unbinned
 from beamline.storage.finding import Finding
 from beamline.storage.scan_source import ScanSource
 from beamline.storage.validate import beam_present, quantity_said, references_present, source_findings
 from drivers.frame import FrameKind
 from recon.align import AxisEstimate, find_axis
-from recon.correct import CorrectionSettings, Projections, References, correct
+from recon.correct import Projections
 from recon.geometry import Geometry
-from recon.views import parse_views
-
-Warn = Callable[[str], None]
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
 _HELD_OUT_VIEWS = 16
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which part of a scan to use, and how.
-
-    Attributes:
-        views: a view selection, see recon.views.parse_views.
-        rows: (first, end) detector rows; None is all.
-        binning: pixels averaged per side.
-        axis_col: rotation axis in columns of the full detector; None finds it.
-        pixel_size_mm: at the sample; None takes the file's.
-        correction: of counts to line integrals.
-        seed: of random view selections.
-    """
-
-    views: str = "all"
-    rows: tuple[int, int] | None = None
-    binning: int = 1
-    axis_col: float | None = None
-    pixel_size_mm: float | None = None
-    correction: CorrectionSettings = field(default_factory=CorrectionSettings)
-    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,55 +47,6 @@ class Prepared:
     n_projections: int
     length_unit: str
     quantity: str
-
-
-class Corrector:
-    """Reads frames of one scan as line integrals, in the rows and with the binning asked for."""
-
-    def __init__(self, source: ScanSource, selection: Selection, warn: Warn) -> None:
-        """Read the reference frames of a scan that `refuse` has nothing against.
-
-        Raises:
-            ConfigError: rows or binning that do not fit the detector.
-        """
-        self._source, self._settings, self._warn = source, selection.correction, warn
-        self.rows, self.binning = rows_of(source, selection), selection.binning
-        self.references: References | None = None
-        if source.quantity == "counts":
-            self.references = read_references(source, self.rows, self.binning)
-
-    def line_integrals(
-        self, frames: NDArray[np.int64], rows: slice | None = None, settings: CorrectionSettings | None = None
-    ) -> Projections:
-        """Line integrals of `frames` (rows of the file), without those that hold no finite pixel: see `view_ids`.
-
-        Args:
-            frames: rows of the file.
-            rows: narrows the detector rows, in binned rows.
-            settings: other than the selection's.
-
-        Raises:
-            DataError: frames that cannot be corrected; the message names the file.
-        """
-        first, end = self.rows.start, self.rows.stop
-        if rows is not None:
-            start, stop, _ = rows.indices((end - first) // self.binning)
-            first, end = first + start * self.binning, first + stop * self.binning
-        data = read_binned(self._source, frames, slice(first, end), self.binning)
-        alive = np.isfinite(data).any(axis=(1, 2))
-        if not alive.any():
-            raise DataError(f"{self._source.path}: none of the pixels of the {len(frames)} views is a finite number.")
-        if not alive.all():
-            lost = frames[~alive]
-            self._warn(f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out.")
-            data, frames = data[alive], frames[alive]
-        if self.references is None:
-            return _as_given(data, frames)
-        references = self.references if rows is None else _narrowed(self.references, rows)
-        try:
-            return correct(data, frames.astype(np.float64), references, settings or self._settings, view_ids=frames)
-        except ValueError as error:
-            raise DataError(f"{self._source.path} cannot be corrected: {error}") from error
 
 
 def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
@@ -190,45 +113,6 @@ def correction_blockers(source: ScanSource) -> list[Finding]:
     return [finding for rule in (quantity_said, references_present, beam_present) for finding in rule(source)]
 
 
-def choose_views(
-    source: ScanSource, frames: NDArray[np.int64], selection: Selection, period: float = math.pi
-) -> NDArray[np.int64]:
-    """Indices into `frames` of the views that the selection names; at least two.
-
-    Args:
-        period: radians after which views see the same rays, see `Geometry.period`.
-
-    Raises:
-        ConfigError: the selection is not legal, or leaves fewer than two views.
-    """
-    try:
-        chosen = parse_views(selection.views, source.angles[frames], selection.seed, period=period)
-    except ValueError as error:
-        raise ConfigError(f"--views: {error}") from error
-    if chosen.size < 2:
-        raise ConfigError(
-            f"--views {selection.views} leaves {chosen.size} of the {frames.size} views of {source.path}; a volume "
-            "needs at least 2."
-        )
-    return chosen
-
-
-def rows_of(source: ScanSource, selection: Selection) -> slice:
-    """The detector rows to read, cut to whole bins.
-
-    Raises:
-        ConfigError: rows outside the detector, or bins larger than what is left.
-    """
-    height, width = source.shape
-    first, end = selection.rows or (0, height)
-    if not 0 <= first < end <= height:
-        raise ConfigError(f"--rows {first}:{end} do not lie in the detector's 0:{height}.")
-    n = selection.binning
-    if not 1 <= n <= min(end - first, width):
-        raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
-    return slice(first, first + (end - first) // n * n)
-
-
 def locate_axis(
     source: ScanSource, corrector: Corrector, frames: NDArray[np.int64], warn: Warn
 ) -> tuple[float, AxisEstimate]:
@@ -266,31 +150,6 @@ def locate_axis(
     return found, estimate
 
 
-def check_axis(source: ScanSource, axis_col: float) -> None:
-    """Raises ConfigError where the axis lies outside the detector."""
-    if not -0.5 <= axis_col <= source.shape[1] - 0.5:
-        raise ConfigError(
-            f"The rotation axis, column {axis_col:g}, lies outside the detector's columns 0 to {source.shape[1] - 1}."
-        )
-
-
-def unbinned(column: float, binning: int) -> float:
-    """A binned column in columns of the full detector."""
-    return column * binning + (binning - 1) / 2
-
-
-def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
-    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 where it is not known."""
-    rows = rows_of(source, selection)
-    full = (rows.stop - rows.start, source.shape[1])
-    pitch = pixel_size(source, selection)
-    return Geometry.parallel(angles, full, 1.0 if pitch is None else pitch, axis_col).binned(selection.binning)
-
-
-def pixel_size(source: ScanSource, selection: Selection) -> float | None:
-    return source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm
-
-
 def report_defects(projections: Projections, warn: Warn) -> None:
     """Tell of what correction had to repair, where it is more than a stray pixel in a thousand."""
     masked = float(projections.masked.mean())
@@ -310,20 +169,3 @@ def _spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     if items.size <= n:
         return items
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
-
-
-def _narrowed(references: References, rows: slice) -> References:
-    return References(references.dark[rows], tuple((position, flat[rows]) for position, flat in references.flats))
-
-
-def _as_given(data: NDArray[Any], frames: NDArray[np.int64]) -> Projections:
-    """Line integrals that need no correction; a pixel that is not finite takes the value of the nearest that is."""
-    data = data.astype(np.float32, copy=False)
-    bad = ~np.isfinite(data)
-    for view in np.flatnonzero(bad.any(axis=(1, 2))):
-        nearest = ndimage.distance_transform_edt(bad[view], return_distances=False, return_indices=True)
-        data[view] = data[view][tuple(nearest)]
-    ones = np.ones(len(frames), np.float32)
-    return Projections(
-        data, frames, floored=0.0, air=ones, masked=np.asarray(bad.all(axis=0)), replaced=float(bad.mean())
-    )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from beamline.checkpoints import Keeper
 from beamline.deliver import Target
-from beamline.pipeline import Selection
+from beamline.selection import Selection
 from beamline.storage.source import Quantity, ScanSource, open_scan
 from recon.fbp import Filter
 from recon.initialise import Start

@@ -12,8 +12,9 @@ import numpy as np
 
 from beamline import figures
 from beamline.history import history_arrays, judged_by
-from beamline.pipeline import Prepared, Selection
+from beamline.pipeline import Prepared
 from beamline.report import METRICS, Picture, Report, formatted
+from beamline.selection import Selection
 from beamline.storage.recon_file import Value
 from beamline.storage.source import ScanSource
 from drivers.frame import FrameKind

@@ -16,9 +16,10 @@ from beamline.events import Event, Sink
 from beamline.machine import machine
 from beamline.measure import fit_truth, read_truth
 from beamline.offline import Warnings
-from beamline.pipeline import Prepared, Selection, prepare
+from beamline.pipeline import Prepared, prepare
 from beamline.recon_options import SourceOptions
 from beamline.recon_report import facts_of
+from beamline.selection import Selection
 from beamline.storage.recon_file import named_on_failure
 from beamline.tradeoff_report import write_figures, write_table
 from beamline.tradeoff_table import Table

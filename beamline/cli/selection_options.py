@@ -12,8 +12,8 @@ import click
 
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan_options import scan_options
-from beamline.pipeline import Selection
 from beamline.recon_options import SourceOptions
+from beamline.selection import Selection
 from recon.correct import CorrectionSettings
 
 

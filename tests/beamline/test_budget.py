@@ -15,8 +15,9 @@ from beamline.budget import Budgeted, joined, within
 from beamline.deliver import Target
 from beamline.events import Event
 from beamline.offline import run
-from beamline.pipeline import Prepared, Selection, prepare
+from beamline.pipeline import Prepared, prepare
 from beamline.recon_options import ReconOptions, SourceOptions
+from beamline.selection import Selection
 from beamline.storage.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.geometry import Geometry

@@ -12,8 +12,9 @@ import pytest
 
 from beamline.checkpoints import Keeper, differences, made_from
 from beamline.errors import ConfigError, DataError
-from beamline.pipeline import Prepared, Selection, prepare
+from beamline.pipeline import Prepared, prepare
 from beamline.recon_options import SourceOptions
+from beamline.selection import Selection
 from beamline.storage.checkpoint_file import Checkpoint, write_checkpoint
 from recon import fit
 from recon.checkpoint import arrays_of

@@ -13,9 +13,10 @@ import recon
 from beamline import figures
 from beamline.deliver import Target, deliver
 from beamline.events import Event
-from beamline.pipeline import Prepared, Selection, prepare
+from beamline.pipeline import Prepared, prepare
 from beamline.recon_options import SourceOptions
 from beamline.recon_report import Context, Made, facts_of
+from beamline.selection import Selection
 from drivers.clock import SystemClock
 from recon.geometry import Geometry
 from recon.operators import Projector

@@ -17,8 +17,8 @@ from beamline.digest import digest
 from beamline.errors import BeamlineError, ConfigError, DataError
 from beamline.events import Event
 from beamline.follow import Rhythm, follow
-from beamline.pipeline import Selection
 from beamline.recon_options import ReconOptions, SourceOptions
+from beamline.selection import Selection
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.recon_file import read_reconstruction
 from drivers.frame import Frame, FrameKind

@@ -9,8 +9,9 @@ import pytest
 
 from beamline.errors import ConfigError
 from beamline.held_out import keep_back, with_held_out
-from beamline.pipeline import Prepared, Selection, prepare
+from beamline.pipeline import Prepared, prepare
 from beamline.recon_options import SourceOptions
+from beamline.selection import Selection
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 ANGLES = np.radians(np.arange(0, 180, 6.0))

@@ -20,9 +20,9 @@ from beamline.digest import digest
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event
 from beamline.offline import run
-from beamline.pipeline import Selection
 from beamline.recon_options import ReconOptions, SourceOptions
 from beamline.recon_report import METHOD_NAMES
+from beamline.selection import Selection
 from beamline.storage.checkpoint_file import read_checkpoint
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.recon_file import read_reconstruction

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from beamline import pipeline
 from beamline.errors import ConfigError, DataError
-from beamline.pipeline import Prepared, Selection, prepare, unbinned
+from beamline.pipeline import Prepared, prepare
 from beamline.reading import read_binned, read_references
+from beamline.selection import Selection, unbinned
 from beamline.storage.source import open_scan
 from recon.align import AxisError, AxisEstimate
 from recon.correct import CorrectionSettings

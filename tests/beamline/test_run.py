@@ -21,8 +21,9 @@ from beamline.digest import FrameDigest
 from beamline.errors import ConfigError, DataError, InstrumentError, ScanStopped
 from beamline.events import Event
 from beamline.ledger import LedgerError
-from beamline.pipeline import Selection, prepare
+from beamline.pipeline import prepare
 from beamline.run import State, run_scan
+from beamline.selection import Selection
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from beamline.storage.source import open_scan

@@ -17,8 +17,8 @@ import pytest
 from beamline import tradeoff
 from beamline.errors import ConfigError, DataError
 from beamline.events import Event
-from beamline.pipeline import Selection
 from beamline.recon_options import SourceOptions
+from beamline.selection import Selection
 from beamline.tradeoff import TradeoffOptions, run
 from beamline.tradeoff_report import text
 from beamline.trials import Outcome, Trial
