@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from beamline import devices
+from beamline.dry_run import dry_run
 from beamline.errors import ConfigError
 from beamline.stages import output_of
 from drivers.errors import DeviceRefused
-from tests.beamline.ball_scan import STAGES, small
+from tests.beamline.ball_scan import COMMON, STAGES, small
 
 
 @pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
@@ -30,6 +32,33 @@ def test_a_stage_keeps_a_transcript_where_it_is_asked_to(tmp_path: Path) -> None
     with devices.connect(small(f"devices.stage.transcript={file}")) as bench:
         bench.devices.stage.position()
     assert b"PS?0" in file.read_bytes()
+
+
+CLOSE = {
+    "pm16c": ("kind: pm16c, port: 'sim://pm16c', pulse_width_s: 0.001", {3051}),
+    "pm16c, widths by train": ("kind: pm16c, port: 'sim://pm16c'", set[int]()),
+    "pi_gcs": ("kind: pi_gcs, port: 'sim://pi_gcs', firmware_pulse_s: 0.001", {3051}),
+    "zaber": ("kind: zaber, port: 'sim://zaber'", {3051}),
+    "zaber, slow": ("kind: zaber, port: 'sim://zaber', shortest_s: 0.00205", {2951, 3000, 3051}),
+    "zaber, toggled": ("kind: zaber, port: 'sim://zaber', toggle: true", {2951, 3051}),
+}
+
+
+@pytest.mark.parametrize(("stage", "refused"), CLOSE.values(), ids=CLOSE)
+def test_a_dry_run_refuses_the_pulses_that_the_stage_would_refuse(stage: str, refused: set[int]) -> None:
+    """2951, 3000 and 3051 views over half a turn are 61, 60 and 59 counts apart; at full speed 60 take 2 ms."""
+    for views, counts in ((2951, 61), (3000, 60), (3051, 59)):
+        settings = small(f"devices.stage={{{stage}, {COMMON}}}", f"scan.angles={{scheme: fixed, views: {views}}}")
+        worked = dry_run(settings)
+        assert worked.timeline.step_counts == counts
+        assert any("trigger output" in said for said in worked.timeline.violations) == (views in refused)
+        with devices.connect(settings) as bench:
+            assert bench.devices.stage.limits == worked.stage
+            bench.devices.stage.start_move(math.radians(-2), math.radians(10))
+            bench.devices.stage.wait(10.0)
+            expected = pytest.raises(DeviceRefused, match="cannot be emitted") if views in refused else nullcontext()
+            with expected:
+                bench.devices.stage.arm(worked.timeline.views.trains[0])
 
 
 def test_limits_hold() -> None:
