@@ -292,6 +292,7 @@ class SimulatedOrcaQuest:
             roi=self._roi(),
             binning=self._settings.binning,
             readout=self._settings.readout,
+            conversion=CONVERSION[self._settings.readout],
             beam=frame.beam,
             sample=frame.sample,
             radius=self._scene.sample.radius,

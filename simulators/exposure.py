@@ -15,7 +15,7 @@ from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
 from simulators.pose import Pose
 from simulators.scene import Scene
-from simulators.sensor import CONVERSION, digitise
+from simulators.sensor import digitise
 
 
 def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.uint16]:
@@ -33,7 +33,7 @@ def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.u
         electrons = np.zeros(shot.detector.shape)
     electrons = chain.apply(Domain.ELECTRONS, electrons, shot, watch)
     with watch("digitise"):
-        electrons /= CONVERSION[shot.readout]
+        electrons /= shot.conversion
     counts = chain.apply(Domain.COUNTS, electrons, shot, watch)
     with watch("digitise"):
         return digitise(counts)

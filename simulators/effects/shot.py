@@ -30,6 +30,7 @@ class Shot:
         roi: (row0, col0, rows, cols) of the sensor.
         binning: sensor pixels summed per side.
         readout: the camera's mode: "standard", "ultra_quiet" or "photon_number".
+        conversion: electrons a count.
         beam: the shutter is open (otherwise a dark).
         sample: the sample is in the beam (otherwise a flat).
         radius: mm from the rotation axis to the farthest matter of the sample.
@@ -48,6 +49,7 @@ class Shot:
     roi: tuple[int, int, int, int]
     binning: int
     readout: str
+    conversion: float
     beam: bool
     sample: bool
     radius: float

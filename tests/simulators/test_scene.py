@@ -53,6 +53,7 @@ def _shot(**changes: Any) -> Shot:
         "roi": (1120, 2008, 60, 80),
         "binning": 1,
         "readout": "standard",
+        "conversion": CONVERSION,
         "angle_at": _never,
         "beam": True,
         "sample": True,
