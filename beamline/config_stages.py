@@ -119,12 +119,11 @@ class ZaberStageConfig(_Stage):
 
     @model_validator(mode="after")
     def _possible_pulses(self) -> Self:
-        assert self.pulses
+        self.pulses()
         return self
 
-    @property
     def pulses(self) -> PulseSettings:
-        """How the driver is to make them."""
+        """How the driver is to make them. Raises ValueError where no output can."""
         rest = PulseSettings(
             measured=self.measured,
             chained=self.chained,

@@ -91,7 +91,7 @@ def make_stage(config: StageConfig, url: str, clock: Clock) -> RotationStage:
                 output=config.output,
                 toggle=config.toggle,
                 speed_unit=config.speed_unit,
-                pulses=config.pulses,
+                pulses=config.pulses(),
                 **wiring,
                 **figures,
             )
@@ -118,7 +118,7 @@ def stage_limits(config: StageConfig) -> StageLimits:
         case ZaberStageConfig():
             from drivers.stages import zaber_limits
 
-            return zaber_limits.limits_of(**figures, pulses=config.pulses, speed_unit=config.speed_unit)
+            return zaber_limits.limits_of(**figures, pulses=config.pulses(), speed_unit=config.speed_unit)
 
 
 def output_of(config: StageConfig, stage: RotationStage, number: int) -> DigitalOutput:
