@@ -13,7 +13,7 @@ from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property
 from drivers.dcam.description import description
 from drivers.dcam.options import DcamOptions, TriggerMode
 from drivers.dcam.properties import Properties
-from drivers.dcam.ring import Ring
+from drivers.dcam.ring import START_TIMEOUT, Ring
 from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
 from drivers.dcam.stamps import require_stamps, seconds_of
@@ -22,7 +22,6 @@ from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 
 _WAIT_SLICE = 0.1  # s; an event may fall between looking and waiting, so that no single wait may be long
-_START_TIMEOUT = 5.0  # s
 _LEAST_SLOTS = 16  # where memory allows: the camera may run on beyond the frames asked for while the host stalls
 _TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 
@@ -218,22 +217,8 @@ class DcamCamera:
     def _start(self, slots: int, mode: CaptureMode) -> Ring:
         """A ring that captures; it is held until `_free`, also after an error."""
         ring = self._held = Ring(self._dcam, self._camera, self.name, slots)
-        deadline = self._clock.now() + _START_TIMEOUT
         try:
-            ring.start(mode)
-            # Triggers that come before BUSY are lost. A SNAP may be over already.
-            while mode is CaptureMode.SEQUENCE and ring.state() is not CaptureState.BUSY:
-                if self._clock.now() > deadline:
-                    raise DeviceTimeout(
-                        self.name,
-                        f"the capture did not start within {_START_TIMEOUT:g} s",
-                        request="dcamcap_start",
-                        reply=ring.state().name,
-                        expected="BUSY",
-                        advice="Switch the camera off and on",
-                        state="It is not armed, and no frame was taken",
-                    )
-                self._clock.sleep(0.001)
+            ring.start(mode, self._clock)
         except BaseException:
             with suppress(DcamError):
                 self._free()
@@ -243,12 +228,12 @@ class DcamCamera:
     def _stamp_of_a_first_frame(self) -> int:
         """0 or 1, as the model has it: without it, the loss of a run's first frame could not be seen."""
         ring = self._start(2, CaptureMode.SNAP)
-        deadline = self._clock.now() + _START_TIMEOUT
+        deadline = self._clock.now() + START_TIMEOUT
         while ring.arrived() < 2:
             if self._clock.now() > deadline:
                 raise DeviceTimeout(
                     self.name,
-                    f"{ring.arrived()} of 2 test frames came within {_START_TIMEOUT:g} s in free run",
+                    f"{ring.arrived()} of 2 test frames came within {START_TIMEOUT:g} s in free run",
                     expected=f"2 frames of {_TEST_SETTINGS.exposure:g} s",
                     advice="Check its cable, then switch it off and on",
                     state="Nothing was measured",

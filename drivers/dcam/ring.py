@@ -1,4 +1,4 @@
-"""Ring: the library's ring of buffers during one capture, drained in order with one copy out per frame."""
+"""Ring: the library's ring of buffers during one capture, from its start, drained in order with one copy a frame."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import ctypes
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.clock import Clock
 from drivers.dcam.abi import RUNTIME, Dcam
 from drivers.dcam.codes import CaptureMode, CaptureState
 from drivers.dcam.session import run_all
 from drivers.dcam.structures import BufFrame
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeout
+
+START_TIMEOUT = 5.0
+"""s that a camera may take to begin a capture."""
 
 
 class Ring:
@@ -35,9 +39,27 @@ class Ring:
         self.overwritten = 0
         dcam.buf_alloc(camera, slots)
 
-    def start(self, mode: CaptureMode) -> None:
-        """Begin to capture; whether it has begun, `state` says."""
+    def start(self, mode: CaptureMode, clock: Clock) -> None:
+        """Begin to capture; when it returns, triggers are taken.
+
+        Raises:
+            DeviceTimeout: the camera did not begin.
+        """
+        deadline = clock.now() + START_TIMEOUT
         self._dcam.cap_start(self._camera, mode)
+        # Triggers that come before BUSY are lost. A SNAP may be over already.
+        while mode is CaptureMode.SEQUENCE and self.state() is not CaptureState.BUSY:
+            if clock.now() > deadline:
+                raise DeviceTimeout(
+                    self._device,
+                    f"the capture did not start within {START_TIMEOUT:g} s",
+                    request="dcamcap_start",
+                    reply=self.state().name,
+                    expected="BUSY",
+                    advice="Switch the camera off and on",
+                    state="It is not armed, and no frame was taken",
+                )
+            clock.sleep(0.001)
 
     def state(self) -> CaptureState:
         return self._dcam.cap_status(self._camera)
