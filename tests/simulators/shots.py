@@ -1,0 +1,72 @@
+"""Shots: a scene, the circumstances of an exposure and a frame for tests, each with what the test wants changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.detector import Detector
+from simulators.effects.shot import AngleAt, Shot
+from simulators.exposure import expose
+from simulators.scene import Scene, load_scene
+from simulators.sensor import CONVERSION
+
+PHANTOM = {
+    "kind": "solids",
+    "solids": [
+        {"kind": "cylinder", "radius": 0.3, "height": 0.5, "attenuation": 2.0},
+        {"kind": "ellipsoid", "semi_axes": [0.15, 0.05, 0.1], "attenuation": 3.0, "centre": [0.1, 0.05, 0.0]},
+    ],
+}
+
+
+def never(time: float) -> float:
+    raise AssertionError("a scene without motion asked where the stage was")
+
+
+def shot(**changes: Any) -> Shot:
+    """10 ms of 60 x 80 pixels of 10 um in the middle of the sensor, the sample at 0.4 rad; whoever asks where the stage
+    is at another time fails."""
+    values = {
+        "detector": Detector.centred((60, 80), 0.01),
+        "exposure": 0.01,
+        "time": 1000.0,
+        "angle": 0.4,
+        "elapsed": 50.0,
+        "row_period": 3.6e-6,
+        "roi": (1120, 2008, 60, 80),
+        "binning": 1,
+        "readout": "standard",
+        "conversion": CONVERSION[changes.get("readout", "standard")],
+        "angle_at": never,
+        "beam": True,
+        "sample": True,
+        "radius": 0.3,
+        "seed": 1,
+        "frame": 2,
+        "view": 0,
+    }
+    return Shot(**(values | changes))
+
+
+def sized(rows: int, cols: int, **changes: Any) -> Shot:
+    """A shot of so many unbinned pixels from the sensor's first row and column."""
+    return shot(**({"detector": Detector.centred((rows, cols), 0.01), "roi": (0, 0, rows, cols)} | changes))
+
+
+def scene(*effects: Any, flux: float = 4e5, phantom: Any = PHANTOM) -> Scene:
+    """Two solids (or others) and the effects; `flux` in photons/s, so that a shot has 4000."""
+    return load_scene({"phantom": phantom, "beam": {"photons_per_s": flux}, "effects": list(effects)})
+
+
+def frame(of_scene: Scene, of: Shot | None = None, angle_at: AngleAt = never, **state: Any) -> NDArray[np.uint16]:
+    """Counts of a scene; `state` is beam and sample."""
+    return expose(of_scene, replace(of or shot(), angle_at=angle_at, **state))
+
+
+def depth(of_scene: Scene, angle: float) -> NDArray[np.float64]:
+    """Line integrals of the scene's sample as `shot()` sees it at `angle` radians."""
+    return of_scene.sample.line_integrals(angle, shot().detector)
