@@ -130,7 +130,7 @@ class ZaberController:
             self.alert()
 
     def _answer(self, command: Command, reason: str) -> None:
-        flag, data = "OK", NOTHING
+        flag, data, before = "OK", NOTHING, self._state()
         try:
             if reason or command.axis > 1:
                 raise Rejected(reason or "BADAXIS")
@@ -146,7 +146,9 @@ class ZaberController:
             self.alert()
         identity = "42" if fault is Fault.OTHER_ID else command.id
         where = f"{self._address:02d} {command.axis}{' ' if identity else ''}{identity}"
-        reply = frame(f"@{where} {flag} {self._state()} {data}", self.device.checksums)
+        # A position read just before the end of a move must not go with IDLE.
+        state = before if command.words[:1] == ("get",) else self._state()
+        reply = frame(f"@{where} {flag} {state} {data}", self.device.checksums)
         self._out += _spoilt(reply, fault)
         for text in information:
             self._out += frame(f"#{where} {text}", self.device.checksums)

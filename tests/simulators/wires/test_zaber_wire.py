@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.wires.zaber import Fault
+from simulators.clock import VirtualClock
+from simulators.trigger_line import TriggerLine
+from simulators.wires.zaber import Fault, ZaberController
 from simulators.wires.zaber_packets import Command, Malformed, PacketReader, frame, lrc
 from tests.simulators.zaber_host import SPEED, TURN, Wire
 
@@ -309,3 +311,26 @@ def test_faults_befall_the_replies_that_they_are_set_for() -> None:
 
 def test_an_echoing_line_sends_the_command_back_first() -> None:
     assert Wire(echo=True).tell("/1 1 get pos").endswith("/1 1 get pos\n@01 1 OK IDLE -- 0\r\n")
+
+
+class Passing(VirtualClock):
+    """A clock on which a millisecond passes at every look."""
+
+    def now(self) -> float:
+        self.sleep(1e-3)
+        return super().now()
+
+
+def test_a_reply_that_says_idle_never_shows_a_place_on_the_way() -> None:
+    """However the end of the move falls between the looks at the clock that a reply takes."""
+    for late in range(40):
+        clock = Passing(start=0.0)
+        box = ZaberController(clock, TriggerLine(clock), counts_per_turn=TURN)
+        box.receive(b"/1 1 move abs 1000\n")
+        clock.sleep(late * 0.25e-3)
+        reply = "BUSY"
+        while "BUSY" in reply:
+            box.transmit()
+            box.receive(b"/1 1 get pos\n")
+            reply = box.transmit().decode()
+        assert reply.split()[4:] == ["--", "1000"], late
