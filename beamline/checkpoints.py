@@ -17,7 +17,8 @@ from beamline.pipeline import Prepared
 from beamline.storage.checkpoint_file import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.recon_file import Value, refuse_existing
 from recon.checkpoint import state_from
-from recon.fit import FitSettings, FitState
+from recon.fit import FitState
+from recon.fit_settings import FitSettings
 from recon.geometry import Geometry
 
 _SHOWN = 40  # characters of a value that is told

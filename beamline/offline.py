@@ -23,7 +23,8 @@ from beamline.recon_report import Context, Made, facts_of
 from beamline.stop import Heeded, Stoppable, never_stopped
 from drivers.clock import Clock
 from recon.backend import backend_for
-from recon.fit import FitSettings, Progress
+from recon.fit import Progress
+from recon.fit_settings import FitSettings
 from recon.initialise import default_count
 from recon.quality import PRESETS
 from recon.reconstruction import DEFAULT_STEPS

@@ -19,7 +19,8 @@ from beamline.storage.recon_file import Value
 from beamline.storage.source import ScanSource
 from drivers.frame import FrameKind
 from recon.fbp import Filter
-from recon.fit import FitSettings, Progress
+from recon.fit import Progress
+from recon.fit_settings import FitSettings
 from recon.quality import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
 from recon.volume import Volume
 

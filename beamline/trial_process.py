@@ -31,7 +31,7 @@ from beamline.trial_data import Data, geometry_in
 from beamline.trials import Trial
 from recon import metrics
 from recon.binning import bin_views
-from recon.fit import FitSettings
+from recon.fit_settings import FitSettings
 from recon.geometry import Geometry
 from recon.operators import data_residual
 from recon.quality import record

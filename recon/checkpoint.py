@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.backend import Backend, Cpu
-from recon.fit import NAMES, FitState
+from recon.fit import FitState
+from recon.fit_settings import NAMES
 
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")

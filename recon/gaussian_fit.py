@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from recon import fit
 from recon.backend import Backend, backend_for
 from recon.checkpoint import arrays_of, state_from
-from recon.fit import FitSettings, FitState, Progress
+from recon.fit import FitState, Progress
+from recon.fit_settings import FitSettings, growth, tv_size, tv_weight
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import Start, place
@@ -186,8 +187,8 @@ def run_fit(
     record = {
         **asdict(settings), "steps": state.step, "seed": request.seed, "start": request.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": request.held_out, "device": request.device,
-        "polish": request.polish, "tv_weight": fit.tv_weight(settings, problem, state.limit),
-        "tv_size": fit.tv_size(settings, field_grid),
+        "polish": request.polish, "tv_weight": tv_weight(settings, problem, state.limit),
+        "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
     return Fitted(volume, tuple(history), model, record, arrays_of(last, backend) | watch.arrays())
 
@@ -221,4 +222,4 @@ def _first_state(
     if not isinstance(start, Gaussians):
         rng = np.random.default_rng(request.seed)
         start = place(data, geometry, field_grid, start, rng, start=request.start, rays=request.settings.rays)
-    return fit.init(start, request.seed, fit.growth(request.settings), backend), start.n, start.density_unit
+    return fit.init(start, request.seed, growth(request.settings), backend), start.n, start.density_unit

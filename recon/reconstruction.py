@@ -17,7 +17,8 @@ from torch import Tensor
 from recon import iterative
 from recon.fbp import Filter, fbp
 from recon.fdk import fdk
-from recon.fit import FitSettings, Progress
+from recon.fit import Progress
+from recon.fit_settings import FitSettings
 from recon.gaussian_fit import FitRequest, run_fit
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry

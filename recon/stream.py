@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon import fit
+from recon.fit_settings import FitSettings, growth
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import place
@@ -32,7 +33,7 @@ _ROOM = 0.1  # of the first count that a round may add; the last one has what is
 
 # Slower than where all views are there from the start: each round would undo with its first fast steps what the last
 # one had learnt (battery of 180 views: 30.7 dB with the rates of `FitSettings`, 31.9 with these).
-WHILE_VIEWS_COME = fit.FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15, tv_size=32)
+WHILE_VIEWS_COME = FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15, tv_size=32)
 
 
 class StreamingFit:
@@ -59,7 +60,7 @@ class StreamingFit:
         seed: int = 0,
         *,
         gaussians: int | None = None,
-        settings: fit.FitSettings | None = None,
+        settings: FitSettings | None = None,
         first_views: int = 8,
         first_span: float = np.pi / 6,
         now: Callable[[], float] = time.perf_counter,
@@ -88,7 +89,7 @@ class StreamingFit:
         return len(self._angles)
 
     @property
-    def settings(self) -> fit.FitSettings:
+    def settings(self) -> FitSettings:
         """What the fit runs with."""
         return self._settings
 
@@ -214,7 +215,7 @@ class StreamingFit:
             self._place_first()
         assert self._state is not None
         # Room is for what later views show: early ones span a narrow angle and would fill it with their streaks.
-        most = round(self._placed * fit.growth(self._settings))
+        most = round(self._placed * growth(self._settings))
         self._state.limit = most if force else min(most, self._state.n + round(_ROOM * self._placed))
         self._round_views, self._round_step = self.n_views, self._state.step
         self._state.drawn = []  # draw from all views from now on

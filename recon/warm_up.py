@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon.density_control import DensityPolicy
-from recon.fit import FitSettings
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import Start

@@ -18,7 +18,7 @@ from beamline.selection import Selection
 from beamline.storage.checkpoint_file import Checkpoint, write_checkpoint
 from recon import fit
 from recon.checkpoint import arrays_of
-from recon.fit import FitSettings
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from tests.beamline.scans import TwoCylinders, write_exchange
 

@@ -11,7 +11,8 @@ import pytest
 from beamline.figures import quality_against_time
 from beamline.history import history_arrays, history_of, judged_by
 from beamline.recon_report import Made
-from recon.fit import FitSettings, Progress
+from recon.fit import Progress
+from recon.fit_settings import FitSettings
 from recon.quality import next_decibel, next_decibel_of_fit
 from recon.stream import WHILE_VIEWS_COME
 from recon.volume import Grid, Volume

@@ -11,6 +11,7 @@ import torch
 
 from recon import fit
 from recon.backend import Backend, backend_for
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.splat import RayModel
@@ -138,7 +139,7 @@ def test_a_step_and_thirty_thousand(n: int, side: int) -> None:
     # Zha et al. 2024 take 8 min 14 s for 30 000 steps on an RTX 3090. Here: steps of the fit, without density control.
     backend, rng = backend_for("cuda"), np.random.default_rng(1)
     views = Geometry.parallel(np.linspace(0, np.pi, 50, endpoint=False), (side, side))
-    data, settings = rng.random((50, side, side)).astype(np.float32), fit.FitSettings(policy=None)
+    data, settings = rng.random((50, side, side)).astype(np.float32), FitSettings(policy=None)
     problem = fit.problem_of(data, views, Grid.matching(views), 1.0, settings, backend)
     state = fit.init(_model(n, 0.86 * side), 0, backend=backend)
     torch.cuda.reset_peak_memory_stats()

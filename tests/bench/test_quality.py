@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import recon
 from recon.fbp import fbp
 from recon.fdk import fdk
-from recon.fit import FitSettings
+from recon.fit_settings import FitSettings
 from recon.iterative import solve
 from recon.metrics import psnr, ssim3d
 from recon.operators import Projector

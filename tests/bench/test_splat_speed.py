@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from recon import fit
 from recon.density_control import DensityPolicy
+from recon.fit_settings import NAMES, FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.kernels import lanes
@@ -150,7 +151,7 @@ def test_a_whole_step_and_its_parts() -> None:
     views = Geometry.parallel(np.linspace(0, math.pi, 4, endpoint=False), (SIDE, SIDE))
     noise = np.random.default_rng(2).normal(1, 0.05, (4, SIDE, SIDE)).astype(np.float32)
     data = project(g, views).numpy() * noise
-    settings = fit.FitSettings(policy=None, views_per_step=1)
+    settings = FitSettings(policy=None, views_per_step=1)
     problem = fit.problem_of(data, views, Grid.matching(views), g.density_unit, settings)
     state = fit.init(g, 0)
     p, unit, n = state.parameters, 1 / problem.half_field, state.n
@@ -169,7 +170,7 @@ def test_a_whole_step_and_its_parts() -> None:
     tv = np.empty_like(density)
     total_variation(density, tv, 0.1)
     gradients, d_raw, d_q = (
-        [np.zeros_like(p[k]) for k in fit.NAMES],
+        [np.zeros_like(p[k]) for k in NAMES],
         np.empty_like(p["raw"]),
         np.empty((n, 4), np.float32),
     )
@@ -212,7 +213,7 @@ def test_a_whole_fit_of_published_length(steps: int, side: int) -> None:
     g = _model(N, side)
     views = Geometry.parallel(np.linspace(0, math.pi, 50, endpoint=False), (side, side))
     data = project(g, views).numpy() * np.random.default_rng(2).normal(1, 0.02, (50, side, side)).astype(np.float32)
-    settings = fit.FitSettings(views_per_step=1, pace=1.0, tv_size=32, policy=DensityPolicy(growth=1.0))
+    settings = FitSettings(views_per_step=1, pace=1.0, tv_size=32, policy=DensityPolicy(growth=1.0))
     warm_up()
     problem = fit.problem_of(data, views, Grid.matching(views), g.density_unit, settings)
     start = replace(g, means=g.means + 0.3 * torch.randn(g.means.shape, generator=torch.Generator().manual_seed(0)))

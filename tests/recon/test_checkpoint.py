@@ -10,6 +10,7 @@ import pytest
 from recon import fit
 from recon.checkpoint import arrays_of, state_from
 from recon.density_control import DensityPolicy
+from recon.fit_settings import FitSettings, growth
 from recon.geometry import Geometry
 from recon.splat import project
 from recon.volume import Grid
@@ -17,7 +18,7 @@ from tests.recon.conftest import Make
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 7, endpoint=False), (14, 20))
 GRID = Grid.matching(VIEWS)
-SETTINGS = fit.FitSettings(policy=DensityPolicy(start=0, stop=1, every=4, threshold=0.0, growth=2.0), tv_size=8)
+SETTINGS = FitSettings(policy=DensityPolicy(start=0, stop=1, every=4, threshold=0.0, growth=2.0), tv_size=8)
 
 
 def _problem(random_gaussians: Make) -> fit.Problem:
@@ -27,7 +28,7 @@ def _problem(random_gaussians: Make) -> fit.Problem:
 @pytest.mark.parametrize("at", [1, 5, 11])
 def test_a_fit_taken_up_again_is_the_fit_that_was_not_left(random_gaussians: Make, at: int) -> None:
     problem, start = _problem(random_gaussians), random_gaussians(20, 9.0)
-    whole, parts = (fit.init(start, 3, fit.growth(SETTINGS)) for _ in range(2))
+    whole, parts = (fit.init(start, 3, growth(SETTINGS)) for _ in range(2))
     for k in range(16):
         fit.step(whole, problem, SETTINGS, k / 16)
         fit.step(parts, problem, SETTINGS, k / 16)

@@ -10,6 +10,7 @@ import torch
 
 from recon import fit
 from recon.density_control import DensityPolicy
+from recon.fit_settings import NAMES, FitSettings, growth, tv_size, tv_weight
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.losses import projection_loss
@@ -22,10 +23,10 @@ from tests.recon.helpers import as_leaves, gradients, in_double
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (22, 26), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
-PLAIN = fit.FitSettings(policy=None, tv_weight=0.0, views_per_step=1, pace=3.0, decay=0.1)
+PLAIN = FitSettings(policy=None, tv_weight=0.0, views_per_step=1, pace=3.0, decay=0.1)
 
 
-def _problem(truth: Gaussians, settings: fit.FitSettings) -> fit.Problem:
+def _problem(truth: Gaussians, settings: FitSettings) -> fit.Problem:
     return fit.problem_of(project(truth, VIEWS).numpy(), VIEWS, GRID, truth.density_unit, settings)
 
 
@@ -55,10 +56,10 @@ def test_a_disturbed_model_finds_back_to_the_data(random_gaussians: Make, rng: n
 
 def test_the_same_seed_gives_the_same_bits(random_gaussians: Make, rng: np.random.Generator) -> None:
     truth = random_gaussians(30, extent=8.0)
-    settings = fit.FitSettings(policy=DensityPolicy(start=0, every=5, threshold=1e-9))
+    settings = FitSettings(policy=DensityPolicy(start=0, every=5, threshold=1e-9))
     problem, start = _problem(truth, settings), _disturbed(truth, rng)
-    ends = [fit.run(fit.init(start, 7, fit.growth(settings)), problem, settings, 20).parameters for _ in range(2)]
-    for name in fit.NAMES:
+    ends = [fit.run(fit.init(start, 7, growth(settings)), problem, settings, 20).parameters for _ in range(2)]
+    for name in NAMES:
         np.testing.assert_array_equal(ends[0][name], ends[1][name])
     assert ends[0]["raw"].size == 45  # the policy grew the model to its limit
 
@@ -92,7 +93,7 @@ def test_one_step_moves_along_the_twins_gradient(random_gaussians: Make, rng: np
     loss.backward()
     fit.step(state, problem, settings, 0.0, view=5)
     assert state.loss == pytest.approx(loss.item(), rel=1e-4)
-    for name, key in zip(("means", "log_scales", "quaternions", "raw_densities"), fit.NAMES, strict=True):
+    for name, key in zip(("means", "log_scales", "quaternions", "raw_densities"), NAMES, strict=True):
         expected = gradients(twin)[name].numpy()
         found = state.first[key] / 0.1
         np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max(), err_msg=name)
@@ -123,7 +124,7 @@ def test_rates_decay_by_the_schedule(random_gaussians: Make, rng: np.random.Gene
     state = fit.init(_disturbed(truth, rng), 0)
     before = {name: values.copy() for name, values in state.parameters.items()}
     fit.step(state, problem, PLAIN, fraction)
-    for name, rate in zip(fit.NAMES, (2e-4 * problem.half_field, 5e-3, 1e-3, 1e-2), strict=True):
+    for name, rate in zip(NAMES, (2e-4 * problem.half_field, 5e-3, 1e-3, 1e-2), strict=True):
         moved = np.abs(state.parameters[name] - before[name]).max()
         assert moved == pytest.approx(3 * rate * 10**-fraction, rel=0.01), name
 
@@ -158,7 +159,7 @@ def test_nothing_shrinks_below_what_the_pixels_can_see(random_gaussians: Make) -
 
 def test_copies_start_without_momentum_and_without_statistic(random_gaussians: Make, rng: np.random.Generator) -> None:
     truth = random_gaussians(30, extent=8.0)
-    settings = fit.FitSettings(policy=DensityPolicy(start=0, stop=2, every=5, threshold=1e-9))
+    settings = FitSettings(policy=DensityPolicy(start=0, stop=2, every=5, threshold=1e-9))
     state = fit.init(_disturbed(truth, rng), 7, 1.5)
     fit.run(state, _problem(truth, settings), settings, 5)
     assert state.n == 45 and not state.statistic.any() and state.statistic.shape == (45,)
@@ -168,7 +169,7 @@ def test_copies_start_without_momentum_and_without_statistic(random_gaussians: M
 
 def test_density_control_keeps_to_its_window(random_gaussians: Make, rng: np.random.Generator) -> None:
     truth = random_gaussians(20, extent=8.0)
-    settings = fit.FitSettings(policy=DensityPolicy(start=0.4, stop=0.6, every=1, threshold=1e-9))
+    settings = FitSettings(policy=DensityPolicy(start=0.4, stop=0.6, every=1, threshold=1e-9))
     counts: list[int] = []
     state = fit.init(_disturbed(truth, rng), 7, 10.0)
     fit.run(state, _problem(truth, settings), settings, 10, lambda s: bool(counts.append(s.n)))
@@ -225,7 +226,7 @@ def test_values_that_are_not_finite_pull_at_nothing(random_gaussians: Make) -> N
     runs = [
         fit.run(fit.init(start, 0), fit.problem_of(d, VIEWS, GRID, 1.0, PLAIN), PLAIN, 5) for d in (marred, other)
     ]  # fmt: skip
-    for name in fit.NAMES:
+    for name in NAMES:
         assert np.isfinite(runs[0].parameters[name]).all()
         np.testing.assert_array_equal(runs[0].parameters[name], runs[1].parameters[name])
 
@@ -238,7 +239,7 @@ def test_a_step_on_all_views_takes_the_mean_gradient(random_gaussians: Make) -> 
     problem = fit.problem_of(data, VIEWS, GRID, 1.0, alone)
     singles = [fit.step(fit.init(g, 0), problem, alone, 0.0, view=v).first for v in range(VIEWS.n_views)]
     together = fit.step(fit.init(g, 0), problem, replace(alone, views_per_step=VIEWS.n_views), 0.0)
-    for name in fit.NAMES:
+    for name in NAMES:
         expected = np.mean([first[name] for first in singles], axis=0)
         np.testing.assert_allclose(together.first[name], expected, atol=1e-5 * np.abs(expected).max())
     assert together.seen == VIEWS.n_views
@@ -270,7 +271,7 @@ def test_settings_out_of_range_are_refused() -> None:
         {"decay": -1.0}, {"smallest": 0.0}, {"coarse_until": 2.0}, {"rates": (1e-3, 1e-3, 1e-3)},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=next(iter(bad))):
-            fit.FitSettings(**bad)  # type: ignore[arg-type]
+            FitSettings(**bad)  # type: ignore[arg-type]
     for wrong in ({"sigmas": -1.0}, {"sigmas": float("nan")}, {"faint": -1.0}, {"faint": float("inf")}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Truncation(**wrong)
@@ -297,7 +298,7 @@ def test_views_of_nothing_leave_a_model_to_go_on_with(random_gaussians: Make) ->
     # All Gaussians fade below the pruning limit; the fit goes on, and no array becomes empty.
     g = random_gaussians(10, extent=6.0)
     policy = DensityPolicy(start=0, stop=2, every=10, prune_below=1e3)
-    settings = fit.FitSettings(policy=policy)
+    settings = FitSettings(policy=policy)
     empty = np.zeros((VIEWS.n_views, *VIEWS.detector_shape), np.float32)
     state = fit.run(fit.init(g, 0), fit.problem_of(empty, VIEWS, GRID, 1.0, settings), settings, 25)
     assert state.n == 10 and state.step == 25
@@ -337,12 +338,12 @@ def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generato
     flat = np.full((views.n_views, *views.detector_shape), 5.0)
     scale = 0.7 * max(grid.shape) * grid.voxel_size / 2
     data = flat + rng.normal(0, noise * scale, flat.shape)
-    settings, count = fit.FitSettings(), flat.size // 24
+    settings, count = FitSettings(), flat.size // 24
     problem = fit.problem_of(data.astype(np.float32), views, grid, 0.7, settings)
-    assert fit.tv_weight(settings, problem, count) == pytest.approx(weight, rel=0.1)
+    assert tv_weight(settings, problem, count) == pytest.approx(weight, rel=0.1)
     rough = coarser(problem, 2, settings.loss, settings.ssim_weight)
-    assert fit.tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
-    assert fit.tv_weight(fit.FitSettings(tv_weight=0.0), problem, count) == 0
+    assert tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
+    assert tv_weight(FitSettings(tv_weight=0.0), problem, count) == 0
 
 
 @pytest.mark.parametrize(
@@ -350,5 +351,5 @@ def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generato
     [((8, 8, 8), 32), ((128, 128, 128), 32), ((96, 256, 256), 48), ((256,) * 3, 64), ((900,) * 3, 96)],
 )
 def test_total_variation_looks_at_a_64th_of_the_grid(shape: tuple[int, int, int], size: int) -> None:
-    assert fit.tv_size(fit.FitSettings(), Grid(shape)) == size
-    assert fit.tv_size(fit.FitSettings(tv_size=20), Grid(shape)) == 20
+    assert tv_size(FitSettings(), Grid(shape)) == size
+    assert tv_size(FitSettings(tv_size=20), Grid(shape)) == 20

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from recon import fit
 from recon.backend import Cpu
+from recon.fit_settings import NAMES, FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.problem import coarser, extend, make_problem, noise_level
@@ -108,12 +109,12 @@ def test_a_fit_goes_on_beside_values_that_no_matter_explains(rng: np.random.Gene
     ends = []
     for value in (np.nan, 1e25):
         data[2, 5, 6] = value
-        settings = fit.FitSettings(policy=None, tv_size=6, coarse=2, coarse_until=0.5)
+        settings = FitSettings(policy=None, tv_size=6, coarse=2, coarse_until=0.5)
         problem = fit.problem_of(data, VIEWS, GRID, 0.2, settings)
         rough = coarser(problem, 2, "l1", 0.25)
         state = fit.run(fit.init(start, 0), rough, settings, 4)
         ends.append(fit.run(state, problem, settings, 4).parameters)
-    for name in fit.NAMES:
+    for name in NAMES:
         assert np.isfinite(ends[1][name]).all()
         np.testing.assert_array_equal(ends[0][name], ends[1][name])
 

@@ -12,7 +12,7 @@ import torch
 import recon
 import recon.initialise
 import recon.reconstruction
-from recon import fit
+from recon.fit_settings import FitSettings
 from recon.metrics import psnr
 from recon.operators import Projector
 from recon.splat import RayModel, project, voxelize
@@ -158,7 +158,7 @@ def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], mess
 
 
 OF_THE_FIT: dict[str, object] = {
-    "steps": 3, "seconds": 1.0, "gaussians": 100, "densify": False, "settings": fit.FitSettings(), "start": "tv",
+    "steps": 3, "seconds": 1.0, "gaussians": 100, "densify": False, "settings": FitSettings(), "start": "tv",
     "held_out": (3,), "early_stop": True, "resume": {}, "device": "cuda", "polish": 3, "on_checkpoint": print,
 }  # fmt: skip
 OF_ITERATIONS: dict[str, object] = {"iterations": 3}
@@ -231,7 +231,7 @@ def test_views_held_out_are_measured_and_not_fitted(noisy: np.ndarray) -> None:
 
 def test_a_fit_may_end_where_views_held_out_stop_getting_better(noisy: np.ndarray) -> None:
     loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)
-    options = {"gaussians": 3000, "held_out": tuple(range(0, 24, 4)), "settings": fit.FitSettings(pace=15.0)}
+    options = {"gaussians": 3000, "held_out": tuple(range(0, 24, 4)), "settings": FitSettings(pace=15.0)}
     early = recon.reconstruct(loud, VIEWS, steps=3000, early_stop=True, **options)  # type: ignore[arg-type]
     assert early.history[-1].step < 3000
     lowest = min(p.held_out for p in early.history if np.isfinite(p.held_out))
@@ -311,10 +311,10 @@ def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [fit.FitSettings(loss="l2"), fit.FitSettings(loss="poisson"), fit.FitSettings(coarse=2, coarse_until=0.5),
-     fit.FitSettings(views_per_step=3)],
+    [FitSettings(loss="l2"), FitSettings(loss="poisson"), FitSettings(coarse=2, coarse_until=0.5),
+     FitSettings(views_per_step=3)],
 )  # fmt: skip
-def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, settings: fit.FitSettings) -> None:
+def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, settings: FitSettings) -> None:
     truth = phantom.attenuation(GRID)
     baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, method="fbp").volume.data)
     result = recon.reconstruct(noisy, VIEWS, steps=300, gaussians=2500, settings=settings)
@@ -326,7 +326,7 @@ def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phanto
     # so more than rays through matter: 22.9 dB, squares alike for all 25.3; by e^3 as much it was 18.5.
     bright = np.where(np.random.default_rng(9).random(noisy.shape) < 0.005, np.float32(-3), noisy)
     likely, squares = (
-        recon.reconstruct(bright, VIEWS, steps=300, gaussians=2500, settings=fit.FitSettings(loss=loss)).volume.data
+        recon.reconstruct(bright, VIEWS, steps=300, gaussians=2500, settings=FitSettings(loss=loss)).volume.data
         for loss in ("poisson", "l2")
     )
     truth = phantom.attenuation(GRID)
@@ -341,7 +341,7 @@ def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.initialise.St
     cone = recon.Geometry.cone(around, SHAPE, 2 * PITCH, 12.0, 24.0, axis_col=18.3)
     data = Projector(cone, GRID).forward(truth)
     baseline = psnr(truth, recon.reconstruct(data, cone, GRID, "fbp").volume.data)
-    settings = fit.FitSettings(rays=RayModel(exact_above=0.01))
+    settings = FitSettings(rays=RayModel(exact_above=0.01))
     result = recon.reconstruct(data, cone, GRID, steps=500, gaussians=2500, settings=settings, start=start)
     assert psnr(truth, result.volume.data) > baseline + 1
 

@@ -9,6 +9,7 @@ import pytest
 
 from recon import Geometry, Grid, fit
 from recon.density_control import DensityPolicy
+from recon.fit_settings import FitSettings
 from recon.initialise import default_count
 from recon.metrics import psnr
 from recon.stream import StreamingFit
@@ -116,7 +117,7 @@ def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_e
 
 
 def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
-    greedy = fit.FitSettings(policy=DensityPolicy(start=0, every=1, threshold=0, prune_below=0))
+    greedy = FitSettings(policy=DensityPolicy(start=0, every=1, threshold=0, prune_below=0))
     model = StreamingFit(VIEWS, GRID, 0, gaussians=500, settings=greedy, now=StepClock())
     counts = []
     for first, last in ((0, 16), (16, 24), (24, 36)):  # each half as many again
@@ -161,7 +162,7 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
 
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="coarse=2 begins a fit on joined pixels"):
-        StreamingFit(VIEWS, GRID, settings=fit.FitSettings(coarse=2))
+        StreamingFit(VIEWS, GRID, settings=FitSettings(coarse=2))
 
 
 def test_one_wild_pixel_does_not_spoil_what_has_come_or_comes(data: np.ndarray, phantom: Phantom) -> None:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon import fit
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.losses import total_variation
@@ -21,7 +22,7 @@ VOXEL = 2 / 256  # of the published field, -1 to 1 in 256 voxels
 VIEWS = Geometry.parallel([0.2, 1.1, 2.3], (20, 24), VOXEL)
 GRID = Grid.matching(VIEWS)
 # So much smoothness that nothing else counts, on a box that is the whole grid.
-SETTINGS = fit.FitSettings(
+SETTINGS = FitSettings(
     tv_weight=1e7, tv_size=64, ssim_weight=0.0, policy=None, smallest=1e-3, truncation=Truncation(9.0, 1e-12)
 )
 
@@ -34,7 +35,7 @@ def _blobs() -> Gaussians:
     )
 
 
-def _gradient(settings: fit.FitSettings) -> tuple[fit.FitState, NDArray[np.float64]]:
+def _gradient(settings: FitSettings) -> tuple[fit.FitState, NDArray[np.float64]]:
     """(state, the gradient on means [n, 3] that a step of the fit takes): Adam's first moments are a tenth of it."""
     start = _blobs()
     data = project(start, VIEWS).numpy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import fit
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import place
@@ -132,4 +132,4 @@ def test_a_cone_too_wide_for_a_box_of_its_pixels_is_fitted(turn: np.ndarray) -> 
 def test_what_cannot_be_joined_is_told_before_anything_is_placed() -> None:
     views = Geometry.parallel(TURN, (1, 32))
     with pytest.raises(ValueError, match="coarse=2 joins 2 x 2 pixels, and the detector has 1 x 32"):
-        reconstruct(np.zeros((48, 1, 32)), views, steps=5, settings=fit.FitSettings(coarse=2))
+        reconstruct(np.zeros((48, 1, 32)), views, steps=5, settings=FitSettings(coarse=2))

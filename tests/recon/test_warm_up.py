@@ -18,7 +18,7 @@ _SCRIPT = """
 import gc
 import numpy as np
 import recon
-from recon.fit import FitSettings
+from recon.fit_settings import FitSettings
 from recon.splat import RayModel
 from recon.warm_up import warm_up
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from recon import fit
 from recon.correct import References, correct
 from recon.fbp import fbp
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.initialise import without_wild_pixels
@@ -27,7 +28,7 @@ F32 = NDArray[np.float32]
 SHAPE = (12, 48)
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 32, endpoint=False), SHAPE)
 GRID = Grid.matching(VIEWS)
-SHORT = fit.FitSettings(policy=None, tv_size=12)
+SHORT = FitSettings(policy=None, tv_size=12)
 
 
 @pytest.fixture(scope="module")

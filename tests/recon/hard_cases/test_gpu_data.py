@@ -10,6 +10,7 @@ import torch
 
 from recon import fit
 from recon.backend import backend_for
+from recon.fit_settings import FitSettings
 from recon.geometry import Geometry
 from recon.kernels.losses_cpu import L2, POISSON, DataTerm
 from recon.losses import projection_loss
@@ -104,7 +105,7 @@ def test_detectors_of_one_row_or_column_with_a_pixel_missing_are_the_cpus(
     views = Geometry.parallel([0.3, 1.9], shape)
     data = rng.random((2, *shape)).astype(np.float32)
     data[0, 0, 0] = np.nan if shape != (1, 1) else 0.3  # a view of nothing else is refused
-    settings = fit.FitSettings(policy=None, tv_size=3, truncation=Truncation(9.0, 1e-12))
+    settings = FitSettings(policy=None, tv_size=3, truncation=Truncation(9.0, 1e-12))
     flat = Grid((2, 5, 4), 1.0, slice_pitch=2.5)
     states = []
     for device in ("cpu", "cuda"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from recon import fit
+from recon.fit_settings import FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.splat import project
@@ -35,7 +36,7 @@ def _start_and_data() -> tuple[Gaussians, np.ndarray]:
 )
 def test_steps_without_drift(steps: int, residual: float) -> None:
     start, data = _start_and_data()
-    settings = fit.FitSettings(policy=None, tv_weight=0.0)
+    settings = FitSettings(policy=None, tv_weight=0.0)
     problem = fit.problem_of(data, VIEWS, Grid.matching(VIEWS), 0.7, settings)
     state = fit.init(start, 0)
     losses: list[float] = []

@@ -12,6 +12,7 @@ from recon import fit
 from recon.backend import Backend, Cpu, backend_for
 from recon.checkpoint import arrays_of, state_from
 from recon.density_control import DensityPolicy
+from recon.fit_settings import NAMES, FitSettings
 from recon.gaussians import Gaussians
 from recon.geometry import Geometry
 from recon.splat import RayModel, Truncation, project, voxelize
@@ -23,7 +24,7 @@ from tests.recon.kernels.gpu.on_gpu import DEVICE, UNIT, cone, parallel
 gpu = importlib.import_module("recon.kernels.gpu")
 
 
-def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: fit.FitSettings) -> tuple[fit.FitState, list]:
+def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettings) -> tuple[fit.FitState, list]:
     """Five steps with rounds of density control on data and weights that are always the same."""
     rng = np.random.default_rng(5)
     data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
@@ -45,14 +46,14 @@ def test_a_fit_is_the_same_on_both_backends(make: object, changes: dict, random_
     g, geometry = random_gaussians(14, 6.0), make((11, 14))  # type: ignore[operator]
     # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.
     policy = DensityPolicy(start=0.0, stop=1.0, every=2, threshold=1e-4, prune_below=0.3)
-    settings = fit.FitSettings(
+    settings = FitSettings(
         truncation=Truncation(9.0, 1e-12), policy=policy, tv_size=5, pace=10.0, smallest=0.8, **changes
     )
     (ours, said), (theirs, told) = (_fit(backend, g, geometry, settings) for backend in (Cpu(), backend_for("cuda")))
     assert len({n for n, *_ in said[:-1]}) > 1  # density control changed the model
     np.testing.assert_allclose(np.hstack(told), np.hstack(said), rtol=2e-5)
     device = backend_for("cuda")
-    for name in fit.NAMES:
+    for name in NAMES:
         a, b = ours.parameters[name], device.numpy(theirs.parameters[name])
         np.testing.assert_allclose(b, a, atol=2e-5 * float(np.abs(a).max()), err_msg=name)
     np.testing.assert_allclose(device.numpy(theirs.statistic), ours.statistic, atol=2e-5 * ours.statistic.max())
