@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from drivers.orca_quest import BINNINGS, SENSOR_SHAPE
+
 
 @dataclass(frozen=True)
 class DetectorSettings:
@@ -14,6 +16,7 @@ class DetectorSettings:
     exposure_s: of a frame.
     binning: sensor pixels summed per side.
     readout: the camera's mode.
+    electrons_per_count: in place of the camera's.
     """
 
     shape: tuple[int, int] = (512, 512)
@@ -21,12 +24,20 @@ class DetectorSettings:
     exposure_s: float = 0.05
     binning: int = 1
     readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
+    electrons_per_count: float | None = None
 
     def __post_init__(self) -> None:
         if not (min(self.shape) >= 1 and self.pixel_size_um > 0 and self.exposure_s > 0):
             raise ValueError(f"shape, pixel_size_um and exposure_s must be positive, got {self}")
-        if self.binning not in (1, 2, 4):
+        if self.binning not in BINNINGS:
             raise ValueError(f"binning must be 1, 2 or 4, got {self.binning}")
+        if any(n * self.binning > whole for n, whole in zip(self.shape, SENSOR_SHAPE, strict=True)):
+            raise ValueError(
+                f"{self.shape} pixels of {self.binning} x {self.binning} do not lie on the sensor of "
+                f"{SENSOR_SHAPE[0]} x {SENSOR_SHAPE[1]}"
+            )
+        if self.electrons_per_count is not None and not self.electrons_per_count > 0:
+            raise ValueError(f"electrons_per_count must be positive, got {self.electrons_per_count}")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,116 @@
+"""`beamline simulate`: frames of a scene without an instrument, their cost, their labels and the truth behind them."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from beamline.cli.scan import stop_signals
+from beamline.cli.told import told_as_json
+from beamline.errors import ConfigError, ScanStopped
+from beamline.events import Event, fan_out
+from beamline.machine import machine, machine_line
+from beamline.simulate.explained import explained, table
+from beamline.simulate.figure import sheet
+from beamline.simulate.scene_file import open_scene
+from beamline.simulate.truth import binning_of, truth_of, write_truth
+from beamline.simulate.write import write_scan
+from beamline.stop import StopRequest
+from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
+from beamline.terminal import Terminal
+from drivers.clock import SystemClock
+from simulators.shots import Scan
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@click.argument("scene", metavar="SCENE")
+@click.option("--explain", "explains", is_flag=True, help="What a frame computes, in order, and what each step costs.")
+@click.option(
+    "--frames", "views", type=click.IntRange(min=1), help="Views over the scene's range; its own number unless given."
+)
+@click.option("--out", type=_FILE, help="Write the scan to this HDF5 file, and its labels beside it.")
+@click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")
+@click.option(
+    "--truth-bin", type=click.IntRange(min=1), help="Pixels a voxel's side; as many as make 256 across at most unless given."
+)
+@click.option("--picture", type=_FILE, help="Write a PNG with some of the frames; beside --out unless given.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all random numbers.")
+@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+def simulate(
+    scene: str,
+    explains: bool,
+    views: int | None,
+    out: Path | None,
+    truth: Path | None,
+    truth_bin: int | None,
+    picture: Path | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
+
+    Only the effects that it names are computed. The file is like one of the instrument: `beamline recon` reads it.
+    The first Ctrl-C ends the scan with a readable file and its labels.
+
+    Exit code: 0 done, 2 a wrong scene, 4 stopped, 5 disk.
+    """
+    if not (explains or out or truth or picture):
+        raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
+    clock = SystemClock()
+    with told_as_json(as_json) as sinks:
+        opened = open_scene(scene)
+        scan = Scan.of(opened.scene, seed, views, clock.now())
+        picture = out.with_suffix(".png") if out and not picture else picture
+        for path in filter(None, (truth, picture)):
+            refuse_existing(path)
+        if explains:
+            found = explained(scan, time.perf_counter)
+            for sink in sinks:
+                sink(Event("explain", clock.now(), asdict(found) | {"machine": machine()}))
+            if not as_json:
+                click.echo(f"{machine_line(machine())}\n\n{table(found)}")
+        data: dict[str, object] = {}
+        if truth:
+            try:
+                made = truth_of(scan.scene.sample, scan.detector, truth_bin or binning_of(scan.detector))
+            except ValueError as error:
+                raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
+            write_truth(truth, made)
+            data["truth"] = truth
+            _say(
+                as_json,
+                "truth",
+                f"{truth}  {' x '.join(map(str, made.grid.shape))} voxels of {made.grid.voxel_size:.4g} mm",
+            )
+        written = None
+        if out:
+            stop = StopRequest()
+            with stop_signals(stop), Terminal(sys.stderr) as terminal:
+                written = write_scan(opened, scan, out, fan_out(terminal, *sinks), clock, lambda: stop.stopping)
+            data |= {"output": out, "labels": written.labels, "n_frames": written.n_frames}
+            _say(as_json, "scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
+            counts = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
+            _say(as_json, "labels", f"{written.labels}  {counts or 'no anomaly'}")
+        if picture and not (written and written.stopped):
+            marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
+            with named_on_failure(picture), whole_file(picture) as partial:
+                partial.write_bytes(sheet(scan, marked))
+            data["picture"] = picture
+            _say(as_json, "picture", str(picture))
+        if written and written.stopped:
+            raise ScanStopped(
+                f"Stopped after {written.n_frames} of {len(scan)} frames; {out} is complete as far as it goes."
+            )
+        for sink in sinks:
+            sink(Event("done", clock.now(), data))
+
+
+def _say(as_json: bool, what: str, text: str) -> None:
+    if not as_json:
+        click.echo(f"{what:<10}{text}")

@@ -1,0 +1,74 @@
+"""Figure: a simulated scan at one look: a dark, a flat and some views, with the labelled anomalies framed."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from beamline.figures import grey_window
+from drivers.frame import FrameKind
+from simulators.exposure import expose
+from simulators.shots import Scan
+
+COLUMNS, PICTURES = 4, 8
+MOST = 512  # pixels a side that a picture of 2 inches can show
+
+
+def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
+    """PNG. Frames are made again for it, so that it can be had without a file.
+
+    Args:
+        marked: frames that should be among those shown: where an anomaly begins.
+    """
+    numbers = _chosen(scan, marked)
+    made = [(n, scan.frame(n)) for n in numbers]
+    frames = [expose(scan.scene, planned.shot) for _, planned in made]
+    step = max(1, -(-max(scan.detector.shape) // MOST))
+    small = [frame[::step, ::step].astype(np.float32) for frame in frames]
+    shown = [frame for frame, (_, planned) in zip(small, made, strict=True) if planned.kind is FrameKind.PROJECTION]
+    low, high = grey_window(shown, 0.5, 99.8)
+    rows = -(-len(frames) // COLUMNS)
+    figure = Figure(
+        figsize=(10.5, 0.4 + 2.9 * rows * scan.detector.shape[0] / scan.detector.shape[1] + 0.3 * rows), dpi=110
+    )
+    FigureCanvasAgg(figure)
+    for place, ((number, planned), frame) in enumerate(zip(made, small, strict=True), start=1):
+        axes = figure.add_subplot(rows, COLUMNS, place)
+        axes.imshow(frame, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        kind = planned.kind.name.lower()
+        angle = f" at {np.degrees(planned.shot.angle):.1f}°" if planned.kind is FrameKind.PROJECTION else ""
+        axes.set_title(f"{number}: {kind}{angle}", fontsize=8)
+        for label in scan.scene.chain.labels(planned.shot):
+            top, bottom, left, right = (edge / step for edge in label.region)
+            axes.add_patch(
+                Rectangle((left - 0.5, top - 0.5), right - left, bottom - top, fill=False, color="tab:orange", lw=1.2)
+            )
+            axes.text(left, top, label.kind, color="tab:orange", fontsize=7, va="top")
+    figure.suptitle(f"counts {low:.0f} (black) to {high:.0f} (white)", fontsize=8)
+    figure.tight_layout()
+    out = io.BytesIO()
+    figure.savefig(out, format="png")
+    return out.getvalue()
+
+
+def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:
+    """A dark and a flat where there are any, frames that are marked, and views spread over the rest."""
+    settings = scan.scene.scan
+    first_view = settings.darks + settings.flats
+    numbers = [0] if settings.darks else []
+    numbers += [settings.darks] if settings.flats else []
+    numbers += list(dict.fromkeys(marked))[: PICTURES - 1 - len(numbers)]
+    spread = np.linspace(first_view, len(scan) - 1, PICTURES).round().astype(int).tolist()
+    middle_out = sorted(spread, key=lambda n: min((abs(n - m) for m in numbers), default=0), reverse=True)
+    for number in middle_out:
+        if len(numbers) == PICTURES:
+            break
+        if number not in numbers:
+            numbers.append(number)
+    return sorted(numbers)

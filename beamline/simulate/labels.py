@@ -1,0 +1,88 @@
+"""Labels: which frames show which injected anomaly and where, as JSON beside a simulated scan, to judge monitors by."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from beamline.storage.recon_file import named_on_failure, whole_file
+from simulators.effects.chain import Label
+
+Region = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Run:
+    """An anomaly in consecutive frames.
+
+    Attributes:
+        kind: the anomaly's name.
+        first: frame, counted in the file from 0.
+        regions: one a frame: (first row, row after the last, first column, column after the last).
+    """
+
+    kind: str
+    first: int
+    regions: tuple[Region, ...]
+
+    @property
+    def last(self) -> int:
+        return self.first + len(self.regions) - 1
+
+
+@dataclass
+class LabelLog:
+    """Takes the labels of one frame after the other."""
+
+    _frames: list[tuple[int, Label]] = field(default_factory=list)
+
+    def add(self, frame: int, labels: Sequence[Label]) -> None:
+        self._frames.extend((frame, label) for label in labels)
+
+    def runs(self) -> tuple[Run, ...]:
+        """In the order in which they begin."""
+        open_runs: dict[str, Run] = {}
+        done: list[Run] = []
+        for frame, label in self._frames:
+            run = open_runs.get(label.kind)
+            if run is not None and run.last == frame - 1:
+                open_runs[label.kind] = Run(run.kind, run.first, (*run.regions, label.region))
+                continue
+            done += [run] if run is not None else []
+            open_runs[label.kind] = Run(label.kind, frame, (label.region,))
+        return tuple(sorted([*done, *open_runs.values()], key=lambda run: (run.first, run.kind)))
+
+
+def labels_path(scan: Path) -> Path:
+    """Where the labels of a scan file stand."""
+    return scan.with_suffix(".labels.json")
+
+
+def write_labels(path: Path, runs: Sequence[Run], n_frames: int) -> None:
+    """All or nothing; also where there is no anomaly, for that is a statement too.
+
+    Raises:
+        DataError: `path` exists, or the disk refuses.
+    """
+    said: dict[str, Any] = {
+        "frames": n_frames,
+        "region": "first row, row after the last, first column, column after the last",
+        "anomalies": [
+            {"kind": run.kind, "first_frame": run.first, "last_frame": run.last, "regions": list(run.regions)}
+            for run in runs
+        ],
+    }
+    with named_on_failure(path), whole_file(path) as partial:
+        partial.write_text(json.dumps(said) + "\n", encoding="utf-8")
+
+
+def read_labels(path: Path) -> tuple[Run, ...]:
+    """What `write_labels` wrote."""
+    said = json.loads(path.read_text(encoding="utf-8"))
+    return tuple(
+        Run(entry["kind"], entry["first_frame"], tuple(tuple(region) for region in entry["regions"]))
+        for entry in said["anomalies"]
+    )

@@ -1,0 +1,84 @@
+"""Truth: the attenuation and the labels of a simulated sample, on the grid that a reconstruction of its scan has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage import hdf5
+from beamline.storage.recon_file import named_on_failure, whole_file
+from recon.geometry import Geometry
+from recon.volume import Grid
+from simulators.detector import Detector
+from simulators.sample import Sample
+
+LARGEST = 256
+"""Voxels across, unless asked otherwise: 256³ take 84 MB with the labels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Attributes:
+    attenuation: float32 [z, y, x], 1/mm.
+    labels: uint8 [z, y, x]; 0 is air, k the k-th of `names`.
+    """
+
+    grid: Grid
+    attenuation: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    names: tuple[str, ...]
+
+
+def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
+    """The simulated rays as reconstructions know them; of a cone, the detector is taken to stand at the sample."""
+    if np.isfinite(detector.sod):
+        return Geometry.cone(
+            angles,
+            detector.shape,
+            detector.sod,
+            detector.sod,
+            detector.pitch,
+            detector.axis_col,
+            axis_row=detector.axis_row,
+        )
+    return Geometry.parallel(angles, detector.shape, detector.pitch, detector.axis_col, axis_row=detector.axis_row)
+
+
+def binning_of(detector: Detector) -> int:
+    """The least binning with which a volume is no larger than LARGEST voxels across."""
+    return max(1, -(-max(detector.shape) // LARGEST))
+
+
+def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
+    """The truth in voxels of `binning` pixels.
+
+    Raises:
+        ValueError: the binning does not fit into the frame.
+    """
+    grid = Grid.matching(geometry_of(detector, np.zeros(1)).binned(binning))
+    return Truth(grid, sample.attenuation(grid), sample.labels(grid), sample.names)
+
+
+def write_truth(path: Path, truth: Truth) -> None:
+    """An HDF5 file with entry/data/data (which `beamline recon --truth` reads) and entry/data/labels; all or nothing.
+
+    Raises:
+        DataError: `path` exists, or the disk refuses.
+    """
+    with named_on_failure(path), whole_file(path) as partial, hdf5.created(partial) as file:
+        file.attrs["default"] = "entry"
+        entry = file.create_group("entry")
+        entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"
+        data = entry.create_group("data")
+        data.attrs["NX_class"], data.attrs["signal"], data.attrs["axes"] = "NXdata", "data", ["z", "y", "x"]
+        chunks = (1, *truth.grid.shape[1:])
+        data.create_dataset("data", data=truth.attenuation, chunks=chunks)
+        data["data"].attrs["units"] = "1/mm"
+        data.create_dataset("labels", data=truth.labels, chunks=chunks, compression="gzip", compression_opts=1)
+        data["labels"].attrs["names"] = ["air", *truth.names]
+        for name, centres in zip(("z", "y", "x"), truth.grid.coordinates(), strict=True):
+            data[name] = centres
+            data[name].attrs["units"] = "mm"

@@ -1,0 +1,115 @@
+"""Write: a simulated scan frame by frame into a file like an instrument's, with the labels of what was put in it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from beamline.digest import digest
+from beamline.events import Event, Sink
+from beamline.simulate.labels import LabelLog, Run, labels_path, write_labels
+from beamline.simulate.scene_file import SceneFile
+from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.recon_file import refuse_existing
+from drivers.clock import Clock
+from drivers.frame import Frame, FrameKind
+from drivers.orca_quest import BITS
+from simulators.exposure import expose
+from simulators.shots import Planned, Scan
+
+PREVIEW_BIN = 4
+SAY_EVERY = 0.1  # real s between `frame` events
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What was written: `stopped` says that it ended before all frames were made."""
+
+    path: Path
+    labels: Path
+    n_frames: int
+    runs: tuple[Run, ...]
+    seconds: float
+    stopped: bool
+
+
+def write_scan(
+    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, stopped: Callable[[], bool]
+) -> Simulated:
+    """Make every frame of `scan` and write it to `out`, and the labels beside it.
+
+    Args:
+        stopped: asked before each frame; where it says so, file and labels are complete as far as they go.
+
+    Raises:
+        DataError: a file is in the way, or the disk refuses.
+    """
+    labels = labels_path(out)
+    for path in (out, labels):
+        refuse_existing(path)
+    log, begun, said = LabelLog(), time.monotonic(), -SAY_EVERY
+    n = 0
+    writer = NXtomoWriter(
+        out, _info(scene, scan), scan.detector.shape, clock=clock, preview_bin=_preview_bin(scan.detector.shape)
+    )
+    with writer:
+        for planned in scan:
+            if stopped():
+                writer.close("stopped")
+                break
+            log.add(n, _write(scan, planned, n, writer))
+            n += 1
+            now = time.monotonic() - begun
+            if now - said >= SAY_EVERY or n == len(scan):
+                said = now
+                sink(Event("frame", clock.now(), _progress(n, len(scan), now, scan.detector.shape, planned.kind)))
+    runs = log.runs()
+    write_labels(labels, runs, n)
+    return Simulated(out, labels, n, runs, time.monotonic() - begun, n < len(scan))
+
+
+def _write(scan: Scan, planned: Planned, row: int, writer: NXtomoWriter):  # type: ignore[no-untyped-def]
+    shot = planned.shot
+    counts = expose(scan.scene, shot)
+    angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan
+    frame = Frame(counts, planned.kind, row, shot.view, shot.frame, angle, shot.time, shot.exposure)
+    writer.append(frame, digest(counts, 2**BITS - 1, _preview_bin(counts.shape)))
+    return scan.scene.chain.labels(shot)
+
+
+def _preview_bin(shape: tuple[int, int]) -> int:
+    return min(PREVIEW_BIN, *shape)
+
+
+def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: FrameKind) -> dict[str, object]:
+    rate = n / seconds if seconds > 0 else 0.0
+    return {
+        "n": n,
+        "of": total,
+        "kind": kind.name.lower(),
+        "frames_per_s": rate,
+        "mb_per_s": rate * 2e-6 * math.prod(shape),
+        "eta_s": (total - n) / rate if rate > 0 else 0.0,
+    }
+
+
+def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
+    settings, beam = scene.scene.scan, scene.scene.beam
+    asked = {"views": scan.views, "range_deg": settings.range_deg, "fly": settings.fly, "seed": scan.seed}
+    magnification = 1.0 if beam.sod is None or beam.sdd is None else beam.sdd / beam.sod
+    return ScanInfo(
+        sample=scene.path.stem,
+        title=f"Simulated scan of the scene {scene.path.stem}",
+        pixel_size_mm=scan.detector.pitch * magnification,
+        distance_mm=None if beam.sod is None or beam.sdd is None else beam.sdd - beam.sod,
+        exposure=scene.scene.detector.exposure_s,
+        period=settings.period_s,
+        axis_col=scan.detector.axis_col,
+        plan=json.dumps(asked),
+        config=scene.text,
+        devices={"simulator": {"seed": scan.seed, "electrons_per_count": scan.frame(0).shot.conversion}},
+    )

@@ -1,0 +1,157 @@
+"""Explain: what a scene computes for one frame, in order, and what each step costs; and what it does not compute.
+
+Steps are timed where they run, but for effects of motion, which make the others run again: what one of these costs is
+the time of a frame with it less that of a frame without it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tracemalloc
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+
+from simulators.effects.catalogue import CATALOGUE
+from simulators.effects.chain import Chain
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Shot
+from simulators.exposure import expose
+from simulators.scene import Scene
+
+Seconds = Callable[[], float]
+
+STEPS = {
+    "line_integrals": "rays through the sample",
+    "beer_lambert": "photons x exp(-depth)",
+    "digitise": "electrons to whole counts",
+}
+"""What every frame of a sample needs, whatever the scene names."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step of a frame costs.
+
+    Attributes:
+        name: of the step or effect.
+        domain: what it acts on; None for the steps that every frame needs.
+        ms: median.
+        size: bytes of memory taken at most while it ran.
+        says: what happens.
+    """
+
+    name: str
+    domain: Domain | None
+    ms: float
+    size: int
+    says: str
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What a frame of a scene costs.
+
+    Attributes:
+        costs: in the order in which the steps run.
+        ms: median of a whole frame.
+        not_called_for: effects of the catalogue that the scene does not name, with what they would do.
+    """
+
+    costs: tuple[Cost, ...]
+    ms: float
+    not_called_for: tuple[tuple[str, str], ...]
+
+
+def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explained:
+    """Make the frame `repeats` times in each way that is needed, after one that does not count (it compiles).
+
+    Args:
+        now: s, of a clock for short times.
+    """
+    motion = [effect for effect in scene.chain.effects if effect.domain is Domain.MOTION]
+    rest = [effect for effect in scene.chain.effects if effect.domain is not Domain.MOTION]
+    still = replace(scene, chain=Chain.of(rest))
+    seconds, sizes = _steps(still, shot, now, repeats)
+    expose(scene, shot)
+    costs = [_cost(name, seconds[name], sizes[name]) for name in ("line_integrals",) if name in seconds]
+    below, below_size = _whole(still, shot, now, repeats), _peak(still, shot)
+    for n, effect in enumerate(motion, start=1):
+        with_it = replace(scene, chain=Chain.of([*motion[:n], *rest]))
+        above, above_size = _whole(with_it, shot, now, repeats), _peak(with_it, shot)
+        costs.append(_cost(effect.name, above - below, max(above_size - below_size, 0)))
+        below, below_size = above, above_size
+    order = [effect.name for effect in rest]
+    depth = [effect.name for effect in rest if effect.domain is Domain.OPTICAL_DEPTH]
+    for name in [*depth, "beer_lambert", *order[len(depth) :], "digitise"]:
+        if name in seconds:
+            costs.append(_cost(name, seconds[name], sizes[name]))
+    named = {effect.name for effect in scene.chain.effects}
+    left = tuple((name, entry.says) for name, entry in CATALOGUE.items() if name not in named)
+    return Explained(tuple(costs), below * 1e3, left)
+
+
+def _cost(name: str, seconds: float, size: int) -> Cost:
+    if name in STEPS:
+        return Cost(name, None, seconds * 1e3, size, STEPS[name])
+    return Cost(name, CATALOGUE[name].domain, seconds * 1e3, size, CATALOGUE[name].says)
+
+
+def _steps(scene: Scene, shot: Shot, now: Seconds, repeats: int) -> tuple[dict[str, float], dict[str, int]]:
+    """Median seconds and peak bytes of each step of a frame."""
+    expose(scene, shot)
+    runs: list[dict[str, float]] = []
+    for _ in range(repeats):
+        run: dict[str, float] = defaultdict(float)
+
+        @contextmanager
+        def timed(name: str, run: dict[str, float] = run) -> Iterator[None]:
+            start = now()
+            yield
+            run[name] += now() - start
+
+        expose(scene, shot, timed)
+        runs.append(run)
+    sizes: dict[str, int] = defaultdict(int)
+
+    @contextmanager
+    def weighed(name: str) -> Iterator[None]:
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        yield
+        sizes[name] = max(sizes[name], tracemalloc.get_traced_memory()[1] - before)
+
+    with _traced():
+        expose(scene, shot, weighed)
+    return {name: statistics.median(run[name] for run in runs) for name in runs[0]}, sizes
+
+
+def _whole(scene: Scene, shot: Shot, now: Seconds, repeats: int) -> float:
+    expose(scene, shot)
+    times = []
+    for _ in range(repeats):
+        start = now()
+        expose(scene, shot, nullcontext)
+        times.append(now() - start)
+    return statistics.median(times)
+
+
+def _peak(scene: Scene, shot: Shot) -> int:
+    with _traced():
+        expose(scene, shot)
+        return tracemalloc.get_traced_memory()[1]
+
+
+@contextmanager
+def _traced() -> Iterator[None]:
+    """Memory is followed within, and as before after it."""
+    if tracemalloc.is_tracing():
+        tracemalloc.reset_peak()
+        yield
+        return
+    tracemalloc.start()
+    try:
+        yield
+    finally:
+        tracemalloc.stop()
