@@ -1,12 +1,12 @@
 """Fuzz for drivers and stand-ins: bytes that a bad line makes of good ones, a wire that sends them, what is allowed.
 
 For a driver: put a `FuzzedWire` before its stand-in, with `plans(samples)` drawn by hypothesis, and run each call
-through `allowed`. For a stand-in: give `received(samples)` to its `receive`. How many examples: tests/conftest.py.
+through `allowed`. For a stand-in: let `told` give it `received(samples)`. How many examples: tests/conftest.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
 from hypothesis import strategies as st
@@ -66,12 +66,13 @@ def plans(samples: Sequence[bytes], latest: float = 2.0) -> SearchStrategy[list[
 
 
 class FuzzedWire:
-    """A stand-in whose replies are replaced as planned; once the plan is used up it is left alone."""
+    """A stand-in whose replies are replaced as planned; once the plan is used up it is left alone. `replies` counts
+    them."""
 
     def __init__(self, wire: Wire, plan: Sequence[Pieces | None]) -> None:
         self._wire, self._plan = wire, iter(plan)
         self._coming: Pieces = []
-        self._looks = 0
+        self._looks = self.replies = 0
 
     @property
     def clock(self) -> Clock:
@@ -89,11 +90,22 @@ class FuzzedWire:
         assert self._looks < LOOKS, "the driver hangs"
         now = self.clock.now()
         if reply := self._wire.transmit():
+            self.replies += 1
             pieces = next(self._plan, None)
             self._coming += [(now, reply)] if pieces is None else [(now + late, data) for late, data in pieces]
         due = [data for time, data in self._coming if time <= now]
         self._coming = [(time, data) for time, data in self._coming if time > now]
         return b"".join(due)
+
+
+def told(wire: Wire, story: Sequence[tuple[bytes, float]], line_end: bytes) -> Iterator[list[bytes]]:
+    """Gives a stand-in bytes, each followed by a wait in s; the lines that it sent of each, which must be whole."""
+    for data, seconds in story:
+        wire.receive(data)
+        wire.clock.sleep(seconds)
+        *lines, rest = wire.transmit().split(line_end)
+        assert rest == b""
+        yield lines
 
 
 def allowed(call: Callable[[], T], clock: Clock, within: float) -> T | DeviceError:

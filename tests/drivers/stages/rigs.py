@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -20,6 +21,7 @@ class AnyRig(Protocol):
 
     clock: VirtualClock
     line: TriggerLine
+    controller: Any
     url: str
 
     def receive(self, data: bytes) -> None: ...
@@ -36,5 +38,6 @@ def pi_gcs(**build: Any) -> AnyRig:
     return pi_gcs_rig.Rig(wire={"latency": 0.0}, **build)
 
 
+NAMES = (f"every-stage-test-{number}" for number in itertools.count())
 RIGS: dict[str, Callable[..., AnyRig]] = {"pm16c": pm16c_rig.Rig, "pi_gcs": pi_gcs, "zaber": zaber_rig.Rig}
 every_stage = pytest.mark.parametrize("rig_of", RIGS.values(), ids=RIGS.keys())

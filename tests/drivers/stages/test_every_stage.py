@@ -17,11 +17,10 @@ from drivers.motion import start_move_by
 from drivers.protocols import TriggerTrain
 from simulators.serial_url import register
 from simulators.transports import serve_pty
-from tests.drivers.stages.rigs import RIGS, AnyRig, every_stage
+from tests.drivers.stages.rigs import NAMES, RIGS, AnyRig, every_stage
 
 SPEED = math.radians(10)
 SOON = 60.0
-NAMES = (f"every-stage-test-{number}" for number in itertools.count())
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
 RigOf = Callable[..., AnyRig]
 

@@ -95,15 +95,6 @@ def test_an_endless_line_is_thrown_away(wire: Wire) -> None:
     assert wire.ask("ERRF?") == "01"
 
 
-@given(st.binary(max_size=60))
-def test_no_bytes_whatever_stop_it(junk: bytes) -> None:
-    wire = Wire()
-    wire.box.receive(junk + b"\r\n")
-    wire.box.transmit()
-    wire.box.receive(b"ESTP0\r\nPS?0\r\n")
-    assert wire.box.transmit().endswith(b"\r\n")
-
-
 def test_faulty_queries_are_counted_from_power_on() -> None:
     wire = Wire(silent={1}, garbled={2})
     assert wire.ask("VERH?") == "HD-VER2"
