@@ -26,7 +26,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
         "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
         "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later and see the sample turned further"),
         "beam_profile": Entry(Domain.PHOTONS, "the beam is bright in the middle and striped, and the stripes drift"),
-        "beam_decay": Entry(Domain.PHOTONS, "the ring current falls"),
+        "ring_current": Entry(Domain.PHOTONS, "the ring current falls and is topped up"),
         "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
         "dark_current": Entry(Domain.ELECTRONS, "electrons without light"),
         "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),

@@ -210,8 +210,8 @@ def test_noise_belongs_to_seed_and_frame_number() -> None:
     assert (other_seed.next_frame(1.0).counts != frames[0]).mean() > 0.9
 
 
-def test_the_beam_decays_with_the_clock() -> None:
-    bench = _Bench({"kind": "beam_decay", "lifetime": 100.0})
+def test_the_ring_currents_with_the_clock() -> None:
+    bench = _Bench({"kind": "ring_current", "lifetime": 100.0})
     bench.sample.out()
     bench.clock.sleep(100 * math.log(2))
     assert bench.one().counts[0, 0] == pytest.approx(FULL / 2, abs=1)

@@ -49,11 +49,11 @@ def test_a_scene_pays_only_for_what_it_names() -> None:
         return nullcontext()
 
     expose(
-        shots.scene({"kind": "beam_profile", "sigma": [1, 1]}, {"kind": "beam_decay", "lifetime": 9.0}),
+        shots.scene({"kind": "beam_profile", "sigma": [1, 1]}, {"kind": "ring_current", "lifetime": 9.0}),
         shots.shot(),
         watch,
     )
-    assert [step for step in steps if step in CATALOGUE] == ["beam_profile", "beam_decay"]
+    assert [step for step in steps if step in CATALOGUE] == ["beam_profile", "ring_current"]
 
 
 def test_the_same_seed_makes_the_same_frame_again() -> None:
@@ -154,8 +154,8 @@ def _with(**changes: Any) -> dict[str, Any]:
         (_with(effects=["read_noise", "rolling_shutter"]), "'rolling_shutter' acts on motion and cannot follow"),
         (_with(effects=["offset", "offset"]), "effect 'offset' is named twice"),
         (
-            _with(effects=["photon_noise", {"kind": "beam_decay", "lifetime": 9}]),
-            "effect 'beam_decay' must come before 'photon_noise', which ends the photons",
+            _with(effects=["photon_noise", {"kind": "ring_current", "lifetime": 9}]),
+            "effect 'ring_current' must come before 'photon_noise', which ends the photons",
         ),
     ],
 )

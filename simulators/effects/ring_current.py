@@ -1,0 +1,84 @@
+"""Ring current: it decays, is topped up, and the beam goes with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+
+@dataclass(frozen=True)
+class RingCurrent:
+    """Exponential decay exp(-t/lifetime) of the stored current (Wiedemann, Particle Accelerator Physics, 2015, §8.5),
+    back to full at each top-up. The ring is full when the camera is connected.
+
+    A frame gets the mean current over its exposure, in closed form: exposures that follow one another collect what one
+    long exposure would, whatever the ring does meanwhile.
+
+    Attributes:
+        lifetime: s to fall to 1/e.
+        top_up_every: s from the start of one top-up to the start of the next; None: not by the clock.
+        top_up_below: share of the full current at which a top-up starts; None: not by the current. Without either the
+            current only falls.
+        refill: s that a top-up takes, the current rising evenly; 0: none at all.
+    """
+
+    lifetime: float
+    top_up_every: float | None = None
+    top_up_below: float | None = None
+    refill: float = 0.0
+
+    name: ClassVar[str] = "ring_current"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not self.lifetime > 0:
+            raise ValueError(f"lifetime must be positive, got {self.lifetime} s")
+        if self.top_up_every is not None and self.top_up_below is not None:
+            raise ValueError("top_up_every and top_up_below are two ways of one thing; name one of them")
+        if self.top_up_below is not None and not 0 < self.top_up_below < 1:
+            raise ValueError(f"top_up_below must lie between 0 and 1, got {self.top_up_below}")
+        if not self.refill >= 0 or (self.refill > 0 and not self.tops_up):
+            raise ValueError(f"refill must be >= 0 s, and 0 where nothing tops up, got {self.refill} s")
+        if self.top_up_every is not None and not self.top_up_every > self.refill:
+            raise ValueError(f"top_up_every must be longer than refill, got {self.top_up_every} and {self.refill} s")
+
+    @property
+    def tops_up(self) -> bool:
+        return self.top_up_every is not None or self.top_up_below is not None
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        image *= self.mean(shot.elapsed, shot.exposure)
+        return image
+
+    def mean(self, start: float, duration: float) -> float:
+        """Mean share of the full current over `duration` s from `start`, s since the camera was connected."""
+        if not self.tops_up:
+            x = duration / self.lifetime
+            return math.exp(-start / self.lifetime) * (-math.expm1(-x) / x if x > 0 else 1.0)
+        start %= self._falls() + self.refill  # of its own cycle: differences of small numbers lose less
+        return (self._charge(start + duration) - self._charge(start)) / duration
+
+    def _charge(self, time: float) -> float:
+        """Integral of the share from 0 to `time`, s."""
+        falls = self._falls()
+        least = math.exp(-falls / self.lifetime)
+        whole = self._fallen(falls) + (1 + least) / 2 * self.refill
+        cycles, rest = divmod(time, falls + self.refill)
+        risen = max(rest - falls, 0.0)
+        slope = (1 - least) / self.refill if self.refill else 0.0
+        return cycles * whole + self._fallen(min(rest, falls)) + least * risen + slope * risen**2 / 2
+
+    def _falls(self) -> float:
+        """s of each cycle in which the current falls."""
+        if self.top_up_below is not None:
+            return -self.lifetime * math.log(self.top_up_below)
+        assert self.top_up_every is not None  # asked only of a ring that tops up
+        return self.top_up_every - self.refill
+
+    def _fallen(self, time: float) -> float:
+        return -self.lifetime * math.expm1(-time / self.lifetime)
