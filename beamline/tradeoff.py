@@ -28,6 +28,7 @@ from beamline.trial_run import compile_kernels, run_trial
 from beamline.trials import Depth, Outcome, Timed, plan, seconds_left
 from drivers.clock import Clock
 from recon.initialise import default_count
+from recon.reconstruction import Method
 from recon.volume import Grid
 
 _HELD_OUT_SHARE = 8  # one of so many views is kept back where there is nothing else to judge by
@@ -52,7 +53,7 @@ class TradeoffOptions:
     source: SourceOptions
     selection: Selection
     folder: Path
-    methods: Sequence[str]
+    methods: Sequence[Method]
     depth: Depth = "quick"
     max_seconds: float | None = None
     truth: str | None = None

@@ -28,12 +28,14 @@ from beamline.held_out import with_held_out
 from beamline.history import history_arrays, judged_by
 from beamline.memory import forget_peak, peak_memory
 from beamline.trial_data import Data, geometry_in
+from beamline.trials import Loss as TrialLoss
 from beamline.trials import Trial
 from recon import metrics
 from recon.binning import bin_views
 from recon.fit_settings import FitSettings
 from recon.geometry import Geometry
 from recon.operators import data_residual
+from recon.problem import Loss
 from recon.quality import record
 from recon.reconstruction import Reconstruction
 from recon.resolution import fourier_shell_correlation, soft_cylinder
@@ -48,6 +50,13 @@ F32 = NDArray[np.float32]
 Say = Callable[[Mapping[str, Any]], None]
 
 _SAY_EVERY = 0.5  # s
+_LOSSES: Mapping[TrialLoss, tuple[Loss, bool]] = {
+    "l1+ssim": ("l1", True),
+    "l1": ("l1", False),
+    "l2+ssim": ("l2", True),
+    "poisson+ssim": ("poisson", True),
+}
+"""The misfit of a fit, and whether SSIM stands beside it."""
 
 
 def run(
@@ -126,7 +135,7 @@ def reconstruct(
     if trial.method != "r2":
         target = grid if trial.binning == 1 else Grid.matching(coarse)
         own: dict[str, Any] = {} if trial.iterations is None else {"iterations": trial.iterations}
-        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, on_progress=on_progress, **own)  # type: ignore[arg-type]
+        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, on_progress=on_progress, **own)
     return recon.reconstruct(
         binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=_settings(trial),
         start=trial.start, held_out=unseen, on_progress=on_progress,
@@ -134,9 +143,9 @@ def reconstruct(
 
 
 def _settings(trial: Trial) -> FitSettings:
-    loss, _, ssim = trial.loss.partition("+")
-    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))  # type: ignore[arg-type]
-    return settings if ssim else replace(settings, ssim_weight=0.0)
+    loss, with_ssim = _LOSSES[trial.loss]
+    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))
+    return settings if with_ssim else replace(settings, ssim_weight=0.0)
 
 
 def warm_up(trial: Trial, geometry: Geometry) -> None:

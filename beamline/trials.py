@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from recon.initialise import Start
+from recon.reconstruction import Method
 
 Loss = Literal["l1+ssim", "l1", "l2+ssim", "poisson+ssim"]
 Depth = Literal["quick", "full"]
@@ -51,7 +52,7 @@ class Trial:
     """
 
     group: str
-    method: str
+    method: Method
     views: int
     binning: int = 1
     steps: int | None = None
@@ -130,7 +131,7 @@ def thousands(n: int) -> str:
     return f"{n / 1000:.3g}k Gaussians" if n >= 1000 else f"{n} Gaussians"
 
 
-def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
+def plan(methods: Sequence[Method], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
     """The trials, one setting varied at a time about each method's baseline; baselines first, cheap ones early.
 
     Args:
@@ -149,7 +150,7 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     return tuple(unique) + ((Trial("precision", "r2", n_views),) if "r2" in methods else ())
 
 
-def _of_method(method: str, n_views: int, gaussians: int, depth: Depth) -> list[Trial]:
+def _of_method(method: Method, n_views: int, gaussians: int, depth: Depth) -> list[Trial]:
     counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
     if method in DIRECT:
         base = Trial("method", method, n_views, halves=True)

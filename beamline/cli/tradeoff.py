@@ -20,18 +20,19 @@ from beamline.tradeoff_report import text
 from drivers.clock import SystemClock
 from recon.reconstruction import Method
 
-METHODS: tuple[str, ...] = get_args(Method)
+METHODS: tuple[Method, ...] = get_args(Method)
 
 
-def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
+def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[Method, ...]:
     """Names of methods, separated by commas; all where none are given."""
     if value is None:
         return METHODS
     names = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
-    unknown = [name for name in names if name not in METHODS]
+    known: dict[str, Method] = {method: method for method in METHODS}
+    unknown = [name for name in names if name not in known]
     if unknown:
         raise click.BadParameter(f"{unknown[0]!r} is none of {', '.join(METHODS)}")
-    return names
+    return tuple(known[name] for name in names)
 
 
 @click.command()
@@ -62,7 +63,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 def tradeoff(
     file: Path,
     truth: str | None,
-    methods: tuple[str, ...],
+    methods: tuple[Method, ...],
     quick: bool,
     max_seconds: float | None,
     seed: int,
