@@ -120,11 +120,9 @@ class Keeper:
                 f"least {reached.step} with --steps, or start anew without --resume."
             )
         if steps != kept.steps or steps == 0:
-            was = f"{kept.steps} steps" if kept.steps else "a time"
-            warn(
-                f"The checkpoint is of a fit over {was}, this one is over {f'{steps} steps' if steps else 'a time'}: "
-                "its learning rates go on where the new plan has them."
-            )
+            was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
+            plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
+            warn(f"The checkpoint is of a fit {plans}: its learning rates go on where the new plan has them.")
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> None:

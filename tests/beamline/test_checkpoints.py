@@ -106,6 +106,22 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: Prepared) 
 
 
 @pytest.mark.parametrize(
+    ("kept", "wanted", "words"),
+    [
+        (0, 0, "of a fit over a time, as this one is:"),
+        (100, 0, "of a fit over 100 steps, this one is over a time:"),
+        (0, 200, "of a fit over a time, this one is over 200 steps:"),
+    ],
+)
+def test_a_plan_without_steps_is_told(tmp_path: Path, prepared: Prepared, kept: int, wanted: int, words: str) -> None:
+    path, said = tmp_path / "fit.h5", list[str]()
+    origin = made_from(prepared, SETTINGS, OTHERS)
+    Keeper(path).write(origin, kept, said.append, _state())
+    assert Keeper(path, path).begin(origin, wanted, said.append) is not None
+    assert len(said) == 1 and words in said[0]
+
+
+@pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"statistic": np.full(5, np.nan, np.float32)}, "statistic"),
