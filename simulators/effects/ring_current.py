@@ -12,8 +12,8 @@ from simulators.effects.shot import Image, Shot
 
 @dataclass(frozen=True)
 class RingCurrent:
-    """Exponential decay exp(-t/lifetime) of the stored current (Wiedemann, Particle Accelerator Physics, 2015, §8.5),
-    back to full at each top-up. The ring is full when the camera is connected.
+    """Exponential decay exp(-t/lifetime), as a beam lifetime is defined, and back to full at each top-up. The ring is
+    full when the camera is connected.
 
     A frame gets the mean current over its exposure, in closed form: exposures that follow one another collect what one
     long exposure would, whatever the ring does meanwhile.

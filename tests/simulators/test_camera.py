@@ -121,7 +121,7 @@ def test_other_triggers_ask_the_line_for_the_angle() -> None:
 
 
 def test_motion_blur_smears_along_the_path_of_the_stage() -> None:
-    still, blurred = _Bench(), _Bench({"kind": "motion_blur", "samples": 8})
+    still, blurred = _Bench(), _Bench("motion_blur")
     for bench in (still, blurred):
         start = bench.clock.now()
         bench.line.attach_angle(lambda time, start=start: 40.0 * (time - start))
@@ -210,7 +210,7 @@ def test_noise_belongs_to_seed_and_frame_number() -> None:
     assert (other_seed.next_frame(1.0).counts != frames[0]).mean() > 0.9
 
 
-def test_the_ring_currents_with_the_clock() -> None:
+def test_the_ring_current_falls_with_the_clock() -> None:
     bench = _Bench({"kind": "ring_current", "lifetime": 100.0})
     bench.sample.out()
     bench.clock.sleep(100 * math.log(2))
