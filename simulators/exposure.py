@@ -62,7 +62,7 @@ def _seen(
     pose = scene.chain.pose(Pose(angles), times, shot)
     with watch("line_integrals"):
         depth = scene.sample.line_integrals(pose, shot.detector)
-    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot, watch)
+    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot.later(float(times[0])), watch)
     with watch("beer_lambert"):
         np.exp(np.negative(depth, out=depth), out=depth)
         depth *= open_beam

@@ -131,6 +131,18 @@ class Chain:
         return image
 
     def labels(self, shot: Shot) -> tuple[Label, ...]:
-        """The anomalies that show in a frame."""
-        found = (effect.label(shot) for effect in self.effects if isinstance(effect, Anomaly))
-        return tuple(label for label in found if label)
+        """The anomalies that show in a frame; one that turns with the sample, wherever it is while the frame looks."""
+        found: list[Label] = []
+        for effect in self.effects:
+            if isinstance(effect, Anomaly):
+                depth = effect.domain == Domain.OPTICAL_DEPTH and self.moves and shot.beam and shot.sample
+                looks = [shot.later(float(times[0])) for times in self.moments(shot).times] if depth else [shot]
+                labels = [label for look in looks if (label := effect.label(look))]
+                found += [_joined(labels)] if labels else []
+        return tuple(found)
+
+
+def _joined(labels: Sequence[Label]) -> Label:
+    """One label around all of one kind."""
+    top, below, left, right = zip(*(label.region for label in labels), strict=True)
+    return Label(labels[0].kind, (min(top), max(below), min(left), max(right)))

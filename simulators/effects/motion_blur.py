@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -10,22 +12,54 @@ import numpy as np
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Moments, Shot
 
+LOOKS = 5
+"""Times of the exposure at which the stage is asked for, so that one that turns back within it is seen to move."""
+
 
 @dataclass(frozen=True)
 class MotionBlur:
-    """Mean of the transmission at `samples` moments spread evenly over the exposure (midpoint rule)."""
+    """Mean of the transmission over as many moments of the exposure as its blur needs: one where the stage stands.
 
-    samples: int = 4
+    The moments are spread evenly (midpoint rule). Gauss and Legendre's take as many and are no better, for edges make
+    the transmission jump: of 1 px of blur of a battery, 1, 2, 4 and 8 moments leave 1.1, 0.38, 0.13 and 0.045 parts in
+    1000 of the beam (rms), theirs 1.1, 0.34, 0.14 and 0.066; of 8 px theirs leave up to 1.6 times as much.
+
+    Attributes:
+        tolerance_px: pixels that the sample's rim may travel from one moment to the next. The whole rim counts, even
+            where it turns beyond the frame: in front of the axis and behind it, it crosses the middle of the frame.
+        max_samples: at most so many moments, each of which costs a frame's line integrals.
+    """
+
+    tolerance_px: float = 0.5
+    max_samples: int = 16
 
     name: ClassVar[str] = "motion_blur"
     domain: ClassVar[Domain] = Domain.MOTION
     final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.samples < 2:
-            raise ValueError(f"samples must be >= 2 (a mean over the exposure), got {self.samples}")
+        if not (self.tolerance_px > 0 and self.max_samples >= 2):
+            raise ValueError(
+                f"tolerance_px must be positive and max_samples >= 2 (a mean over the exposure), got "
+                f"{self.tolerance_px} and {self.max_samples}"
+            )
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        within = (np.arange(self.samples) + 0.5) / self.samples * shot.exposure
+        n = self.samples(shot)
+        if n == 0:
+            return moments
+        within = (np.arange(n) + 0.5) / n * shot.exposure
         times = (within[:, None, None] + moments.times).reshape(-1, moments.times.shape[1])
-        return Moments(times, np.tile(moments.weights / self.samples, self.samples))
+        return Moments(times, np.tile(moments.weights / n, n))
+
+    def samples(self, shot: Shot) -> int:
+        """How many moments a frame is the mean of; 0 where the stage stands while the first row is exposed."""
+        angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
+        turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
+        return min(math.ceil(turned * _rim(shot) / self.tolerance_px), self.max_samples)
+
+
+def _rim(shot: Shot) -> float:
+    """Pixels by which the sample's rim moves a radian, at most; in a cone most of all on the source's side."""
+    reach, sod = shot.radius / shot.detector.pitch, shot.detector.sod
+    return reach if math.isinf(sod) else reach / max(1 - shot.radius / sod, 0.05)

@@ -1,4 +1,4 @@
-"""Rolling shutter: each row is exposed a little later than the one above and sees the sample turned further."""
+"""Rolling shutter: rows are exposed in pairs, each a little later than the one above, and see the sample further on."""
 
 from __future__ import annotations
 
@@ -13,11 +13,19 @@ from simulators.effects.shot import Moments, Shot
 
 @dataclass(frozen=True)
 class RollingShutter:
-    """Row r starts r row periods after row 0; the camera says how long a row period is."""
+    """Sensor rows are read in pairs, one pair a line time, downwards from the frame's first row.
+
+    A line time is two row periods of the sensor: 7.2 us in the standard readout and 172.8 us in ultra quiet (property
+    table of the C15550-20UP). A binned row begins with its first line. Every row is exposed as long as the others,
+    from its own start, as with an edge trigger that opens the rows one after the other; the modes in which all rows
+    look at once are not simulated: DELAYED, which waits for light until the last row is open, and GLOBALRESET, which
+    opens all rows together and closes them line by line.
+    """
 
     name: ClassVar[str] = "rolling_shutter"
     domain: ClassVar[Domain] = Domain.MOTION
     final: ClassVar[bool] = False
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        return Moments(moments.times + np.arange(moments.times.shape[1]) * shot.row_period, moments.weights)
+        lines = np.arange(moments.times.shape[1]) * shot.binning // 2
+        return Moments(moments.times + lines * (2 * shot.row_period / shot.binning), moments.weights)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,13 @@ class Shot:
     seed: int
     frame: int
     view: int
+
+    def later(self, seconds: float) -> Shot:
+        """The same shot as the sample is seen `seconds` after the trigger: at another time and angle."""
+        if seconds == 0:
+            return self
+        time = self.time + seconds
+        return replace(self, time=time, angle=self.angle_at(time))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,24 +1,36 @@
-"""Motion blur: the mean transmission over the exposure."""
+"""Motion blur: the mean transmission over the exposure, at as many moments as the rim's arc asks for."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from simulators import sensor
+from simulators.detector import Detector
 from simulators.effects.motion_blur import MotionBlur
+from simulators.exposure import expose
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]
+RADIUS_PX = 30  # of the sample that shots.shot() speaks of: 0.3 mm in pixels of 0.01 mm
+
+
+def _turning(radians: float) -> Callable[[float], float]:
+    """A stage that turns so far during the exposure of a shot, from its angle on."""
+    return lambda time: 0.4 + radians / 0.01 * (time - 1000.0)
 
 
 def test_motion_blur_is_the_mean_transmission_over_the_exposure() -> None:
-    def stage(time: float) -> float:
-        return 0.4 + 20.0 * (time - 1000.0)  # 0.2 rad during the exposure
-
-    scene = shots.scene({"kind": "motion_blur", "samples": 5})
-    angles = stage(1000.0 + 0.01 * (np.arange(5) + 0.5) / 5)
-    mean = np.mean([np.exp(-shots.depth(scene, a)) for a in angles], axis=0)
+    stage = _turning(0.2)
+    scene = shots.scene({"kind": "motion_blur", "tolerance_px": 1.2, "max_samples": 9})  # 0.2 rad x 30 px: 6 px
+    angles = stage(1000.0 + 0.01 * (np.arange(5) + 0.5) / 5)  # type: ignore[arg-type]
+    mean = np.mean([np.exp(-shots.depth(scene, a)) for a in np.atleast_1d(angles)], axis=0)
     blurred = shots.frame(scene, angle_at=stage)
     np.testing.assert_allclose(blurred * CONVERSION / 4000, mean, atol=2e-5)
     # A finer midpoint rule agrees to second order: the samples are spread evenly over the exposure.
@@ -28,6 +40,52 @@ def test_motion_blur_is_the_mean_transmission_over_the_exposure() -> None:
     assert np.abs(mean - fine).max() < 0.1 * np.abs(np.exp(-shots.depth(scene, 0.4)) - fine).max()
 
 
-def test_a_wrong_parameter_is_refused() -> None:
-    with pytest.raises(ValueError, match="samples must be >= 2"):
-        MotionBlur(samples=1)
+@given(radians=st.floats(-0.5, 0.5), tolerance=st.floats(0.1, 3.0), most=st.integers(2, 40))
+def test_moments_are_as_many_as_the_arc_needs_and_no_more(radians: float, tolerance: float, most: int) -> None:
+    blur = MotionBlur(tolerance, most)
+    n = blur.samples(shots.shot(angle_at=_turning(radians)))
+    arc = abs(radians) * RADIUS_PX
+    assert n <= most
+    assert n == most or arc / max(n, 1) <= tolerance * (1 + 1e-9)
+    assert n <= 1 or arc / (n - 1) > tolerance * (1 - 1e-6)
+
+
+def test_a_standing_stage_costs_one_look_and_changes_no_bit() -> None:
+    looks = []
+
+    def watched(step: str) -> AbstractContextManager[None]:
+        looks.append(step)
+        return nullcontext()
+
+    still = expose(shots.scene("motion_blur"), shots.shot(angle_at=lambda time: 0.4), watched)
+    np.testing.assert_array_equal(still, shots.frame(shots.scene()))
+    assert looks.count("line_integrals") == 1
+
+
+def test_a_stage_that_turns_back_within_the_exposure_is_seen_to_move() -> None:
+    def swing(time: float) -> float:
+        return 0.4 + 0.1 * math.sin(math.pi * (time - 1000.0) / 0.01)
+
+    assert swing(1000.0) == pytest.approx(swing(1000.01))
+    assert MotionBlur(tolerance_px=0.5).samples(shots.shot(angle_at=swing)) == math.ceil(0.2 * RADIUS_PX / 0.5)
+
+
+def test_what_stands_before_the_axis_counts_though_its_rim_is_beyond_the_frame() -> None:
+    """A ball 0.3 mm in front of the axis flies at the speed of the rim across a frame that is 0.11 mm wide."""
+    ball = {"kind": "ellipsoid", "semi_axes": [0.01, 0.01, 0.01], "attenuation": 9.0, "centre": [0.0, -0.3, 0.0]}
+    blur = {"kind": "motion_blur", "tolerance_px": 0.5, "max_samples": 60}
+    shot = shots.shot(detector=Detector.centred((9, 11), 0.01), angle=0.0, radius=0.31)
+    scene = shots.scene(blur, phantom={"kind": "solids", "solids": [ball]})
+    lost = 4000 / CONVERSION - shots.frame(scene, shot, angle_at=lambda time: 80.0 * (time - 1000.0) - 0.4)
+    assert lost[4].min() > 0.8 * lost[4].max()  # evenly smeared; a comb of separate balls has nothing between them
+
+
+def test_a_cone_sees_the_side_of_its_source_move_faster() -> None:
+    shot = shots.shot(angle_at=_turning(0.1), detector=Detector.centred((60, 80), 0.01, sod=0.6))
+    assert MotionBlur(tolerance_px=0.5).samples(shot) == 2 * 0.1 * RADIUS_PX / 0.5  # 0.6 / (0.6 - 0.3)
+
+
+@pytest.mark.parametrize("wrong", [{"tolerance_px": 0.0}, {"max_samples": 1}])
+def test_a_wrong_parameter_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="tolerance_px must be positive and max_samples >= 2"):
+        MotionBlur(**wrong)  # type: ignore[arg-type]
