@@ -8,54 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from beamline import pipeline
-from beamline.errors import ConfigError, DataError
+from beamline.errors import DataError
 from beamline.pipeline import Prepared, prepare
-from beamline.reading import read_binned, read_references
-from beamline.selection import Selection, unbinned
+from beamline.selection import Selection
 from beamline.storage.source import open_scan
 from recon.align import AxisError, AxisEstimate
 from recon.correct import CorrectionSettings
 from recon.geometry import Geometry
+from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
 SCAN = TwoCylinders()
 PLAIN = CorrectionSettings(air="none")
-
-
-class ArraySource:
-    """A ScanSource over arrays that notes what is read of it."""
-
-    path = Path("array")
-    format = "array"
-    quantity = "counts"
-    pixel_size_mm: float | None = None
-    energy_kev: float | None = None
-    axis_col: float | None = None
-    attributes: dict[str, Any] = {}  # noqa: RUF012
-    finished = True
-
-    def __init__(
-        self,
-        data: NDArray[Any],
-        keys: list[int],
-        angles: NDArray[np.float64],
-        exposures: NDArray[np.float64] | None = None,
-    ) -> None:
-        self._data = data
-        self.exposures = np.full(len(data), np.nan) if exposures is None else exposures
-        self.image_key, self.angles = np.array(keys, np.int32), angles
-        self.shape, self.dtype = data.shape[1:], data.dtype
-        self.was_read: list[tuple[list[int], int]] = []
-
-    def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:
-        block = self._data[frames, rows]
-        self.was_read.append((np.arange(len(self._data))[frames].tolist(), block.shape[1]))
-        return block
 
 
 def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[Prepared, list[str]]:
@@ -101,12 +67,6 @@ def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
     assert prepared.geometry.axis_col == pytest.approx((prepared.axis_col - 0.5) / 2)
 
 
-@given(column=st.floats(-10, 5000), binning=st.integers(1, 16))
-def test_unbinned_inverts_the_geometrys_binning(column: float, binning: int) -> None:
-    binned = Geometry.parallel([0.0], (16, 6000), 1.0, column).binned(binning).axis_col
-    assert unbinned(binned, binning) == pytest.approx(column, abs=1e-6)
-
-
 def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN)
     prepared, _ = _prepare(path, Selection(views="first:10", axis_col=20.7, correction=PLAIN))
@@ -129,61 +89,6 @@ def test_selected_views_of_a_whole_turn_spread_over_it_where_the_axis_is_off_the
     prepared, _ = _prepare(path, Selection(views="fixed:12", axis_col=axis_col, correction=PLAIN))
     expected = np.linspace(0, 2 * np.pi * turned, 12, endpoint=False)
     np.testing.assert_allclose(prepared.geometry.angles, expected, atol=1e-5)
-
-
-def test_only_what_was_asked_for_is_read() -> None:
-    counts = SCAN.counts()
-    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
-    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
-    selection = Selection(views="first:5", rows=(1, 3), axis_col=20.7, correction=PLAIN)
-    corrector = pipeline.Corrector(source, selection, pytest.fail)  # type: ignore[arg-type]
-    corrector.line_integrals(np.arange(2, 7))
-    assert {rows for _, rows in source.was_read} == {2}
-    assert sorted(f for frames, _ in source.was_read for f in frames) == [0, 1, 2, 3, 4, 5, 6]
-
-
-def test_reading_is_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = np.arange(7 * 2 * 3, dtype=np.uint16).reshape(7, 2, 3)
-    source = ArraySource(data, [0] * 7, np.zeros(7))
-    monkeypatch.setattr("beamline.reading._BATCH_BYTES", 3 * 2 * 3 * 2)
-    got = read_binned(source, np.array([6, 0, 5, 1, 2]), slice(0, 2), 1)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(got, data[[6, 0, 5, 1, 2]])
-    assert [len(frames) for frames, _ in source.was_read] == [3, 2]
-
-
-@given(
-    rows=st.integers(1, 9),
-    cols=st.integers(1, 9),
-    binning=st.integers(1, 4),
-    holes=st.floats(0, 0.9),
-    seed=st.integers(0, 99),
-)
-@settings(max_examples=40, deadline=None)
-def test_bins_are_means_of_what_is_finite(rows: int, cols: int, binning: int, holes: float, seed: int) -> None:
-    """Against a loop over the bins."""
-    rng = np.random.default_rng(seed)
-    data = rng.random((2, rows, cols)).astype(np.float32)
-    data[rng.random(data.shape) < holes] = np.nan
-    got = read_binned(ArraySource(data, [0, 0], np.zeros(2)), np.arange(2), slice(0, rows), binning)  # type: ignore[arg-type]
-    assert got.shape == (2, rows // binning, cols // binning)
-    for v, r, c in np.ndindex(got.shape):
-        block = data[v, r * binning : (r + 1) * binning, c * binning : (c + 1) * binning]
-        if np.isfinite(block).any():
-            assert got[v, r, c] == pytest.approx(float(np.nanmean(block)), rel=1e-5)
-        else:
-            assert np.isnan(got[v, r, c])
-
-
-def test_flats_are_grouped_by_the_views_between_them() -> None:
-    keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
-    data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
-    references = read_references(ArraySource(data, keys, np.zeros(12)), slice(0, 2), 1)  # type: ignore[arg-type]
-    assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
-        (1.5, 1.5),
-        (7.0, 7.0),
-        (11.0, 11.0),
-    ]
-    assert references.dark[0, 0] == 5.0
 
 
 def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
@@ -240,6 +145,17 @@ def test_darks_of_another_exposure_are_told() -> None:
     assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warnings[0]
 
 
+def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None:
+    counts = SCAN.counts().astype(np.float32)
+    counts[[3, 30]] = np.nan
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": counts})
+    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    assert prepared.geometry.n_views == 43
+    np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
+    np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
+    assert any("2 of 45 views hold no finite pixel (first: frame 7)" in text for text in warnings)
+
+
 def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
     data = SCAN.line_integrals().astype(np.float32)
     data[3, 1, 20] = np.nan
@@ -250,17 +166,6 @@ def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
     assert prepared.projections.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
     data[3, 1, 20] = prepared.projections.data[3, 1, 20]
     np.testing.assert_array_equal(prepared.projections.data, data)
-
-
-def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None:
-    counts = SCAN.counts().astype(np.float32)
-    counts[[3, 30]] = np.nan
-    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": counts})
-    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
-    assert prepared.geometry.n_views == 43
-    np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
-    np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
-    assert any("2 of 45 views hold no finite pixel (first: frame 7)" in text for text in warnings)
 
 
 _SHAPE = (45, 4, 40)
@@ -296,22 +201,6 @@ def test_empty_field_is_refused(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": np.full(_SHAPE, DARK + BEAM, np.uint16)})
     with pytest.raises(DataError):
         _prepare(path, Selection(axis_col=20.0))
-
-
-@pytest.mark.parametrize(
-    ("selection", "said"),
-    [
-        (Selection(views="nonsense"), "--views: .*'nonsense'.*fixed:N"),
-        (Selection(views="first:1"), "at least 2"),
-        (Selection(rows=(2, 9), axis_col=20.0), "--rows 2:9"),
-        (Selection(binning=5, axis_col=20.0), "--bin 5"),
-        (Selection(axis_col=40.0), "outside the detector"),
-    ],
-)
-def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: str) -> None:
-    path = write_exchange(tmp_path / "scan.h5", SCAN)
-    with pytest.raises(ConfigError, match=said):
-        _prepare(path, selection)
 
 
 def _estimate(value: float, confident: bool) -> AxisEstimate:

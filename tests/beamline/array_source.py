@@ -1,0 +1,41 @@
+"""A scan in memory that notes what is read of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class ArraySource:
+    """A ScanSource over arrays that notes what is read of it."""
+
+    path = Path("array")
+    format = "array"
+    quantity = "counts"
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    axis_col: float | None = None
+    cone: tuple[float, float] | None = None
+    attributes: dict[str, Any] = {}  # noqa: RUF012
+    finished = True
+
+    def __init__(
+        self,
+        data: NDArray[Any],
+        keys: list[int],
+        angles: NDArray[np.float64],
+        exposures: NDArray[np.float64] | None = None,
+    ) -> None:
+        self._data = data
+        self.exposures = np.full(len(data), np.nan) if exposures is None else exposures
+        self.image_key, self.angles = np.array(keys, np.int32), angles
+        self.shape, self.dtype = data.shape[1:], data.dtype
+        self.was_read: list[tuple[list[int], int]] = []
+
+    def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:
+        block = self._data[frames, rows]
+        self.was_read.append((np.arange(len(self._data))[frames].tolist(), block.shape[1]))
+        return block
