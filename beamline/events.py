@@ -22,7 +22,8 @@ class Event:
         data: numbers and strings that belong to it.
 
     Vocabulary: run_started, state, block_started, frame (throttled), block_done, beam, flag, warning, snapshot,
-    progress, scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, explain, check, done, failed.
+    progress, scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, explain, check, done,
+    failed.
     What a live reconstruction says carries source="recon".
     """
 

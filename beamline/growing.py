@@ -14,10 +14,10 @@ from beamline.errors import DataError
 from beamline.events import Event, Sink
 from beamline.fit_progress import progress_events
 from beamline.offline import Warnings
-from beamline.pipeline import correction_blockers, locate_axis, refuse
+from beamline.pipeline import correction_blockers, locate_axis, refuse, stated_axis
 from beamline.recon_options import ReconOptions
 from beamline.recon_report import Made
-from beamline.selection import check_axis, geometry_of
+from beamline.selection import check_axis, cone_of, geometry_of
 from beamline.stop import Heeded
 from beamline.storage.recon_file import ReconRecord, write_reconstruction
 from beamline.storage.scan_source import ScanSource
@@ -104,6 +104,9 @@ class Growing:
         While views come only a clear optimum counts. Where it moves by much, the fit begins anew with all views; by
         little, it goes on.
         """
+        if cone_of(self.source, self._options.selection) is not None:
+            self.axis_col, self._axis_settled = stated_axis(self.source), True
+            return
         if views.size < self._next_axis and not ended:
             return
         self._next_axis, self._axis_settled = views.size + views.size // 2, ended

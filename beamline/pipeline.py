@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.corrector import Corrector, Warn
 from beamline.errors import DataError
-from beamline.selection import Selection, check_axis, choose_views, geometry_of, pixel_size, unbinned
+from beamline.selection import Selection, check_axis, choose_views, cone_of, geometry_of, pixel_size, unbinned
 from beamline.storage.finding import Finding
 from beamline.storage.scan_source import ScanSource
 from beamline.storage.validate import beam_present, quantity_said, references_present, source_findings
@@ -71,7 +71,10 @@ def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
     corrector = Corrector(source, selection, warn)
     axis_col, axis = selection.axis_col, None
     if axis_col is None:
-        axis_col, axis = locate_axis(source, corrector, scan_frames, warn)
+        if cone_of(source, selection) is not None:
+            axis_col = stated_axis(source)
+        else:
+            axis_col, axis = locate_axis(source, corrector, scan_frames, warn)
     check_axis(source, axis_col)
     period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
     chosen = choose_views(source, scan_frames, selection, period)
@@ -111,6 +114,20 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
 def correction_blockers(source: ScanSource) -> list[Finding]:
     """Why the frames of a scan that is still growing cannot be corrected."""
     return [finding for rule in (quantity_said, references_present, beam_present) for finding in rule(source)]
+
+
+def stated_axis(source: ScanSource) -> float:
+    """The rotation axis that the file states; that of a cone beam is not searched, for its opposite views differ.
+
+    Raises:
+        DataError: it states none.
+    """
+    if source.axis_col is None:
+        raise DataError(
+            f"{source.path} does not say where the rotation axis is, and that of a cone beam is not searched. Give it "
+            "with --axis COLUMN (0 is the centre of the first column)."
+        )
+    return source.axis_col
 
 
 def locate_axis(

@@ -24,7 +24,8 @@ class Selection:
         rows: (first, end) detector rows; None is all.
         binning: pixels averaged per side.
         axis_col: rotation axis in columns of the full detector; None finds it.
-        pixel_size_mm: at the sample; None takes the file's.
+        pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
+        cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
         correction: of counts to line integrals.
         seed: of random view selections.
     """
@@ -34,6 +35,7 @@ class Selection:
     binning: int = 1
     axis_col: float | None = None
     pixel_size_mm: float | None = None
+    cone: tuple[float, float] | None = None
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
     seed: int = 0
 
@@ -91,11 +93,29 @@ def unbinned(column: float, binning: int) -> float:
 
 
 def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
-    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 where it is not known."""
+    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 where it is not known.
+
+    Raises:
+        ConfigError: a cone beam's pixel size is not known.
+    """
     rows = rows_of(source, selection)
     full = (rows.stop - rows.start, source.shape[1])
     pitch = pixel_size(source, selection)
+    if (cone := cone_of(source, selection)) is not None:
+        if pitch is None:
+            raise ConfigError(
+                f"{source.path} does not say its pixel size, which a cone beam needs: give --pixel-size-um (on the "
+                "detector)."
+            )
+        # The central ray meets the middle of the detector, whatever rows are read.
+        axis_row = (source.shape[0] - 1) / 2 - rows.start
+        return Geometry.cone(angles, full, pitch, *cone, axis_col, axis_row=axis_row).binned(selection.binning)
     return Geometry.parallel(angles, full, 1.0 if pitch is None else pitch, axis_col).binned(selection.binning)
+
+
+def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | None:
+    """(sod, sdd) in mm; None for a parallel beam."""
+    return source.cone if selection.cone is None else selection.cone
 
 
 def pixel_size(source: ScanSource, selection: Selection) -> float | None:

@@ -40,6 +40,19 @@ def column(ctx: click.Context, param: click.Parameter, value: str) -> float | No
     return number
 
 
+def distances(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, float] | None:
+    """`sod:sdd` in mm."""
+    if value is None:
+        return None
+    try:
+        sod, sdd = (float(part) for part in value.split(":"))
+    except ValueError:
+        sod = sdd = math.nan
+    if not 0 < sod <= sdd < math.inf:
+        raise click.BadParameter(f"{value!r} is not SOD:SDD with 0 < SOD <= SDD in mm, e.g. 100:140")
+    return sod, sdd
+
+
 def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str | tuple[int, int]:
     """Which columns at the detector's edges show air: auto, none, or counts `left,right`."""
     match = re.fullmatch(r"(\d+),(\d+)", value)
@@ -51,7 +64,7 @@ def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str |
 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --views, --rows, --bin, --axis, --pixel-size-um, --air and the options of `scan_options`."""
+    """Adds --views, --rows, --bin, --axis, --pixel-size-um, --cone, --air and the options of `scan_options`."""
     for option in reversed(_AFTER):
         command = option(command)
     command = scan_options(command)
@@ -70,6 +83,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         binning=rest.pop("binning"),
         axis_col=rest.pop("axis"),
         pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
+        cone=rest.pop("cone"),
         correction=CorrectionSettings(air=rest.pop("air")),
         seed=seed,
     )
@@ -98,7 +112,13 @@ _BEFORE = (
     ),
 )
 _AFTER = (
-    click.option("--pixel-size-um", type=POSITIVE, help="At the sample; else the file's."),
+    click.option("--pixel-size-um", type=POSITIVE, help="At the sample (of a cone: on the detector); else the file's."),
+    click.option(
+        "--cone",
+        callback=distances,
+        metavar="SOD:SDD",
+        help="Cone beam: mm from the source to the rotation axis and to the detector; else the file's.",
+    ),
     click.option(
         "--air",
         callback=air_columns,

@@ -37,7 +37,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--out", type=_FILE, help="Write the scan to this HDF5 file, and its labels beside it.")
 @click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")
 @click.option(
-    "--truth-bin", type=click.IntRange(min=1), help="Pixels a voxel's side; as many as make 256 across at most unless given."
+    "--truth-bin", type=click.IntRange(min=1), help="Pixels a voxel's side; by default as many as leave 256 across."
 )
 @click.option("--picture", type=_FILE, help="Write a PNG with some of the frames; beside --out unless given.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all random numbers.")

@@ -38,9 +38,9 @@ def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
         return Geometry.cone(
             angles,
             detector.shape,
-            detector.sod,
-            detector.sod,
             detector.pitch,
+            detector.sod,
+            detector.sod,
             detector.axis_col,
             axis_row=detector.axis_row,
         )

@@ -105,6 +105,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         sample=scene.path.stem,
         title=f"Simulated scan of the scene {scene.path.stem}",
         pixel_size_mm=scan.detector.pitch * magnification,
+        source_distance_mm=beam.sod,
         distance_mm=None if beam.sod is None or beam.sdd is None else beam.sdd - beam.sod,
         exposure=scene.scene.detector.exposure_s,
         period=settings.period_s,

@@ -40,6 +40,7 @@ class DataExchangeSource:
     finished = True
     energy_kev: float | None = None
     axis_col: float | None = None
+    cone: tuple[float, float] | None = None
 
     def __init__(self, path: Path, *, own_angles: bool = True) -> None:
         """Open. `own_angles` False: the caller brings the angles, so theta may be absent."""

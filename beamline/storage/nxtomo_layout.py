@@ -9,7 +9,7 @@
       frame_log                 kind, trigger, framestamp, time, flags of each frame
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
-      record                    plan (JSON), config (YAML), period, axis_col, quantity, program
+      record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
 
@@ -51,6 +51,8 @@ STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 END_TIME = "/entry/end_time"
 BEAM = "/entry/record/beam"
+SOURCE_DISTANCE = "/entry/record/source_distance"
+"""Of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes for cones."""
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 
@@ -88,6 +90,8 @@ class ScanInfo:
         pixel_size_mm: at the sample; energy_kev; distance_mm: sample to detector.
         exposure, period: s.
         axis_col: rotation axis in 0-based pixel-centre columns.
+        source_distance_mm: source to sample; given only where the beam is a cone (then `pixel_size_mm` is that on the
+            detector, as NXtomo has it).
         plan: JSON; config: YAML; both as text for the record.
         devices: what each device says of itself, by its name.
         beam_unit: of the beam monitor's readings; None: there is none.
@@ -101,6 +105,7 @@ class ScanInfo:
     exposure: float | None = None
     period: float | None = None
     axis_col: float | None = None
+    source_distance_mm: float | None = None
     plan: str = "{}"
     config: str = ""
     devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
@@ -163,10 +168,14 @@ def create(
         _rewritable_text(file, END_TIME, "", 40)
     file["/entry/sample/name"] = info.sample
     file["/entry/instrument/source/probe"] = "x-ray"
+    # NXsource counts distances along the beam, from the sample.
+    upstream = None if info.source_distance_mm is None else -info.source_distance_mm
     for path, value, unit in (
         (f"{DETECTOR}/x_pixel_size", info.pixel_size_mm, "mm"),
         (f"{DETECTOR}/y_pixel_size", info.pixel_size_mm, "mm"),
         (f"{DETECTOR}/distance", info.distance_mm, "mm"),
+        ("/entry/instrument/source/distance", upstream, "mm"),
+        (SOURCE_DISTANCE, info.source_distance_mm, "mm"),
         ("/entry/instrument/beam/incident_energy", info.energy_kev, "keV"),
         ("/entry/record/exposure", info.exposure, "s"),
         ("/entry/record/period", info.period, "s"),

@@ -44,12 +44,18 @@ class NXtomoSource:
             self.energy_kev = next((value for value in energy if value is not None), None)
             # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
             self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
+            self.cone = self._cone()
             self.n = 0
             self._own_angles = own_angles
             self.refresh()
         except BaseException:
             self._file.close()
             raise
+
+    def _cone(self) -> tuple[float, float] | None:
+        sod = hdf5.scalar(self._file, layout.SOURCE_DISTANCE, hdf5.LENGTH_UNITS)
+        beyond = hdf5.scalar(self._places.detector, "distance", hdf5.LENGTH_UNITS)
+        return None if sod is None or beyond is None else (sod, sod + beyond)
 
     def _check(self) -> None:
         finer = hdf5.dataset(self._places.detector, "image_key_control")
@@ -199,6 +205,7 @@ NUMBERS = (
     ("period_s", "record/period", hdf5.TIME_UNITS),
     ("no_data", "record/no_data", {"": 1.0}),
     ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
+    ("source_distance_mm", "record/source_distance", hdf5.LENGTH_UNITS),
 )
 
 

@@ -104,6 +104,10 @@ class Overlay:
         return self._base.energy_kev
 
     @property
+    def cone(self) -> tuple[float, float] | None:
+        return self._base.cone
+
+    @property
     def axis_col(self) -> float | None:
         return self._base.axis_col
 

@@ -31,8 +31,9 @@ class ScanSource(Protocol):
         image_key: int32 [frame], values of drivers.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
         exposures: float64 [frame] s, NaN where unknown.
-        pixel_size_mm: at the sample.
+        pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
+        cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         attributes: whatever else the file says, for the record.
         finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
@@ -59,6 +60,8 @@ class ScanSource(Protocol):
     def energy_kev(self) -> float | None: ...
     @property
     def axis_col(self) -> float | None: ...
+    @property
+    def cone(self) -> tuple[float, float] | None: ...
     @property
     def attributes(self) -> Attributes: ...
     @property

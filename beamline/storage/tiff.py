@@ -57,6 +57,7 @@ class TiffStack:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
+    cone: tuple[float, float] | None = None
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -158,6 +159,7 @@ class TiffSeries:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
+    cone: tuple[float, float] | None = None
 
     def __init__(self, path: Path) -> None:
         self.path = path

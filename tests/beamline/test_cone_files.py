@@ -1,0 +1,111 @@
+"""A scan of a cone beam, from its file to a volume: distances are kept, rows and bins keep the central ray."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from beamline.digest import digest
+from beamline.errors import ConfigError, DataError
+from beamline.pipeline import prepare
+from beamline.selection import Selection
+from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.source import open_scan
+from drivers.clock import SystemClock
+from drivers.frame import Frame, FrameKind
+from recon.correct import CorrectionSettings
+from recon.fdk import fdk
+from recon.volume import Grid
+
+SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
+BALL, CENTRE, MU = 0.2, (0.12, -0.05, 0.06), 1.5  # mm, (x, y, z), 1/mm
+INFO = ScanInfo(
+    sample="ball", pixel_size_mm=PITCH, distance_mm=SDD - SOD, source_distance_mm=SOD, axis_col=AXIS
+)  # fmt: skip
+PLAIN = Selection(correction=CorrectionSettings(air="none"))
+
+
+def _line_integrals(angle: float) -> NDArray[np.float64]:
+    """A ball seen from a point: 2 μ √(r² - d²) with d the distance of its centre from the ray through each pixel."""
+    rows, cols = SHAPE
+    u, v = (np.arange(cols) - AXIS) * PITCH, (np.arange(rows) - (rows - 1) / 2) * PITCH
+    ray = np.stack(np.broadcast_arrays(u[None, :], SDD, v[:, None]), axis=-1)  # from the source, in (u, beam, v)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    x, y, z = CENTRE
+    c, s = np.cos(angle), np.sin(angle)
+    ball = np.array([x * c + y * s, SOD + y * c - x * s, z])
+    distance2 = ball @ ball - (ray @ ball) ** 2
+    return 2 * MU * np.sqrt(np.clip(BALL**2 - distance2, 0, None))
+
+
+def _write(path: Path, info: ScanInfo, views: int = 90) -> None:
+    angles = 2 * np.pi * np.arange(views) / views
+    frames = [np.zeros(SHAPE), np.full(SHAPE, 50_000.0), *(50_000 * np.exp(-_line_integrals(a)) for a in angles)]
+    kinds = [FrameKind.DARK, FrameKind.FLAT, *[FrameKind.PROJECTION] * views]
+    with NXtomoWriter(path, info, SHAPE, clock=SystemClock()) as writer:
+        for i, (frame, kind) in enumerate(zip(frames, kinds, strict=True)):
+            counts = np.rint(frame).astype(np.uint16)
+            angle = angles[i - 2] if i > 1 else np.nan
+            writer.append(Frame(counts, kind, i, i, i, angle, 0.1 * i, 0.05), digest(counts, 65535, 4))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cone") / "ball.h5"
+    _write(path, INFO)
+    return path
+
+
+def _never(message: str) -> None:
+    raise AssertionError(message)
+
+
+def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> None:
+    with open_scan(scan) as source:
+        assert source.cone == (SOD, SDD)
+        prepared = prepare(source, PLAIN, _never)
+    geometry = prepared.geometry
+    assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
+    assert geometry.period == pytest.approx(2 * np.pi)
+    grid = Grid.matching(geometry)
+    volume = fdk(prepared.projections.data, geometry, grid, "hann")
+    z, y, x = grid.coordinates()
+    inside = ((z[:, None, None] - CENTRE[2]) ** 2 + (y[:, None] - CENTRE[1]) ** 2 + (x - CENTRE[0]) ** 2) < 0.12**2
+    assert volume[inside].mean() == pytest.approx(MU, rel=0.03)
+    weights = np.clip(volume, 0.3 * MU, None) - 0.3 * MU  # the streaks between few views are far below that
+    for axis, expected in ((x, CENTRE[0]), (y[:, None], CENTRE[1]), (z[:, None, None], CENTRE[2])):
+        assert (weights * axis).sum() / weights.sum() == pytest.approx(expected, abs=0.1 * grid.voxel_size)
+
+
+def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:
+    with open_scan(scan) as source:
+        whole = prepare(source, PLAIN, _never).geometry
+        rows = prepare(source, replace(PLAIN, rows=(10, 30), binning=2), _never).geometry
+    assert rows.detector_shape == (10, 24)
+    # The central ray met row 19.5 of the detector: 9.5 of the rows that are read, 4.5 of these in pairs.
+    assert (whole.axis_row, rows.axis_row) == (19.5, pytest.approx(4.5))
+    assert (rows.pixel_pitch, rows.sdd) == (2 * PITCH, SDD)
+
+
+def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> None:
+    path = tmp_path / "silent.h5"
+    _write(path, replace(INFO, source_distance_mm=None), views=8)
+    with open_scan(path) as source:
+        assert source.cone is None  # a detector's distance alone is propagation in a parallel beam
+        told = replace(PLAIN, cone=(SOD, SDD))
+        assert prepare(source, told, _never).geometry.is_cone
+
+
+def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
+    for name, info, error, words in (
+        ("axis", replace(INFO, axis_col=None), DataError, "that of a cone beam is not searched. Give it with --axis"),
+        ("pixel", replace(INFO, pixel_size_mm=None), ConfigError, "which a cone beam needs: give --pixel-size-um"),
+    ):
+        path = tmp_path / f"{name}.h5"
+        _write(path, info, views=4)
+        with open_scan(path) as source, pytest.raises(error, match=words):
+            prepare(source, PLAIN, _never)
