@@ -127,7 +127,7 @@ class PM16CStage:
             raise DeviceRefused(
                 self.name,
                 "it has no home switch",
-                advice="Where there is one, give its angle as `home` in the configuration",
+                advice="Where there is one, give its angle as `home_deg` in the configuration",
                 state="Nothing has moved",
             )
         search = HomeSearch(self._channel, self.name, self._home)
