@@ -39,5 +39,6 @@ def pi_gcs(**build: Any) -> AnyRig:
 
 
 NAMES = (f"every-stage-test-{number}" for number in itertools.count())
-RIGS: dict[str, Callable[..., AnyRig]] = {"pm16c": pm16c_rig.Rig, "pi_gcs": pi_gcs, "zaber": zaber_rig.Rig}
+RigOf = Callable[..., AnyRig]
+RIGS: dict[str, RigOf] = {"pm16c": pm16c_rig.Rig, "pi_gcs": pi_gcs, "zaber": zaber_rig.Rig}
 every_stage = pytest.mark.parametrize("rig_of", RIGS.values(), ids=RIGS.keys())

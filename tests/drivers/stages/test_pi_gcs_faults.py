@@ -157,23 +157,6 @@ def test_a_lost_error_reply_after_a_move_says_that_the_stage_may_be_turning(rig:
     assert not stage.moving()
 
 
-def test_a_dead_line_lets_a_stop_out_and_does_not_keep_the_port(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_move(math.radians(60), math.radians(1))
-    rig.spoil = lambda reply: b""
-    with pytest.raises(DeviceTimeout, match="may be turning"):
-        stage.wait(LONG)
-    rig.clock.sleep(1.0)
-    for stop in (stage.stop, stage.abort):
-        with pytest.raises(DeviceTimeout):
-            stop()
-    rig.spoil = lambda reply: reply
-    rig.clock.sleep(2.0)
-    assert rig.say(b"\x05") == "0"
-    stage.close()
-    rig.open().close()
-
-
 def test_a_motion_error_that_came_before_a_command_is_not_laid_at_its_door() -> None:
     rig = Rig(stall_at=2500)
     stage = rig.open()

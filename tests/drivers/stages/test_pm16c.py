@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from pathlib import Path
 
 import pytest
@@ -44,13 +43,6 @@ def test_a_controller_found_in_remote_is_left_there(rig: Rig) -> None:
     assert rig.say("STQ?") == "R4"
 
 
-def test_opening_a_moving_stage_is_refused_and_lets_it_move(rig: Rig) -> None:
-    rig.say("REM", "ABSB+50000")
-    with pytest.raises(DeviceRefused, match="opening is not possible while it moves"):
-        rig.open()
-    assert rig.say("STSB?")[2] == "P"
-
-
 def test_remote_that_is_not_granted_is_named(rig: Rig) -> None:
     """Another axis moves, and the panel was switched to LOCAL after it started: the controller ignores REM."""
     rig.say("REM", "ABS3+50000")
@@ -79,14 +71,6 @@ def test_limits_in_the_controller_that_leave_no_room_are_respected(rig: Rig) -> 
             rig.open(**limits)
     rig.open(low=math.radians(-8), high=math.radians(80)).close()
     assert (rig.say("FL?B"), rig.say("SETLS?B")) == ("+0020000", "10000000")
-
-
-def test_two_drivers_cannot_hold_one_port(rig: Rig) -> None:
-    stage = rig.open()
-    with pytest.raises(DeviceError, match="does not open"):
-        rig.open()
-    stage.close()
-    rig.open().close()
 
 
 # acceleration
@@ -155,41 +139,6 @@ def test_the_transcript_holds_the_opening(rig: Rig, tmp_path: Path) -> None:
     assert text.index(r"> b'VER?\r\n'") < text.index("PM16C-04XDL-SIMULATED") < text.index(r"> b'LOC\r\n'")
 
 
-def test_after_a_stop_on_the_way_going_on_gives_the_rest_and_going_back_gives_none(rig: Rig) -> None:
-    bench = rig.bench()
-    train = bench.train(1.0, 1.0, 30)
-    bench.stage.arm(train)
-    bench.stage.start_move(math.radians(40), SPEED)
-    rig.clock.sleep(1.6)
-    bench.stage.stop()
-    before = len(bench.pulses())
-    bench.go(2.0)
-    assert len(bench.pulses()) == before
-    bench.go(40.0)
-    assert 10 < before < 20
-    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [
-        train.start + 250 * k for k in range(30)
-    ]
-
-
-def test_a_train_half_emitted_is_ended_by_disarming(rig: Rig) -> None:
-    bench = rig.bench()
-    bench.stage.arm(bench.train(1.0, 1.0, 30))
-    bench.go(10.5)
-    bench.stage.disarm()
-    bench.go(40.0)
-    assert len(bench.pulses()) == 10
-
-
-def test_lost_pulses_are_missing_and_no_others() -> None:
-    rig = Rig(lost={0, 7})
-    bench = rig.bench()
-    bench.stage.arm(bench.train(1.0, 0.5, 10))
-    bench.go(10.0)
-    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-    assert counts == [250 + 125 * k for k in range(10) if k not in {0, 7}]
-
-
 def test_a_setting_that_another_program_took_back_is_noticed(rig: Rig) -> None:
     stage = rig.open()
     rig.say("LOC")
@@ -238,15 +187,3 @@ def test_a_fifth_motor_cannot_start_and_the_controllers_words_are_given(rig: Rig
     with pytest.raises(DeviceError, match="MCC06 BUSY ERROR"):
         stage.start_move(math.radians(30), SPEED)
     assert stage.position() == 0.0
-
-
-def test_a_stop_from_another_thread_ends_the_wait_with_an_error(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_move(math.radians(90), math.radians(1))
-    rig.clock.sleep(5.0)
-    stopper = threading.Thread(target=stage.stop)
-    stopper.start()
-    with pytest.raises(DeviceError, match="stopped short"):
-        stage.wait(1e4)
-    stopper.join()
-    assert not stage.moving()

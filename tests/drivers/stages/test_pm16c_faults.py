@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.protocols import TriggerTrain
 from tests.drivers.pm16c_rig import QUERIES_TO_OPEN, Rig
-from tests.drivers.stage_bench import LONG, SPEED
+from tests.drivers.stage_bench import SPEED
 
 
 @pytest.fixture
@@ -75,28 +75,3 @@ def test_garbage_is_named_and_the_next_request_is_in_step_again() -> None:
     with pytest.raises(DeviceError, match=r"does not have the form.*signed position in pulses"):
         stage.position()
     assert stage.position() == 0.0
-
-
-def test_a_timeout_during_a_move_says_that_the_stage_may_be_turning_and_a_stop_still_works() -> None:
-    silent = set(range(QUERIES_TO_OPEN + 4, 10_000))
-    rig = Rig(silent=silent)
-    stage = rig.open()
-    stage.start_move(math.radians(60), math.radians(1))
-    with pytest.raises(DeviceTimeout, match="may be turning"):
-        stage.wait(LONG)
-    rig.clock.sleep(1.0)
-    with pytest.raises(DeviceTimeout):
-        stage.stop()
-    silent.clear()
-    assert rig.say("STSB?")[2] == "S"
-    stage.close()
-
-
-def test_a_dead_line_does_not_keep_the_port() -> None:
-    silent: set[int] = set()
-    rig = Rig(silent=silent)
-    stage = rig.open()
-    silent.update(range(10_000))
-    stage.close()
-    silent.clear()
-    rig.open().close()

@@ -169,54 +169,6 @@ def test_pulse_times_are_those_of_the_closed_form() -> None:
     assert len(bench.pulses()) == 60
 
 
-@pytest.mark.parametrize("settings", [{}, {"toggle": True}])
-def test_after_a_stop_on_the_way_going_on_gives_the_rest(settings: dict[str, Any]) -> None:
-    bench = Rig().bench(**settings)
-    train = bench.train(1.0, 1.0, 30)
-    bench.stage.arm(train)
-    bench.stage.start_move(math.radians(40), SPEED)
-    bench.clock.sleep(1.6)
-    bench.stage.stop()
-    before = len(bench.pulses())
-    assert bench.stage.remaining_pulses() == 30 - before
-    bench.go(40.0)
-    assert 10 < before < 20
-    assert counts_of(bench) == points(train)
-
-
-def test_going_back_over_a_train_under_way_ends_it() -> None:
-    bench = Rig().bench()
-    bench.stage.arm(bench.train(1.0, 1.0, 30))
-    bench.go(10.5)
-    bench.go(2.0)
-    assert bench.stage.remaining_pulses() == 0
-    bench.go(40.0)
-    assert len(bench.pulses()) == 10
-
-
-@pytest.mark.parametrize("stop", [-2.0, 0.5, 1.5, 1.9])
-def test_going_back_before_the_first_pulse_keeps_the_train(stop: float) -> None:
-    bench = Rig().bench()
-    train = bench.train(2.0, 1.0, 5)
-    bench.stage.arm(train)
-    bench.go(stop)
-    bench.go(-4.0)
-    assert bench.stage.remaining_pulses() == 5
-    bench.go(20.0)
-    assert counts_of(bench) == points(train)
-
-
-def test_a_train_half_emitted_is_ended_by_disarming_also_while_it_moves() -> None:
-    bench = Rig().bench()
-    bench.stage.arm(bench.train(1.0, 1.0, 30))
-    bench.stage.start_move(math.radians(40), SPEED)
-    bench.clock.sleep(1.6)
-    bench.stage.disarm()
-    before = len(bench.pulses())
-    bench.stage.wait(LONG)
-    assert len(bench.pulses()) == before > 10
-
-
 def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle() -> None:
     rig = Rig()
     bench = rig.bench(toggle=True)
@@ -226,13 +178,6 @@ def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle(
         bench.stage.disarm()
         assert rig.say("/1 0 io get do 1") == "0"
     assert len(bench.pulses()) == 4
-
-
-def test_lost_pulses_are_missing_and_no_others() -> None:
-    bench = Rig(lost={0, 7}).bench()
-    bench.stage.arm(bench.train(1.0, 0.5, 10))
-    bench.go(10.0)
-    assert counts_of(bench) == [1000 + 500 * k for k in range(10) if k not in {0, 7}]
 
 
 # firmware that is less able

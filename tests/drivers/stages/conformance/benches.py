@@ -36,6 +36,7 @@ class Kind:
         homes: it has a reference, within its limits.
         stops_are_told: `status` tells that the last move was stopped.
         turning_back_ends: a train ends where the stage turns back inside it; elsewhere its rest comes later.
+        disarms_moving: a train can be ended while the stage moves.
         relative_moves: how many of them make the long way; fewer where bytes cost time and the law is tested elsewhere.
         terminal: its bytes go through a pseudo-terminal. Time is virtual all the same: they take their own time, the
             clock stands meanwhile.
@@ -49,6 +50,7 @@ class Kind:
     homes: bool = True
     stops_are_told: bool = True
     turning_back_ends: bool = True
+    disarms_moving: bool = True
     relative_moves: int = 1000
     terminal: bool = False
 
@@ -87,7 +89,11 @@ def _zaber(**device: Any) -> RigOf:
 
 
 _PM16C = Kind(
-    lambda _: pm16c_rig.Rig(home_at=500), {"home": math.radians(2.0)}, no_width=50e-6, turning_back_ends=False
+    lambda _: pm16c_rig.Rig(home_at=500),
+    {"home": math.radians(2.0)},
+    no_width=50e-6,
+    turning_back_ends=False,
+    disarms_moving=False,
 )
 _PI_GCS = Kind(_pi_gcs, {}, width=None, inverts=True)
 _ZABER = Kind(_zaber(), {}, width=1e-3, no_width=0.5e-3, inverts=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import pytest
 
@@ -54,3 +55,14 @@ def test_after_a_stop_it_goes_on_elsewhere(bench: StageBench, hard: bool) -> Non
     bench.clock.sleep(1.0)
     (bench.stage.abort if hard else bench.stage.stop)()
     assert bench.go(-2.0) == pytest.approx(-2.0, abs=bench.count)
+
+
+def test_a_stop_from_another_thread_ends_the_wait_with_an_error(bench: StageBench) -> None:
+    bench.stage.start_move(math.radians(90), math.radians(1))
+    bench.clock.sleep(5.0)
+    stopper = threading.Thread(target=bench.stage.stop)
+    stopper.start()
+    with pytest.raises(DeviceError, match="stopped short"):
+        bench.stage.wait(1e4)
+    stopper.join()
+    assert not bench.stage.moving()

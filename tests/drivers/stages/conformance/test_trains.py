@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from contextlib import nullcontext
 
 import pytest
 
+from drivers.errors import DeviceRefused
 from drivers.protocols import TriggerTrain
-from tests.drivers.stage_bench import StageBench
+from tests.drivers.stage_bench import LONG, SPEED, StageBench
+from tests.drivers.stages.conformance.benches import Kind
 
 
 @pytest.mark.parametrize(("first", "step", "n"), [(2.0, 0.5, 37), (-1.0, -0.25, 9), (1.0, 0.1, 1), (-1.0, -0.1, 1)])
@@ -133,3 +136,67 @@ def test_pulses_still_to_come_are_counted_where_the_controller_tells(bench: Stag
     bench.go(10.0)
     told.append(bench.stage.remaining_pulses())
     assert told in ([0, 5, 3, 0], [None] * 4)
+
+
+def test_a_train_under_which_the_stage_is_stopped_goes_on_with_the_next_move(bench: StageBench) -> None:
+    train = bench.train(1.0, 1.0, 30)
+    bench.stage.arm(train)
+    bench.stage.start_move(math.radians(40), SPEED)
+    bench.clock.sleep(1.6)
+    bench.stage.stop()
+    before = len(bench.pulses())
+    assert 10 < before < 20
+    assert bench.stage.remaining_pulses() in (30 - before, None)
+    bench.go(40.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [train.start + train.interval * k for k in range(30)]
+
+
+@pytest.mark.parametrize("stopped", [False, True], ids=["at the end of a move", "after a stop"])
+def test_turning_back_inside_a_train_gives_no_pulse_and_ends_it_where_it_cannot_go_on(
+    kind: Kind, bench: StageBench, stopped: bool
+) -> None:
+    train = bench.train(1.0, 1.0, 30)
+    bench.stage.arm(train)
+    if stopped:
+        bench.stage.start_move(math.radians(40), SPEED)
+        bench.clock.sleep(1.1)
+        bench.stage.stop()
+    else:
+        bench.go(10.5)
+    before = len(bench.pulses())
+    assert before == 10 or (stopped and 5 < before < 15)
+    bench.go(2.0)
+    assert len(bench.pulses()) == before
+    assert bench.stage.remaining_pulses() in (0 if kind.turning_back_ends else 30 - before, None)
+    bench.go(40.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [train.start + train.interval * k for k in range(before if kind.turning_back_ends else 30)]
+
+
+@pytest.mark.parametrize("stop", [-2.0, 0.5, 1.5, 1.9])
+def test_turning_back_before_the_first_pulse_keeps_the_train(bench: StageBench, stop: float) -> None:
+    train = bench.train(2.0, 1.0, 5)
+    bench.stage.arm(train)
+    bench.go(stop)
+    bench.go(-4.0)
+    assert bench.stage.remaining_pulses() in (5, None)
+    bench.go(20.0)
+    counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+    assert counts == [train.start + train.interval * k for k in range(5)]
+
+
+def test_disarming_on_the_way_ends_the_pulses_or_is_refused_and_lets_it_move(kind: Kind, bench: StageBench) -> None:
+    bench.stage.arm(bench.train(1.0, 1.0, 30))
+    bench.stage.start_move(math.radians(40), SPEED)
+    bench.clock.sleep(1.6)
+    with (
+        nullcontext()
+        if kind.disarms_moving
+        else pytest.raises(DeviceRefused, match="disarming is not possible while it moves")
+    ):
+        bench.stage.disarm()
+    before = len(bench.pulses())
+    assert 10 < before < 20
+    assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(40.0, abs=bench.count)
+    assert len(bench.pulses()) == (before if kind.disarms_moving else 30)
