@@ -12,12 +12,22 @@ from simulators.sensor import READ_NOISE
 
 @dataclass(frozen=True)
 class ReadNoise:
-    """Gaussian; pixels summed by binning are read one by one, so that their noise adds up."""
+    """Gaussian; pixels summed by binning are read one by one, so that their noise adds up.
+
+    `rms`: electrons of a sensor pixel, in place of the readout's.
+    """
+
+    rms: float | None = None
 
     name: ClassVar[str] = "read_noise"
     domain: ClassVar[Domain] = Domain.ELECTRONS
     final: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        if self.rms is not None and not self.rms >= 0:
+            raise ValueError(f"rms must be >= 0 electrons, got {self.rms}")
+
     def apply(self, image: Image, shot: Shot) -> Image:
-        image += draws(self.name, shot).normal(0.0, READ_NOISE[shot.readout] * shot.binning, image.shape)
+        rms = READ_NOISE[shot.readout] if self.rms is None else self.rms
+        image += draws(self.name, shot).normal(0.0, rms * shot.binning, image.shape)
         return image
