@@ -1,0 +1,145 @@
+"""`beamline simulate`: the file is a scan like any other, labels and truth belong to it, and nothing half stays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.simulate import write
+from beamline.simulate.labels import read_labels
+from beamline.simulate.scene_file import shipped_scenes
+from beamline.storage.source import open_scan
+from drivers.frame import FrameKind
+from recon.geometry import Geometry
+from recon.volume import Grid
+
+SCENE = """
+phantom:
+  kind: solids
+  solids:
+    - {kind: ellipsoid, semi_axes: [0.1, 0.08, 0.12], attenuation: 4.0, centre: [0.05, 0.02, 0.03]}
+    - {kind: cylinder, radius: 0.05, height: 0.2, attenuation: 2.0, centre: [-0.15, 0.0, 0.0]}
+beam: {photons_per_s: 1.0e+5}
+axis_offset_px: 1.5
+detector: {shape: [32, 40], pixel_size_um: 12.0, exposure_s: 0.02}
+scan: {views: 12, darks: 2, flats: 2}
+effects: [photon_noise, read_noise, offset]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(SCENE, encoding="utf-8")
+    return tmp_path
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def test_a_simulated_scan_is_a_scan(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5", "--frames", "6", "--seed", "4")
+    assert result.exit_code == 0, result.output
+    assert "10 frames" in result.stdout
+    assert "no anomaly" in result.stdout
+    assert Path("scan.png").read_bytes().startswith(b"\x89PNG")
+    assert read_labels(Path("scan.labels.json")) == ()
+    with open_scan("scan.h5") as source:
+        kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * 6
+        assert source.image_key.tolist() == kinds
+        np.testing.assert_allclose(np.degrees(source.angles[4:]), np.arange(6) * 30.0)
+        assert source.axis_col == 19.5 + 1.5
+        assert source.pixel_size_mm == pytest.approx(0.012)
+        frames = source.read(slice(None)).astype(float)
+    assert frames[:2].mean() == pytest.approx(200, abs=1)
+    assert frames[2:4].mean() == pytest.approx(200 + 2000 / 0.107, rel=0.01)
+    assert _beamline("validate", "scan.h5").exit_code == 0
+    again = _beamline("simulate", "scene.yaml", "--out", "again.h5", "--frames", "6", "--seed", "4")
+    assert again.exit_code == 0
+    with open_scan("again.h5") as source:
+        np.testing.assert_array_equal(source.read(slice(None)), frames)
+
+
+def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--truth", "truth.h5", "--truth-bin", "2")
+    assert result.exit_code == 0, result.output
+    grid = Grid.matching(Geometry.parallel([0.0], (32, 40), 0.012, 21.0).binned(2))
+    with h5py.File("truth.h5") as file:
+        data, labels = file["entry/data/data"][...], file["entry/data/labels"][...]
+        assert file["entry/data/labels"].attrs["names"].tolist() == ["air", "ellipsoid", "cylinder"]
+        for name, centres in zip(("z", "y", "x"), grid.coordinates(), strict=True):
+            np.testing.assert_allclose(file[f"entry/data/{name}"], centres)
+    assert data.shape == labels.shape == grid.shape
+    # What the voxels hold is what the solids hold: 4/3 π a b c and π r² h.
+    masses = 4 / 3 * np.pi * 0.1 * 0.08 * 0.12 * 4.0, np.pi * 0.05**2 * 0.2 * 2.0
+    assert data.sum(dtype=float) * grid.voxel_size**3 == pytest.approx(sum(masses), rel=0.01)
+    assert (labels == 1).sum() * grid.voxel_size**3 == pytest.approx(masses[0] / 4.0, rel=0.03)
+
+
+def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--explain")
+    assert result.exit_code == 0, result.output
+    head, tail = result.stdout.split("Not called for")
+    lines = [line.split()[0] for line in head.splitlines() if line]
+    steps = ["line_integrals", "beer_lambert", "photon_noise", "read_noise", "offset", "digitise"]
+    assert [line for line in lines if line in steps] == steps
+    assert "rolling_shutter" in tail
+    assert "photon_noise" not in tail
+    said = json.loads(_beamline("simulate", "scene.yaml", "--explain", "--json").stdout.splitlines()[0])
+    assert said["event"] == "explain"
+    assert [cost["name"] for cost in said["costs"]] == steps
+    assert said["ms"] > 0
+
+
+def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, made = write.expose, []
+
+    def stopping(*arguments: object) -> object:
+        made.append(1)
+        if len(made) == 7:
+            import signal
+
+            signal.raise_signal(signal.SIGINT)
+        return real(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(write, "expose", stopping)
+    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5")
+    assert result.exit_code == 4
+    assert "Stopped after 7 of 16 frames; scan.h5 is complete as far as it goes." in result.stderr
+    with open_scan("scan.h5") as source:
+        assert source.image_key.size == 7
+        assert source.attributes["status"] == "stopped"
+    assert json.loads(Path("scan.labels.json").read_text(encoding="utf-8"))["frames"] == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("nowhere", "--explain"), 2, "There is no scene nowhere: neither a file, nor one of battery"),
+        (("scene.yaml",), 2, "Nothing to do: ask for --explain"),
+        (("broken.yaml", "--explain"), 2, "scene.beam: key 'photons' is unknown"),
+        (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
+        (("scene.yaml", "--out", "there.h5"), 5, "there.h5 exists"),
+        (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),
+    ],
+)
+def test_refused_before_anything_is_written(folder: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
+    Path("there.h5").write_bytes(b"")
+    Path("broken.yaml").write_text("phantom: {kind: solids, solids: []}\nbeam: {photons: 1}\n", encoding="utf-8")
+    before = sorted(path.name for path in folder.iterdir())
+    result = _beamline("simulate", *arguments)
+    assert (result.exit_code, words in result.stderr) == (code, True), result.stderr
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", shipped_scenes())
+def test_every_shipped_scene_can_be_simulated(folder: Path, name: str) -> None:
+    result = _beamline("simulate", name, "--frames", "1", "--picture", "p.png")
+    assert result.exit_code == 0, result.output

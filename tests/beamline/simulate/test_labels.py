@@ -1,0 +1,43 @@
+"""Labels of anomalies: runs of frames, kept in JSON and read back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from beamline.errors import DataError
+from beamline.simulate.labels import LabelLog, Run, labels_path, read_labels, write_labels
+from simulators.effects.chain import Label
+
+A, B, C = (0, 4, 0, 4), (1, 5, 1, 5), (2, 6, 2, 6)
+
+
+def test_consecutive_frames_of_a_kind_are_one_run() -> None:
+    log = LabelLog()
+    for frame, labels in enumerate(
+        [[], [Label("ghost", A)], [Label("jump", C), Label("ghost", B)], [], [Label("ghost", C)]]
+    ):
+        log.add(frame, labels)
+    runs = log.runs()
+    assert runs == (Run("ghost", 1, (A, B)), Run("jump", 2, (C,)), Run("ghost", 4, (C,)))
+    assert [run.last for run in runs] == [2, 2, 4]
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    path = labels_path(tmp_path / "scan.h5")
+    assert path.name == "scan.labels.json"
+    runs = (Run("ghost", 1, (A, B)),)
+    write_labels(path, runs, n_frames=9)
+    assert read_labels(path) == runs
+    said = json.loads(path.read_text(encoding="utf-8"))
+    assert said["frames"] == 9
+    assert said["anomalies"][0] == {"kind": "ghost", "first_frame": 1, "last_frame": 2, "regions": [list(A), list(B)]}
+    with pytest.raises(DataError, match="exists and results are never overwritten"):
+        write_labels(path, (), n_frames=1)
+
+
+def test_a_scan_without_anomalies_says_so(tmp_path: Path) -> None:
+    write_labels(tmp_path / "x.json", (), n_frames=3)
+    assert read_labels(tmp_path / "x.json") == ()
