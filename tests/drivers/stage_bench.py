@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from drivers.clock import Clock
 from drivers.protocols import RotationStage, TriggerTrain
 from simulators.trigger_line import Pulse, TriggerLine
+from tests.simulators.cable import emitted
 
 SPEED = math.radians(10)
 LONG = 60.0
@@ -24,12 +25,7 @@ class StageBench:
 
     def pulses(self) -> list[Pulse]:
         """Those that have been emitted by now."""
-        found: list[Pulse] = []
-        after = -math.inf
-        while (pulse := self.line.next_after(after)) is not None and pulse.time <= self.clock.now():
-            found.append(pulse)
-            after = pulse.time
-        return found
+        return emitted(self.line, self.clock)
 
     def go(self, degrees: float) -> float:
         """Move and wait; where it stands, in degrees."""

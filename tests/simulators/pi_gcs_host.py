@@ -9,6 +9,7 @@ from simulators.clock import VirtualClock
 from simulators.trigger_line import Pulse, TriggerLine
 from simulators.wires.pi_gcs import PiGcsController
 from simulators.wires.pi_gcs_axis import Build
+from tests.simulators.cable import emitted
 
 TURN = 360_000
 """A thousand counts a degree."""
@@ -60,11 +61,7 @@ class Wire:
         assert self.ask("ERR?") in ("0", "10")
 
     def pulses(self) -> list[Pulse]:
-        found, after = [], -math.inf
-        while (pulse := self.line.next_after(after)) is not None and pulse.time <= self.clock.now():
-            found.append(pulse)
-            after = pulse.time
-        return found
+        return emitted(self.line, self.clock)
 
     def degrees(self) -> list[float]:
         """Where the pulses were."""

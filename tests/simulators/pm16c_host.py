@@ -7,6 +7,7 @@ import math
 from simulators.clock import VirtualClock
 from simulators.trigger_line import Pulse, TriggerLine
 from simulators.wires.pm16c import PM16CController
+from tests.simulators.cable import emitted
 
 TURN = 360_000
 SPEED = 10_000
@@ -44,11 +45,7 @@ class Wire:
         self.clock.sleep(3600.0)
 
     def pulses(self) -> list[Pulse]:
-        found, after = [], -math.inf
-        while (pulse := self.line.next_after(after)) is not None and pulse.time <= self.clock.now():
-            found.append(pulse)
-            after = pulse.time
-        return found
+        return emitted(self.line, self.clock)
 
     def counts(self) -> list[int]:
         """Where the pulses were, in counts."""

@@ -16,6 +16,7 @@ from drivers.clock import SystemClock
 from simulators.transports import serve_pty
 from simulators.trigger_line import TriggerLine
 from tests.drivers.stages.pi_gcs_rig import controller
+from tests.simulators.cable import emitted
 
 pytest.importorskip("pipython", reason="PIPython, the vendor's host library (Python 3.12 or newer), is not installed")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
@@ -37,12 +38,7 @@ class Bench:
 
     def degrees(self) -> list[float]:
         """Where pulses were emitted by now."""
-        found: list[float] = []
-        after = -math.inf
-        while (pulse := self.line.next_after(after)) is not None and pulse.time <= self.clock.now():
-            found.append(round(math.degrees(pulse.angle), 4))
-            after = pulse.time
-        return found
+        return [round(math.degrees(pulse.angle), 4) for pulse in emitted(self.line, self.clock)]
 
 
 @pytest.fixture

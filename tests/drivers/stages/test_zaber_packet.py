@@ -10,19 +10,8 @@ from hypothesis import strategies as st
 
 from drivers.stages.zaber_packet import ENDINGS, FAULTS, damage, encode, lrc, meaning_of, reply_form, reply_of
 from simulators.wires.zaber_packets import frame
+from tests.drivers.zaber_vectors import VECTORS
 
-VECTORS = """
-/:00
-/1:CF
-/0 1:7F
-/2 1:7D
-/0 0 5:2B
-/1 tools echo:BF
-/get maxspeed:49
-/2 0 5 get maxspeed:52
-/0 0 27 stop:11
-"""
-"""From zproto's tests, and captured from the vendor's library."""
 COMMANDS = [
     ("/1 0 01 trigger 1 when 1 dist 1000:C1", (1, 0, 1, "trigger 1 when 1 dist 1000")),
     ("/1 1 19 move abs 1000:E6", (1, 1, 19, "move abs 1000")),
@@ -33,7 +22,7 @@ COMMANDS = [
 """As the vendor's library sends them."""
 
 
-@pytest.mark.parametrize("packet", VECTORS.split("\n")[1:-1])
+@pytest.mark.parametrize("packet", VECTORS)
 def test_checksums_are_the_published_ones(packet: str) -> None:
     body, _, checksum = packet[1:].partition(":")
     assert lrc(body) == checksum

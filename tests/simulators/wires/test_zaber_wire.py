@@ -13,6 +13,7 @@ from simulators.clock import VirtualClock
 from simulators.trigger_line import TriggerLine
 from simulators.wires.zaber import Fault, ZaberController
 from simulators.wires.zaber_packets import Command, Malformed, PacketReader, frame, lrc
+from tests.drivers.zaber_vectors import VECTORS
 from tests.simulators.zaber_host import SPEED, TURN, Wire
 
 
@@ -23,28 +24,8 @@ def wire() -> Wire:
 
 # packets
 
-VECTORS = """
-/:00
-/1:CF
-/0 1:7F
-/2 1:7D
-/0 0 5:2B
-/1 tools echo:BF
-/get maxspeed:49
-/2 0 5 get maxspeed:52
-/1 0 01 trigger 1 when 1 dist 1000:C1
-/1 1 19 move abs 1000:E6
-/1 1 21 home:32
-/1 1 22 stop:14
-/1 1 25:F7
-/0 0 27 stop:11
-@01 1 OK IDLE -- 0:8C
-@01 0 RJ IDLE -- BADCOMMAND:F5
-"""
-"""From zproto's tests, and captured from the vendor's library."""
 
-
-@pytest.mark.parametrize("packet", VECTORS.split("\n")[1:-1])
+@pytest.mark.parametrize("packet", VECTORS)
 def test_checksums_are_the_published_ones(packet: str) -> None:
     body, _, checksum = packet[1:].partition(":")
     assert lrc(body.encode()) == checksum
