@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields
-from types import NoneType, UnionType
+from dataclasses import MISSING, fields, is_dataclass
+from types import MappingProxyType, NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ class SceneError(ValueError):
 
 
 def build(cls: type[T], where: str, mapping: Any) -> T:
-    """`cls(**mapping)` for a dataclass of plain fields: numbers, words, true or false, lists of these, and None for
-    what may be left out.
+    """`cls(**mapping)` for a dataclass of plain fields: numbers, words, true or false, lists and mappings of these,
+    dataclasses of such fields, and None for what may be left out.
 
     Raises:
         SceneError: naming the key (`where` is its path) and the legal ones.
@@ -92,6 +92,10 @@ def _value(where: str, kind: Any, value: Any) -> Any:
         return value
     if origin is tuple:
         return _values(where, choices, value)
+    if origin is Mapping:
+        return _entries(where, choices, value)
+    if is_dataclass(kind):
+        return build(kind, where, value)
     if kind is bool or kind is str:
         if not isinstance(value, kind):
             raise SceneError(f"{where} must be {'true or false' if kind is bool else 'text'}, got {value!r}")
@@ -101,6 +105,18 @@ def _value(where: str, kind: Any, value: Any) -> Any:
             raise SceneError(f"{where} must be a whole number, got {value!r}")
         return value
     return number(where, value)
+
+
+def _entries(where: str, kinds: tuple[Any, ...], value: Any) -> Mapping[Any, Any]:
+    """A mapping from whole numbers or names; a number may stand as text, as JSON has its keys."""
+    if not isinstance(value, Mapping):
+        raise SceneError(f"{where} must be a mapping, got {value!r}")
+    of_key, of_value = kinds
+    entries = {}
+    for key, entry in value.items():
+        read = int(key) if of_key is int and isinstance(key, str) and key.isdecimal() else key
+        entries[_value(f"{where}: key", of_key, read)] = _value(f"{where}.{key}", of_value, entry)
+    return MappingProxyType(entries)
 
 
 def _values(where: str, kinds: tuple[Any, ...], value: Any) -> tuple[Any, ...]:
