@@ -1,0 +1,41 @@
+"""Encoder error: the stage is not quite at the angle that its encoder reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Shot, draws
+from simulators.effects.turn_waves import Wave, check, series
+from simulators.pose import Pose
+
+
+@dataclass(frozen=True)
+class EncoderError:
+    """Angular positioning error: the sample stands at the angle of the trigger plus the error.
+
+    Attributes:
+        harmonics: waves a turn, millidegrees, phase in degrees. A grating that is not centred gives 1 wave, a gear as
+            many as it has teeth, and interpolation between an encoder's lines as many as it has lines.
+        random_mdeg: standard deviation of the rest, drawn anew for each frame.
+    """
+
+    harmonics: tuple[Wave, ...] = ()
+    random_mdeg: float = 0.0
+
+    name: ClassVar[str] = "encoder_error"
+    domain: ClassVar[Domain] = Domain.MOTION
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check("harmonics", self.harmonics)
+        if not self.random_mdeg >= 0:
+            raise ValueError(f"random_mdeg must be >= 0 millidegrees, got {self.random_mdeg}")
+
+    def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
+        error = series(pose.angle, self.harmonics).real + draws(self.name, shot).normal(0.0, self.random_mdeg)
+        return pose.turned_by(np.radians(1e-3 * error))

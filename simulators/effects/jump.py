@@ -1,0 +1,74 @@
+"""Jump: the sample slips on the stage once, and stays where it slipped to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.chain import Label
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Shot
+from simulators.pose import Pose
+
+SEEN_PX = 0.01
+"""Pixels of a shift that a frame shows; one along the beam it does not."""
+
+
+@dataclass(frozen=True)
+class Jump:
+    """From view `view` on the sample stands elsewhere on the stage: first turned, then shifted, and turning with it.
+
+    Every view from the jump on is labelled, for none is what it would have been. Errors of the stage come before it in
+    a scene: they go by the stage's angle, not by the sample's.
+
+    Attributes:
+        view: the first that is seen after it.
+        shift_um: micrometres along x, y (which turn with the stage) and z (along the axis).
+        turn_deg: degrees about the axis, in the sense in which angles grow.
+    """
+
+    view: int
+    shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_deg: float = 0.0
+
+    name: ClassVar[str] = "jump"
+    domain: ClassVar[Domain] = Domain.MOTION
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.view < 0 or not (any(self.shift_um) or self.turn_deg):
+            raise ValueError(
+                f"view must be >= 0, and shift_um or turn_deg other than 0, got {self.view}, {list(self.shift_um)} and "
+                f"{self.turn_deg}"
+            )
+
+    def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
+        if shot.view < self.view:
+            return pose
+        return pose.turned_by(math.radians(self.turn_deg)).shifted_by(self._shift(pose.angle))
+
+    def label(self, shot: Shot) -> Label | None:
+        """The columns that the sample sweeps; how high it is no shot says."""
+        if not (shot.beam and shot.sample and shot.view >= self.view):
+            return None
+        detector = shot.detector
+        u, _, v = self._shift(np.array([shot.angle]))[0]
+        if math.isinf(detector.sod) and not self.turn_deg and math.hypot(u, v) < SEEN_PX * detector.pitch:
+            return None
+        radius = shot.radius + 1e-3 * math.hypot(*self.shift_um[:2])
+        if not math.isinf(detector.sod):
+            radius /= max(1 - radius / detector.sod, 0.05)
+        rows, cols = detector.shape
+        first = max(0, math.ceil(detector.axis_col - radius / detector.pitch))
+        last = min(cols - 1, math.floor(detector.axis_col + radius / detector.pitch))
+        return Label(self.name, (0, rows, first, last + 1)) if first <= last else None
+
+    def _shift(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
+        """mm along (u, b, v) at each angle, [row, 3]."""
+        x, y, z = (1e-3 * um for um in self.shift_um)
+        c, s = np.cos(angle), np.sin(angle)
+        return np.stack([x * c + y * s, y * c - x * s, np.full_like(c, z)], axis=1)

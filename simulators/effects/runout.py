@@ -1,0 +1,56 @@
+"""Runout: the rotation axis wanders as the stage turns, sideways, along the beam, and up and down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Shot, draws
+from simulators.effects.turn_waves import Wave, check, series
+from simulators.pose import Pose
+
+
+@dataclass(frozen=True)
+class Runout:
+    """Radial and axial error motion (ISO 230-7:2015), synchronous (harmonics) and asynchronous (drawn for each frame).
+
+    Attributes:
+        radial: waves a turn, micrometres, phase in degrees, of the axis' way across the beam and along it. 1 wave is
+            no more than a sample that stands beside the axis, and 0 an axis that is elsewhere; others are the
+            bearing's; a negative number goes round against the sample.
+        axial: the same, up and down.
+        radial_random_um: standard deviation of the rest across the beam, and along it.
+        axial_random_um: of the rest up and down.
+    """
+
+    radial: tuple[Wave, ...] = ()
+    axial: tuple[Wave, ...] = ()
+    radial_random_um: float = 0.0
+    axial_random_um: float = 0.0
+
+    name: ClassVar[str] = "runout"
+    domain: ClassVar[Domain] = Domain.MOTION
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check("radial", self.radial)
+        check("axial", self.axial)
+        if not min(self.radial_random_um, self.axial_random_um) >= 0:
+            raise ValueError(
+                f"radial_random_um and axial_random_um must be >= 0 micrometres, got {self.radial_random_um} and "
+                f"{self.axial_random_um}"
+            )
+
+    def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
+        radial, axial = series(pose.angle, self.radial), series(pose.angle, self.axial)
+        shift = np.stack([radial.real, -radial.imag, axial.real], axis=1)
+        shift += draws(self.name, shot).normal(0.0, 1.0, 3) * (
+            self.radial_random_um,
+            self.radial_random_um,
+            self.axial_random_um,
+        )
+        return pose.shifted_by(1e-3 * shift)
