@@ -25,6 +25,11 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
     {
         "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
         "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later and see the sample turned further"),
+        "encoder_error": Entry(Domain.MOTION, "the stage is not quite at the angle that its encoder reads"),
+        "backlash": Entry(Domain.MOTION, "after the stage has turned backwards the sample lags behind"),
+        "stage_wobble": Entry(Domain.MOTION, "the rotation axis tilts as the stage turns"),
+        "runout": Entry(Domain.MOTION, "the rotation axis wanders as the stage turns"),
+        "jump": Entry(Domain.MOTION, "the sample slips on the stage once"),
         "beam_profile": Entry(Domain.PHOTONS, "the beam is bright in the middle and striped, and the stripes drift"),
         "ring_current": Entry(Domain.PHOTONS, "the ring current falls and is topped up"),
         "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
