@@ -1,0 +1,26 @@
+"""Bands: the rows of a frame shared out among threads; what a row becomes does not depend on who does it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+from numba import config
+
+SMALL = 1 << 16
+"""Pixels below which threads cost more than they gain."""
+
+
+def share_rows(work: Callable[[int, int], None], shape: tuple[int, int]) -> None:
+    """Call `work(first, end)` for bands that make up all rows of a frame of `shape`, at once in NUMBA_NUM_THREADS
+    threads (its default is one a core); `work` releases the interpreter's lock. Not numba's own threads: those may not
+    be entered by two threads at once, and a camera is read while other threads compute."""
+    threads = config.NUMBA_NUM_THREADS if shape[0] * shape[1] > SMALL else 1
+    if threads == 1:
+        return work(0, shape[0])
+    edges = [shape[0] * k // threads for k in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(work, first, end) for first, end in pairwise(edges)]:
+            done.result()
+    return None

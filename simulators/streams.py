@@ -1,0 +1,82 @@
+"""Streams: uniform and normal random numbers for compiled loops; a stream is one 64-bit state, wherever it begins.
+
+A stream is splitmix64 (Steele, Lea & Flood 2014): the state goes on by a fixed step and each number is a hash of it, so
+that a row of a frame or a pixel of the sensor begins a stream of its own by hashing its name. Streams that begin at
+random places of a circle of 2^64 hardly ever meet, and where two do they share a few numbers and no more.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+STEP = np.uint64(0x9E3779B97F4A7C15)
+"""Odd, 2^64 over the golden ratio: the states of a stream are this far apart."""
+_FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_30, _27, _31, _11, _8 = (np.uint64(n) for n in (30, 27, 31, 11, 8))
+_SIGN, _LAYER = np.uint64(256), np.uint64(255)
+
+TAIL = 3.6541528853610088
+"""Where the ziggurat's tail begins, for 256 layers (Marsaglia & Tsang 2000)."""
+
+
+def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Edges x (falling from the base's to 0) [257] and exp(-x²/2) [257] of layers of one area."""
+    area = TAIL * math.exp(-(TAIL**2) / 2) + math.sqrt(math.pi / 2) * math.erfc(TAIL / math.sqrt(2))
+    edges = [area * math.exp(TAIL**2 / 2), TAIL]
+    while len(edges) < 256:
+        edges.append(math.sqrt(-2 * math.log(area / edges[-1] + math.exp(-(edges[-1] ** 2) / 2))))
+    x = np.array([*edges, 0.0])
+    return x, np.exp(-(x**2) / 2)
+
+
+_X, _HEIGHT = _layers()
+
+
+@njit(cache=True, nogil=True, inline="always")
+def mix(state):  # type: ignore[no-untyped-def]
+    """Hash of 64 bits to 64 bits, one to one."""
+    z = (state ^ (state >> _30)) * _FIRST
+    z = (z ^ (z >> _27)) * _SECOND
+    return z ^ (z >> _31)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def begin(key, number):  # type: ignore[no-untyped-def]
+    """State of the stream `number` (a row, a pixel) among those of a key."""
+    return mix(key ^ mix(np.uint64(number) * STEP + STEP))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def uniform(state):  # type: ignore[no-untyped-def]
+    """A number in 0 ... 1 (excluded) with 53 bits, and the state after it."""
+    state += STEP
+    return (mix(state) >> _11) * 2.0**-53, state
+
+
+@njit(cache=True, nogil=True)
+def normal(state):  # type: ignore[no-untyped-def]
+    """A number of mean 0 and variance 1 and the state after it; ziggurat of Marsaglia & Tsang (2000), with separate
+    bits for layer, sign and value (Doornik 2005)."""
+    while True:
+        state += STEP
+        bits = mix(state)
+        layer = bits & _LAYER
+        x = (bits >> _11) * 2.0**-53 * _X[layer]
+        if x >= _X[layer + np.uint64(1)]:
+            if layer == 0:
+                y = 0.0
+                while 2.0 * y <= (x - TAIL) * (x - TAIL):
+                    u, state = uniform(state)
+                    v, state = uniform(state)
+                    x = TAIL - math.log(1.0 - u) / TAIL
+                    y = -math.log(1.0 - v)
+            else:
+                u, state = uniform(state)
+                low, high = _HEIGHT[layer], _HEIGHT[layer + np.uint64(1)]
+                if low + u * (high - low) >= math.exp(-0.5 * x * x):
+                    continue
+        return (-x if bits & _SIGN else x), state

@@ -1,0 +1,139 @@
+"""Noise: the expansion within its bound and the sums against scipy, then the numbers themselves by chi-square."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import special, stats
+
+from simulators import bands
+from simulators.noise import LEAST, add_normal, expansion, poisson, searched, summed
+from tests.simulators import chance
+
+SHAPE = (512, 512)
+
+
+def _poisson(mean: float, seed: int = 0) -> NDArray[np.float64]:
+    return poisson(np.full(SHAPE, mean), np.random.default_rng(seed))
+
+
+def test_the_expansion_lies_within_its_bound() -> None:
+    """Q(x - error, m) <= Φ(w) <= Q(x + error, m) by scipy, in the tail that keeps the digits."""
+    for mean in np.concatenate([np.geomspace(LEAST, 29.9, 60), np.geomspace(30, 1e5, 60)]):
+        w = np.linspace(-1, 1, 201) * (3 if mean < 30 else 5)
+        x, error = expansion.py_func(w, mean, math.sqrt(mean))
+        low, high = np.maximum(x - error, 1e-300), x + error
+        rounding = 1e-9
+        below, above = special.ndtr(w), special.ndtr(-w)
+        left, right = w <= 0, w > 0
+        assert (special.gammaincc(low, mean) <= below * (1 + rounding))[left].all()
+        assert (special.gammaincc(high, mean) >= below * (1 - rounding))[left].all()
+        assert (special.gammainc(low, mean) >= above * (1 - rounding))[right].all()
+        assert (special.gammainc(high, mean) <= above * (1 + rounding))[right].all()
+        assert error.max() < 0.6 * (1 if mean > 10 else 2)  # and it is of use
+
+
+@pytest.mark.parametrize("mean", [LEAST, 3.3, 17.0, 240.0, 5e3, 1e5])
+def test_the_sums_find_the_quantile(mean: float) -> None:
+    for w in np.random.default_rng(1).uniform(-7, 7, 100):
+        k = summed(w, mean)
+        if w < 0:
+            below = special.ndtr(w)
+            assert stats.poisson.cdf(k, mean) >= below * (1 - 1e-9)
+            assert stats.poisson.cdf(k - 1, mean) <= below * (1 + 1e-9)
+        else:
+            above = special.ndtr(-w)
+            assert stats.poisson.sf(k, mean) <= above * (1 + 1e-9)
+            assert stats.poisson.sf(k - 1, mean) >= above * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("mean", [1e-6, 0.01, 0.7, LEAST])
+def test_small_expectations_are_looked_up(mean: float) -> None:
+    u = np.random.default_rng(2).random(500)
+    np.testing.assert_array_equal([searched(value, mean) for value in u], stats.poisson.ppf(u, mean))
+    assert searched(1 - 2**-53, mean) < 30
+
+
+@pytest.mark.parametrize("mean", [0.003, 0.5, 1.99, 2.01, 5.0, 12.0, 29.0, 31.0, 200.0, 5000.0, 80_000.0])
+def test_poisson_numbers_are_poisson(mean: float) -> None:
+    k = _poisson(mean)
+    chance.poisson_like(k, mean)
+    chance.mean_is(k, mean, mean)
+    chance.variance_is(k, mean, 1 / mean)
+    if mean > 1:
+        chance.mean_is(
+            (k - mean) ** 3, mean, 15 * mean**3 + 130 * mean**2 + 56 * mean
+        chance.mean_is((k - mean) ** 3, mean, 15 * mean**3 + 24 * mean**2 + mean)  # central moments 3 and 6
+
+
+def test_each_pixel_has_its_own_expectation() -> None:
+    mean = np.repeat(np.geomspace(0.05, 20_000, 64), 4096).reshape(64, 4096)
+    k = poisson(mean.copy(), np.random.default_rng(3))
+    z = (k - mean) / np.sqrt(mean)
+    for row in range(64):
+        chance.mean_is(z[row], 0.0, 1.0)
+        chance.variance_is(z[row], 1.0, 1 / mean[row, 0])
+    np.testing.assert_array_equal(poisson(np.zeros(SHAPE), np.random.default_rng(0)), 0)
+
+
+def test_neighbours_and_frames_are_independent() -> None:
+    for mean in (0.5, 300.0):
+        k, other = _poisson(mean), _poisson(mean, seed=1)
+        chance.uncorrelated(k[:, 1:], k[:, :-1])
+        chance.uncorrelated(k[1:], k[:-1])
+        chance.uncorrelated(k, other)
+
+
+def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = []
+    for threads in (1, 2, 3):
+        monkeypatch.setattr(bands.config, "NUMBA_NUM_THREADS", threads)
+        frame = _poisson(40.0)
+        add_normal(frame, 0.4, np.random.default_rng(5))
+        frames.append(frame)
+    np.testing.assert_array_equal(frames[0], frames[1])
+    np.testing.assert_array_equal(frames[0], frames[2])
+
+
+def test_normal_noise_has_the_rms_of_each_pixel() -> None:
+    image = np.full(SHAPE, 7.0)
+    add_normal(image, 0.43, np.random.default_rng(0))
+    chance.mean_is(image, 7.0, 0.43**2)
+    chance.variance_is(image, 0.43**2)
+    chance.normal_like((image - 7) / 0.43)
+    rms = np.linspace(0.1, 2.0, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    image = np.zeros(SHAPE)
+    add_normal(image, rms, np.random.default_rng(0))
+    chance.normal_like(image / rms)
+
+
+@pytest.mark.parametrize("bad", [-1e-9, math.nan, math.inf, 2e9])
+def test_what_is_no_expectation_is_refused_and_nothing_is_written(bad: float) -> None:
+    image = np.full((4, 5), 3.0)
+    image[2, 2] = bad
+    before = image.copy()
+    with pytest.raises(ValueError, match=r"expectations must lie in 0 ... 1e\+09, got"):
+        poisson(image, np.random.default_rng(0))
+    np.testing.assert_array_equal(image, before)
+
+
+@pytest.mark.bench
+def test_a_frame_of_2048_takes_a_quarter_of_numpy_s_time() -> None:
+    import time
+
+    mean, rng = np.full((2048, 2048), 5000.0), np.random.default_rng(0)
+
+    def best(make) -> float:  # type: ignore[no-untyped-def]
+        seconds = []
+        for _ in range(5):
+            image = mean.copy()
+            begin = time.perf_counter()
+            make(image)
+            seconds.append(time.perf_counter() - begin)
+        return min(seconds)
+
+    best(lambda image: poisson(image, rng))
+    assert best(lambda image: poisson(image, rng)) < best(rng.poisson) / 4
