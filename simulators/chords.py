@@ -1,7 +1,10 @@
-"""Chord lengths of parallel rays through packed solids, and the share of a voxel that a solid fills: the hot loops.
+"""Chords: how far the rays of one row of a detector run inside one body, in a parallel beam and in a cone.
 
-A ray at (u, v) of a view at angle θ is p = u (cos θ, sin θ, 0) + v (0, 0, 1) + t (-sin θ, cos θ, 0), t in mm. Each row
-of the detector may have an angle of its own (rolling shutter). Only the pixels in a body's shadow are touched.
+In the laboratory's axes (u, b, v) a parallel ray is (u, 0, v) + t (0, 1, 0) and a cone's (0, -sod, 0) + t (u, sod, v),
+t = 1 being the plane of the rotation axis; `axes` [3, 3] has these axes as columns, in the sample's (x, y, z). Each
+function adds attenuation x length in t to the pixels in the body's shadow and tells which these are: from the first to
+the one after the last. In a cone the caller multiplies by the length of (u, sod, v). All is reckoned from the body's
+middle, so that no digits cancel where the source is far.
 """
 
 from __future__ import annotations
@@ -12,189 +15,291 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from simulators.solids import CYLINDER, ELLIPSOID
+from simulators.packing import ELLIPSOID, POLYHEDRON, Packed
 
 Reals = NDArray[np.float64]
-Kinds = NDArray[np.int64]
+Triple = tuple[float, float, float]
+Span = tuple[int, int]
+
+EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an axis
+_FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
-@njit(cache=True, nogil=True)
-def add_line_integrals(
-    cos_row: Reals,
-    sin_row: Reals,
-    u0: float,
-    v0: float,
-    pitch: float,
-    kind: Kinds,
-    attenuation: Reals,
-    centre: Reals,
-    extent: Reals,
-    planes: Reals,
-    half: Reals,
-    out: Reals,
-) -> None:
-    """Add attenuation x chord to `out`, float64 [row, col]; pixel (j, i) is at (v0, u0) + (j, i) * pitch."""
-    rows = out.shape[0]
-    for b in range(kind.size):
-        first_row = max(0, math.ceil((centre[b, 2] - extent[b, 2] - v0) / pitch))
-        last_row = min(rows - 1, math.floor((centre[b, 2] + extent[b, 2] - v0) / pitch))
-        for j in range(first_row, last_row + 1):
-            c, s = cos_row[j], sin_row[j]
-            u_mid = centre[b, 0] * c + centre[b, 1] * s
-            v = v0 + j * pitch - centre[b, 2]
-            if kind[b] == CYLINDER:
-                _cylinder_row(out[j], u0 - u_mid, pitch, attenuation[b], half[b, 0])
-            elif kind[b] == ELLIPSOID:
-                _ellipsoid_row(out[j], u0 - u_mid, v, pitch, attenuation[b], c, s, planes[b])
-            else:
-                _slabs_row(out[j], u0 - u_mid, v, pitch, attenuation[b], c, s, planes[b], half[b], extent[b])
+@njit(**_FAST)
+def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: Reals, facets: Reals) -> None:
+    """What all rows share that see the sample alike: `place` float64 [7] of a body, `facets` float64 [face, 4] of all.
 
-
-@njit(cache=True, nogil=True)
-def _columns(u0: float, pitch: float, low: float, high: float, cols: int) -> tuple[int, int]:
-    """Columns first..last (inclusive) whose centres lie in low..high."""
-    return max(0, math.ceil((low - u0) / pitch)), min(cols - 1, math.floor((high - u0) / pitch))
-
-
-@njit(cache=True, nogil=True)
-def _cylinder_row(row: Reals, u0: float, pitch: float, attenuation: float, radius: float) -> None:
-    first, last = _columns(u0, pitch, -radius, radius, row.size)
-    for i in range(first, last + 1):
-        u = u0 + i * pitch
-        row[i] += 2.0 * attenuation * math.sqrt(max(radius * radius - u * u, 0.0))
-
-
-@njit(cache=True, nogil=True)
-def _ellipsoid_row(
-    row: Reals, u0: float, v: float, pitch: float, attenuation: float, c: float, s: float, W: Reals
-) -> None:
-    """|W (q + t d)|² = 1 is a quadratic in t; its discriminant is one in u, solved for the row (q = u e_u + v e_z)."""
-    dd = du = dv = uu = uv = vv = 0.0
-    for k in range(3):
-        d, e, z = c * W[k, 1] - s * W[k, 0], c * W[k, 0] + s * W[k, 1], W[k, 2]
-        dd, du, dv, uu, uv, vv = dd + d * d, du + d * e, dv + d * z, uu + e * e, uv + e * z, vv + z * z
-    # Schur complement of the ray direction: the shadow is where su u² + 2 suv u v + sv v² <= 1
-    su, suv, sv = uu - du * du / dd, uv - du * dv / dd, vv - dv * dv / dd
-    shift = suv * v / su
-    rest = 1.0 - (sv - suv * suv / su) * v * v
-    if rest <= 0.0:
-        return
-    reach = math.sqrt(rest / su)
-    first, last = _columns(u0, pitch, -shift - reach, -shift + reach, row.size)
-    scale = 2.0 * attenuation / math.sqrt(dd)
-    for i in range(first, last + 1):
-        u = u0 + i * pitch + shift
-        row[i] += scale * math.sqrt(max(rest - su * u * u, 0.0))
-
-
-@njit(cache=True, nogil=True)
-def _slabs_row(
-    row: Reals,
-    u0: float,
-    v: float,
-    pitch: float,
-    attenuation: float,
-    c: float,
-    s: float,
-    normals: Reals,
-    half: Reals,
-    extent: Reals,
-) -> None:
-    """The ray is inside between the latest entry into and the earliest exit out of all slabs (Kay and Kajiya 1986)."""
-    reach = extent[0] * abs(c) + extent[1] * abs(s)
-    first, last = _columns(u0, pitch, -reach, reach, row.size)
-    for i in range(first, last + 1):
-        u = u0 + i * pitch
-        enter, leave = -np.inf, np.inf
-        for k in range(half.size):
-            if half[k] == np.inf:
-                break
-            across = u * (c * normals[k, 0] + s * normals[k, 1]) + v * normals[k, 2]
-            along = c * normals[k, 1] - s * normals[k, 0]
-            if abs(along) < 1e-12:  # the ray runs in the slab or beside it
-                if abs(across) > half[k]:
-                    leave = -np.inf
-                continue
-            middle, span = -across / along, half[k] / abs(along)
-            enter, leave = max(enter, middle - span), min(leave, middle + span)
-        if leave > enter:
-            row[i] += attenuation * (leave - enter)
-
-
-@njit(cache=True, nogil=True)
-def _level(kind: int, x: float, y: float, z: float, planes: Reals, half: Reals) -> float:
-    """Negative inside, positive outside; changes by at most 1 mm per mm, so it bounds the distance to the surface."""
-    if kind == CYLINDER:
-        return max(math.sqrt(x * x + y * y) - half[0], abs(z) - half[1])
-    if kind == ELLIPSOID:
-        r2 = 0.0
-        for k in range(3):
-            w = planes[k, 0] * x + planes[k, 1] * y + planes[k, 2] * z
-            r2 += w * w
-        return (math.sqrt(r2) - 1.0) * half[0]
-    level = -np.inf
-    for k in range(half.size):
-        if half[k] == np.inf:
-            break
-        level = max(level, abs(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2] * z) - half[k])
-    return level
-
-
-@njit(cache=True, nogil=True)
-def add_attenuation(
-    x0: float,
-    y0: float,
-    z0: float,
-    voxel: float,
-    supersample: int,
-    kind: Kinds,
-    attenuation: Reals,
-    centre: Reals,
-    extent: Reals,
-    planes: Reals,
-    half: Reals,
-    out: Reals,
-) -> None:
-    """Add attenuation x filled share to `out`, float64 [z, y, x]; voxel (0, 0, 0) has its centre at (z0, y0, x0).
-
-    The share is counted on supersample³ points, only in voxels that the surface can cross.
+    place: the middle (u, b, v); for an ellipsoid in a parallel beam also su, suv / su, sv - suv² / su and 2 attenuation
+    / |D|, where the shadow is su u² + 2 suv u v + sv v² <= 1 (Schur complement of the ray's direction). facets, in a
+    parallel beam: t = f0 - f1 v + f2 u on the face, and in f3 whether rays enter (-1), leave (1) or run along it (0).
     """
-    nz, ny, nx = out.shape
-    corner = 0.5 * math.sqrt(3.0) * voxel
-    step = voxel / supersample
-    start = -0.5 * voxel + 0.5 * step
-    for b in range(kind.size):
-        k0, k1 = _voxels(z0 - centre[b, 2], voxel, extent[b, 2], nz)
-        j0, j1 = _voxels(y0 - centre[b, 1], voxel, extent[b, 1], ny)
-        i0, i1 = _voxels(x0 - centre[b, 0], voxel, extent[b, 0], nx)
-        for k in range(k0, k1):
-            z = z0 + k * voxel - centre[b, 2]
-            for j in range(j0, j1):
-                y = y0 + j * voxel - centre[b, 1]
-                for i in range(i0, i1):
-                    x = x0 + i * voxel - centre[b, 0]
-                    level = _level(kind[b], x, y, z, planes[b], half[b])
-                    if level <= -corner:
-                        out[k, j, i] += attenuation[b]
-                    elif level < corner:
-                        share = _filled(kind[b], x + start, y + start, z + start, step, supersample, planes[b], half[b])
-                        out[k, j, i] += attenuation[b] * share
+    x, y, z = p.centre[b, 0] - origin[0], p.centre[b, 1] - origin[1], p.centre[b, 2] - origin[2]
+    for k in range(3):
+        place[k] = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
+    if not parallel:
+        return
+    if p.kind[b] == ELLIPSOID:
+        U, D, V = _times(p.matrix[b], axes, 0), _times(p.matrix[b], axes, 1), _times(p.matrix[b], axes, 2)
+        dd, du, dv = _dot(D, D), _dot(D, U), _dot(D, V)
+        su, suv, sv = _dot(U, U) - du * du / dd, _dot(U, V) - du * dv / dd, _dot(V, V) - dv * dv / dd
+        place[3], place[4], place[5] = su, suv / su, sv - suv * suv / su
+        place[6] = 2.0 * p.attenuation[b] / math.sqrt(dd)
+    elif p.kind[b] == POLYHEDRON:
+        for f in range(p.first_face[b], p.first_face[b + 1]):
+            nu, nb, nv = _normal(p.faces[f], axes)
+            if abs(nb) < EDGE_ON:
+                facets[f, 0], facets[f, 1], facets[f, 2], facets[f, 3] = p.faces[f, 3], nv, nu, 0.0
+            else:
+                facets[f, 0], facets[f, 1], facets[f, 2] = p.faces[f, 3] / nb, nv / nb, -nu / nb
+                facets[f, 3] = 1.0 if nb > 0 else -1.0
 
 
-@njit(cache=True, nogil=True)
-def _filled(kind: int, x0: float, y0: float, z0: float, step: float, n: int, planes: Reals, half: Reals) -> float:
-    """Share of n³ points, `step` apart from (x0, y0, z0) on, that lie inside."""
-    inside = 0
-    for k in range(n):
-        for j in range(n):
-            for i in range(n):
-                if _level(kind, x0 + i * step, y0 + j * step, z0 + k * step, planes, half) <= 0.0:
-                    inside += 1
-    return inside / n**3
+@njit(**_FAST)
+def upright_cylinder(row: Reals, u: Reals, pitch: float, middle: float, radius: float, attenuation: float) -> Span:
+    """Parallel rays across an upright cylinder between its ends."""
+    first, stop = _columns(u, pitch, middle - radius, middle + radius)
+    part, at = row[first:stop], u[first:stop]
+    for i in range(part.size):
+        d = at[i] - middle
+        part[i] += 2.0 * attenuation * math.sqrt(max(radius * radius - d * d, 0.0))
+    return first, stop
 
 
-@njit(cache=True, nogil=True)
-def _voxels(first: float, voxel: float, reach: float, n: int) -> tuple[int, int]:
-    """Range of voxels that touch -reach..reach, the first voxel's centre being at `first`."""
-    low = max(0, math.floor((-reach - first) / voxel + 0.5))
-    return low, max(low, min(n, math.floor((reach - first) / voxel + 0.5) + 1))
+@njit(**_FAST)
+def ellipsoid(row: Reals, u: Reals, pitch: float, v: float, place: Reals) -> Span:
+    """Parallel rays; `place` as `look` left it."""
+    dv = v - place[2]
+    rest = 1.0 - place[5] * dv * dv
+    if rest <= 0.0:
+        return 0, 0
+    su, middle, scale = place[3], place[0] - place[4] * dv, place[6]
+    reach = math.sqrt(rest / su)
+    first, stop = _columns(u, pitch, middle - reach, middle + reach)
+    part, at = row[first:stop], u[first:stop]
+    for i in range(part.size):
+        d = at[i] - middle
+        part[i] += scale * math.sqrt(max(rest - su * d * d, 0.0))
+    return first, stop
+
+
+@njit(**_FAST)
+def polyhedron(
+    row: Reals, u: Reals, pitch: float, v: float, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals
+) -> Span:
+    """Parallel rays; `lines` float64 [4, faces] is room to work in."""
+    dv = v - place[2]
+    left, right, high, low = -np.inf, np.inf, 0, 0
+    for f in range(p.first_face[b], p.first_face[b + 1]):
+        a, slope = facets[f, 0] - facets[f, 1] * dv, facets[f, 2]
+        if facets[f, 3] > 0:
+            lines[0, high], lines[1, high] = a, slope
+            high += 1
+        elif facets[f, 3] < 0:
+            lines[2, low], lines[3, low] = a, slope
+            low += 1
+        else:  # n · (u, v) <= distance, whatever t
+            left, right = _bounded(left, right, slope, a)
+    return _between(row, u, pitch, place[0], p.attenuation[b], lines, high, low, left, right, False)
+
+
+@njit(**_FAST)
+def cone_polyhedron(
+    row: Reals, u: Reals, pitch: float, v: float, sod: float, p: Packed, b: int, axes: Reals, place: Reals, lines: Reals
+) -> Span:
+    """A cone's rays. With s = 1/t a face is n · (u, sod, v) <= s x (the source's distance from it), linear in u."""
+    middle = place[0] * sod / (sod + place[1])
+    left, right, high, low = -np.inf, np.inf, 0, 0
+    for f in range(p.first_face[b], p.first_face[b + 1]):
+        nu, nb, nv = _normal(p.faces[f], axes)
+        inside = p.faces[f, 3] + nu * place[0] + nb * (sod + place[1]) + nv * place[2]
+        at_middle = nu * middle + nb * sod + nv * v
+        if abs(inside) < EDGE_ON * sod:
+            left, right = _bounded(left, right, nu, -at_middle)
+        elif inside < 0:
+            lines[0, high], lines[1, high] = at_middle / inside, nu / inside
+            high += 1
+        else:
+            lines[2, low], lines[3, low] = at_middle / inside, nu / inside
+            low += 1
+    return _between(row, u, pitch, middle, p.attenuation[b], lines, high, low, left, right, True)
+
+
+@njit(**_FAST)
+def cone_ellipsoid(
+    row: Reals, u: Reals, pitch: float, v: float, sod: float, matrix: Reals, attenuation: float, axes: Reals,
+    place: Reals,
+) -> Span:  # fmt: skip
+    """A cone's rays, in the space where the ellipsoid is the unit ball: half a chord squared is |D|² - |R x D|² over
+    |D|⁴, with R where the ray comes by the middle and D its direction, both linear in u."""
+    near = (sod + place[1]) / sod
+    middle, w = place[0] / near, near * v - place[2]
+    U, B, V = _times(matrix, axes, 0), _times(matrix, axes, 1), _times(matrix, axes, 2)
+    M = _sum(sod, B, v, V, middle, U)
+    x0, x1 = _cross(V, M), _sum(near, _cross(U, M), w, _cross(V, U), 0.0, U)
+    c0, c1, c2 = _dot(M, M) - w * w * _dot(x0, x0), 2.0 * (_dot(M, U) - w * _dot(x0, x1)), _dot(U, U) - _dot(x1, x1)
+    root = c1 * c1 - 4.0 * c0 * c2
+    if root <= 0.0 or c2 >= 0.0:
+        return 0, 0
+    top, reach = -c1 / (2.0 * c2), math.sqrt(root) / (-2.0 * c2)
+    first, stop = _columns(u, pitch, middle + top - reach, middle + top + reach)
+    part, at = row[first:stop], u[first:stop]
+    d0, d1, d2 = _dot(M, M), 2.0 * _dot(M, U), _dot(U, U)
+    for i in range(part.size):
+        d = at[i] - middle
+        part[i] += 2.0 * attenuation * math.sqrt(max(c0 + d * (c1 + d * c2), 0.0)) / (d0 + d * (d1 + d * d2))
+    return first, stop
+
+
+@njit(**_FAST)
+def leaning_cylinder(
+    row: Reals, u: Reals, pitch: float, v: float, sod: float, radius: float, half: float, attenuation: float,
+    axes: Reals, place: Reals,
+) -> Span:  # fmt: skip
+    """Any rays (sod is infinite in a parallel beam): inside the round wall and between the ends."""
+    reach = radius * math.hypot(axes[0, 0], axes[1, 0]) + half * abs(axes[2, 0])
+    low, high, near, turn = place[0] - reach, place[0] + reach, 1.0, 0.0
+    R0 = D0 = (axes[0, 1], axes[1, 1], axes[2, 1])
+    U, B, V = R0, R0, R0
+    U, V = (axes[0, 0], axes[1, 0], axes[2, 0]), (axes[0, 2], axes[1, 2], axes[2, 2])
+    middle = place[0]
+    if sod < np.inf:
+        deep = radius * math.hypot(axes[0, 1], axes[1, 1]) + half * abs(axes[2, 1])
+        front, back = sod / (sod + place[1] - deep), sod / (sod + place[1] + deep)
+        low, high = min(low * front, low * back), max(high * front, high * back)
+        near, turn = (sod + place[1]) / sod, 1.0
+        middle = place[0] / near
+        D0 = _sum(sod, B, v, V, middle, U)
+    w = near * v - place[2]
+    R0 = _sum(w, V, 0.0, V, 0.0, V)
+    first, stop = _columns(u, pitch, low, high)
+    part, at = row[first:stop], u[first:stop]
+    for i in range(part.size):
+        d = at[i] - middle
+        rx, ry, rz = R0[0] + near * d * U[0], R0[1] + near * d * U[1], R0[2] + near * d * U[2]
+        dx, dy, dz = D0[0] + turn * d * U[0], D0[1] + turn * d * U[1], D0[2] + turn * d * U[2]
+        dd, cross = dx * dx + dy * dy, rx * dy - ry * dx
+        size = EDGE_ON * EDGE_ON * (dd + dz * dz)
+        inside = radius * radius * dd - cross * cross
+        enter, leave = -np.inf, np.inf
+        if dd > size:
+            if inside <= 0.0:
+                continue
+            span, halfway = math.sqrt(inside) / dd, -(rx * dx + ry * dy) / dd
+            enter, leave = halfway - span, halfway + span
+        elif rx * rx + ry * ry > radius * radius:
+            continue
+        if dz * dz > size:
+            span, halfway = half / abs(dz), -rz / dz
+            enter, leave = max(enter, halfway - span), min(leave, halfway + span)
+        elif abs(rz) > half:
+            continue
+        part[i] += attenuation * max(leave - enter, 0.0)
+    return first, stop
+
+
+@njit(**_FAST)
+def _between(
+    row: Reals, u: Reals, pitch: float, middle: float, attenuation: float, lines: Reals, high: int, low: int,
+    left: float, right: float, cone: bool,
+) -> Span:  # fmt: skip
+    """Add the gap between the lowest of the `high` lines [0:2] and the highest of the `low` lines [2:4], each value +
+    slope (u - middle): walk from kink to kink. In a cone the lines are of 1/t, and the gap is that of t."""
+    for k in range(high):
+        for m in range(low):  # each pair of faces bounds u
+            left, right = _bounded(left, right, lines[3, m] - lines[1, k], lines[0, k] - lines[2, m])
+    first, stop = _columns(u, pitch, middle + left, middle + right)
+    if not (left < right and first < stop and high > 0 and low > 0):
+        return 0, 0
+    k, m = 0, 0
+    for i in range(1, high):
+        gap = lines[0, i] + lines[1, i] * left - lines[0, k] - lines[1, k] * left
+        if gap < 0.0 or (gap == 0.0 and lines[1, i] < lines[1, k]):
+            k = i
+    for i in range(1, low):
+        gap = lines[2, i] + lines[3, i] * left - lines[2, m] - lines[3, m] * left
+        if gap > 0.0 or (gap == 0.0 and lines[3, i] > lines[3, m]):
+            m = i
+    begin = first
+    while begin < stop:
+        kink, next_k, next_m = right, k, m
+        for i in range(high):
+            if lines[1, i] < lines[1, k]:
+                at = (lines[0, i] - lines[0, k]) / (lines[1, k] - lines[1, i])
+                if at < kink:
+                    kink, next_k, next_m = at, i, m
+        for i in range(low):
+            if lines[3, i] > lines[3, m]:
+                at = (lines[2, m] - lines[2, i]) / (lines[3, i] - lines[3, m])
+                if at < kink:
+                    kink, next_k, next_m = at, k, i
+        end = stop
+        if next_k != k or next_m != m:
+            end = min(stop, max(begin, _columns(u, pitch, -np.inf, middle + kink)[1]))
+        part, where = row[begin:end], u[begin:end]
+        if cone:
+            a, b, c, d = lines[0, k], lines[1, k], lines[2, m], lines[3, m]
+            for i in range(part.size):
+                s, z = a + b * (where[i] - middle), c + d * (where[i] - middle)
+                part[i] += attenuation * max(s - z, 0.0) / (s * z)
+        else:
+            a, b = attenuation * (lines[0, k] - lines[2, m]), attenuation * (lines[1, k] - lines[3, m])
+            for i in range(part.size):
+                part[i] += a + b * (where[i] - middle)
+        begin, k, m = end, next_k, next_m
+    return first, stop
+
+
+@njit(**_FAST)
+def _bounded(left: float, right: float, slope: float, limit: float) -> tuple[float, float]:
+    """left..right where slope x (u - middle) <= limit."""
+    if slope > 0.0:
+        return left, min(right, limit / slope)
+    if slope < 0.0:
+        return max(left, limit / slope), right
+    return left, right if limit >= 0.0 else -np.inf
+
+
+@njit(**_FAST)
+def _columns(u: Reals, pitch: float, low: float, high: float) -> Span:
+    """First column whose centre lies in low..high, and the one after the last."""
+    cols = float(u.size)
+    first = math.ceil(min(max((low - u[0]) / pitch, 0.0), cols))
+    stop = math.floor(min(max((high - u[0]) / pitch, -1.0), cols - 1.0)) + 1
+    return first, max(first, stop)
+
+
+@njit(**_FAST)
+def _times(matrix: Reals, axes: Reals, k: int) -> Triple:
+    """The laboratory's k-th axis, multiplied by a matrix [3, 3]."""
+    x, y, z = axes[0, k], axes[1, k], axes[2, k]
+    return (
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )
+
+
+@njit(**_FAST)
+def _normal(face: Reals, axes: Reals) -> Triple:
+    """A face's normal along (u, b, v)."""
+    return (
+        face[0] * axes[0, 0] + face[1] * axes[1, 0] + face[2] * axes[2, 0],
+        face[0] * axes[0, 1] + face[1] * axes[1, 1] + face[2] * axes[2, 1],
+        face[0] * axes[0, 2] + face[1] * axes[1, 2] + face[2] * axes[2, 2],
+    )
+
+
+@njit(**_FAST)
+def _dot(x: Triple, y: Triple) -> float:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+@njit(**_FAST)
+def _cross(x: Triple, y: Triple) -> Triple:
+    return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
+
+
+@njit(**_FAST)
+def _sum(a: float, x: Triple, b: float, y: Triple, c: float, z: Triple) -> Triple:
+    """a x + b y + c z."""
+    return a * x[0] + b * y[0] + c * z[0], a * x[1] + b * y[1] + c * z[1], a * x[2] + b * y[2] + c * z[2]

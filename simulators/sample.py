@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,4 +39,27 @@ class Sample(Protocol):
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
         """What is at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
+        ...
+
+
+@runtime_checkable
+class Counted(Protocol):
+    """A sample that also tells the counts behind it where there is nothing but Beer-Lambert: sooner than by its line
+    integrals, and the same to the count."""
+
+    def counts(
+        self,
+        angle: ArrayLike | Pose,
+        detector: Detector,
+        open_beam: float,
+        rule: Callable[[NDArray[np.float64]], NDArray[np.uint16]],
+    ) -> NDArray[np.uint16]:
+        """What `rule` makes of the line integrals, uint16 [row, col].
+
+        Args:
+            angle: as for line_integrals.
+            open_beam: counts where the line integral is 0, before they are rounded.
+            rule: counts of line integrals float64 [row, col], which it may write over: rounded and clipped open_beam x
+                exp(-line integral). It has the last word.
+        """
         ...

@@ -1,4 +1,4 @@
-"""Solids: analytic bodies with a constant attenuation, as values, and their packing into flat arrays for the kernels.
+"""Solids: analytic bodies with a constant attenuation, as values.
 
 Where solids overlap their attenuations add up: a particle in a matrix is given by its contrast to the matrix, a hole
 by a negative attenuation. Lengths are in mm, attenuation in 1/mm, positions (x, y, z) in the sample's frame (z is the
@@ -8,18 +8,15 @@ rotation axis), orientations quaternions (w, x, y, z) of any length that turn th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
-CYLINDER, ELLIPSOID, SLABS = 0, 1, 2
-MAX_SLABS = 4  # an octahedron is the intersection of four slabs, a box of three
+from simulators.polyhedra import Hull, hull_of_faces, hull_of_vertices
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Face = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
@@ -114,102 +111,113 @@ class Octahedron:
         return 4 / 3 * math.prod(self.half_diagonals)
 
 
-Solid = Cylinder | Tube | Ellipsoid | Box | Octahedron
-SOLIDS: Mapping[str, type[Solid]] = MappingProxyType(
-    {cls.__name__.lower(): cls for cls in (Cylinder, Tube, Ellipsoid, Box, Octahedron)}
-)
+@dataclass(frozen=True)
+class Plate:
+    """Hexagonal plate, the habit of layered oxides such as LiCoO2; any orientation.
 
-
-@dataclass(frozen=True, eq=False)
-class Packed:
-    """Solids as flat arrays, one entry a body (a tube is two: outer and, negative, inner).
-
-    Attributes:
-        kind: int64 [n], CYLINDER, ELLIPSOID or SLABS.
-        attenuation: float64 [n].
-        centre, extent: float64 [n, 3], middle and half size of the axis-aligned box around the body.
-        planes: float64 [n, MAX_SLABS, 3]. ELLIPSOID: rows 0..2 are W with |W q| <= 1 inside; SLABS: unit normals.
-        half: float64 [n, MAX_SLABS]. CYLINDER: (radius, half height); ELLIPSOID: (smallest semi-axis,); SLABS:
-            |normal · q| <= half inside, infinite for unused slabs.
+    The hexagon lies in its own x and y with corners on the x axis; `width` is measured from corner to corner.
     """
 
-    kind: NDArray[np.int64]
-    attenuation: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    extent: NDArray[np.float64]
-    planes: NDArray[np.float64]
-    half: NDArray[np.float64]
+    width: float
+    thickness: float
+    attenuation: float
+    centre: Vector = ORIGIN
+    quaternion: Quaternion = UPRIGHT
+
+    def __post_init__(self) -> None:
+        _check(self, width=self.width, thickness=self.thickness)
+
+    @property
+    def volume(self) -> float:
+        return 3 * math.sqrt(3) / 8 * self.width**2 * self.thickness
 
 
-def pack(solids: Sequence[Solid]) -> Packed:
-    """Flat arrays for the kernels; see Packed."""
-    bodies = [body for solid in solids for body in _bodies(solid)]
-    n = len(bodies)
-    packed = Packed(
-        np.zeros(n, np.int64),
-        np.zeros(n),
-        np.zeros((n, 3)),
-        np.zeros((n, 3)),
-        np.zeros((n, MAX_SLABS, 3)),
-        np.full((n, MAX_SLABS), np.inf),
-    )
-    for i, body in enumerate(bodies):
-        packed.attenuation[i], packed.centre[i] = body.attenuation, body.centre
-        if isinstance(body, Cylinder):
-            packed.kind[i] = CYLINDER
-            packed.half[i, :2] = body.radius, body.height / 2
-            packed.extent[i] = body.radius, body.radius, body.height / 2
-            continue
-        axes = rotation(body.quaternion).T  # row k: the body's k-th axis in the sample's frame
-        if isinstance(body, Ellipsoid):
-            size = np.array(body.semi_axes)
-            packed.kind[i] = ELLIPSOID
-            packed.planes[i, :3] = axes / size[:, None]
-            packed.half[i, 0] = size.min()
-            packed.extent[i] = np.linalg.norm(axes * size[:, None], axis=0)
-        elif isinstance(body, Box):
-            size = np.array(body.edges) / 2
-            packed.kind[i] = SLABS
-            packed.planes[i, :3], packed.half[i, :3] = axes, size
-            packed.extent[i] = np.abs(axes * size[:, None]).sum(axis=0)
-        else:
-            size = np.array(body.half_diagonals)
-            normals = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)]) / size
-            length = np.linalg.norm(normals, axis=1)
-            packed.kind[i] = SLABS
-            packed.planes[i], packed.half[i] = (normals / length[:, None]) @ axes, 1 / length
-            packed.extent[i] = np.abs(axes * size[:, None]).max(axis=0)
-    return packed
+@dataclass(frozen=True)
+class TruncatedOctahedron:
+    """Octahedron whose corners are cut off, the habit of well-grown spinel and layered oxides; any orientation.
+
+    |x|/a + |y|/b + |z|/c <= 1 and |x|/a, |y|/b, |z|/c <= `cut` in its own axes, (a, b, c) being `half_diagonals`: 1/2
+    leaves squares that touch at their corners, 2/3 equal edges, and towards 1 the octahedron is whole.
+    """
+
+    half_diagonals: Vector
+    attenuation: float
+    cut: float = 2 / 3
+    centre: Vector = ORIGIN
+    quaternion: Quaternion = UPRIGHT
+
+    def __post_init__(self) -> None:
+        _check(self, half_diagonals=self.half_diagonals)
+        if not 0.5 <= self.cut < 1:
+            raise ValueError(f"truncated_octahedron: cut must be >= 0.5 and < 1, got {self.cut}")
+
+    @property
+    def volume(self) -> float:
+        return 4 * math.prod(self.half_diagonals) * (1 / 3 - (1 - self.cut) ** 3)
 
 
-def rotation(quaternion: Quaternion) -> NDArray[np.float64]:
-    """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any length but zero."""
-    w, x, y, z = np.array(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+@dataclass(frozen=True)
+class Polyhedron:
+    """Convex polyhedron, given by its corners or by its faces; any orientation.
+
+    `vertices` are (x, y, z) in mm in its own axes. `faces` are (nx, ny, nz, distance): inside is where n · (x, y, z) <=
+    distance in mm for the unit normal n, which is given at any length.
+    """
+
+    attenuation: float
+    vertices: tuple[Vector, ...] | None = None
+    faces: tuple[Face, ...] | None = None
+    centre: Vector = ORIGIN
+    quaternion: Quaternion = UPRIGHT
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if (self.vertices is None) == (self.faces is None):
+            raise ValueError("polyhedron: give either vertices or faces, not both and not neither")
+        self.hull()
+
+    def hull(self) -> Hull:
+        """In its own axes."""
+        if self.vertices is not None:
+            return hull_of_vertices(self.vertices)
+        return hull_of_faces(self.faces or ())
+
+    @property
+    def volume(self) -> float:
+        return self.hull().volume
 
 
-def _bodies(solid: Solid) -> list[Cylinder | Ellipsoid | Box | Octahedron]:
-    if isinstance(solid, Tube):
-        return [
-            Cylinder(solid.outer_radius, solid.height, solid.attenuation, solid.centre),
-            Cylinder(solid.inner_radius, solid.height, -solid.attenuation, solid.centre),
-        ]
-    return [solid]
+Faceted = Box | Octahedron | Plate | TruncatedOctahedron | Polyhedron
+Solid = Cylinder | Tube | Ellipsoid | Faceted
+SOLIDS: Mapping[str, type[Solid]] = MappingProxyType(
+    {
+        "cylinder": Cylinder,
+        "tube": Tube,
+        "ellipsoid": Ellipsoid,
+        "box": Box,
+        "octahedron": Octahedron,
+        "plate": Plate,
+        "truncated_octahedron": TruncatedOctahedron,
+        "polyhedron": Polyhedron,
+    }
+)
+"""Every solid by the name that scenes and labels use."""
+
+_KINDS = MappingProxyType({cls: kind for kind, cls in SOLIDS.items()})
+
+
+def kind_of(solid: Solid) -> str:
+    """The solid's name in SOLIDS."""
+    return _KINDS[type(solid)]
 
 
 def _check(solid: Solid, **lengths: float | Vector) -> None:
     """Raises ValueError for a length that is not positive, a non-finite number or a zero quaternion."""
-    name = type(solid).__name__.lower()
+    name = kind_of(solid)
     for key, value in lengths.items():
         if not all(math.isfinite(v) and v > 0 for v in (value if isinstance(value, tuple) else (value,))):
             raise ValueError(f"{name}: {key} must be positive in mm, got {value}")
     if not all(math.isfinite(v) for v in (solid.attenuation, *solid.centre)):
         raise ValueError(f"{name}: attenuation {solid.attenuation} and centre {solid.centre} must be finite")
-    if isinstance(solid, Ellipsoid | Box | Octahedron) and not math.hypot(*solid.quaternion) > 0:
-        raise ValueError(f"{name}: quaternion must be four numbers (w, x, y, z), not all zero")
+    if not isinstance(solid, Cylinder | Tube) and not 0 < math.hypot(*solid.quaternion) < math.inf:
+        raise ValueError(f"{name}: quaternion must be four numbers (w, x, y, z), finite and not all zero")

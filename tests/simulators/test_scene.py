@@ -21,7 +21,6 @@ from simulators.effects.shot import Shot
 from simulators.exposure import expose
 from simulators.mapping import SceneError
 from simulators.scene import load_scene
-from simulators.solids import SOLIDS
 from tests.simulators import shots
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
@@ -84,10 +83,6 @@ def test_scenes_that_come_with_the_package_load(name: str) -> None:
     flat = shots.frame(scene, shots.shot(exposure=0.05), sample=False)
     assert flat.max() < 65535 or name == "battery"  # a zinger may saturate
     assert np.median(flat) < 60_000
-
-
-def test_every_solid_can_be_named() -> None:
-    assert set(SOLIDS) == {"cylinder", "tube", "ellipsoid", "box", "octahedron"}
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
