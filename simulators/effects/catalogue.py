@@ -30,14 +30,23 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
         "stage_wobble": Entry(Domain.MOTION, "the rotation axis tilts as the stage turns"),
         "runout": Entry(Domain.MOTION, "the rotation axis wanders as the stage turns"),
         "jump": Entry(Domain.MOTION, "the sample slips on the stage once"),
+        "floaters": Entry(Domain.OPTICAL_DEPTH, "crumbs far from the axis come into view for a few views"),
         "beam_profile": Entry(Domain.PHOTONS, "the beam is bright in the middle and striped, and the stripes drift"),
         "ring_current": Entry(Domain.PHOTONS, "the ring current falls and is topped up"),
+        "prnu": Entry(Domain.PHOTONS, "pixels differ in how much light they detect"),
+        "ghost": Entry(Domain.PHOTONS, "something like fog crosses the frame in a few views"),
+        "black_band": Entry(Domain.PHOTONS, "a slit darkens a band at the left side"),
+        "narrow_field": Entry(Domain.PHOTONS, "the beam is narrower than the sample"),
+        "lost_beam": Entry(Domain.PHOTONS, "for a while there is no light, or less of it"),
         "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
         "dark_current": Entry(Domain.ELECTRONS, "electrons without light"),
         "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
         "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
+        "saturation": Entry(Domain.ELECTRONS, "a pixel holds no more than its full well"),
+        "dead_pixels": Entry(Domain.ELECTRONS, "a few pixels see no light"),
         "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
         "offset": Entry(Domain.COUNTS, "the digital bias"),
+        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or not quite straight"),
     }
 )
 

@@ -1,0 +1,60 @@
+"""Black band: a slit stands in the beam, and a band at the left side of the frame is dark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.chain import Label
+from simulators.effects.domain import Domain
+from simulators.effects.penumbra import lit
+from simulators.effects.shot import Image, Shot
+from simulators.effects.views import Views, check, within
+
+
+@dataclass(frozen=True)
+class BlackBand:
+    """The band's edge is soft by the penumbra of the source; flats have the band too.
+
+    Attributes:
+        width: mm from the left edge of the frame, whatever the ROI, to where half of the light is there.
+        penumbra: mm over which the light goes from none to all.
+        share: of the light that is left in the band.
+        views: [first, one after the last] in which the slit stands there; always, where not given.
+    """
+
+    width: float
+    penumbra: float = 0.0
+    share: float = 0.0
+    views: Views | None = None
+
+    name: ClassVar[str] = "black_band"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0 and self.penumbra >= 0 and 0 <= self.share < 1):
+            raise ValueError(
+                f"width must be positive and penumbra >= 0 in mm, and share in 0 ... 1 (excluded), got {self.width}, "
+                f"{self.penumbra} and {self.share}"
+            )
+        check(self.views)
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        if within(self.views, shot):
+            light = self._light(shot)
+            image[:, : light.size] *= light
+        return image
+
+    def label(self, shot: Shot) -> Label | None:
+        cols = self._light(shot).size if shot.beam and within(self.views, shot) else 0
+        return Label(self.name, (0, shot.detector.shape[0], 0, cols)) if cols else None
+
+    def _light(self, shot: Shot) -> NDArray[np.float64]:
+        """Share of the light in each column of the band."""
+        from_left = (np.arange(shot.detector.shape[1], dtype=np.float64) + 0.5) * shot.detector.pitch
+        light = self.share + (1 - self.share) * lit(from_left - self.width, self.penumbra)
+        return light[light < 1]

@@ -1,0 +1,137 @@
+"""Floaters: crumbs far from the axis that come into view for a few views and are gone in the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from simulators.effects.chain import Label
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+from simulators.effects.views import Views, check, within
+
+SEEN = 1e-3
+"""Optical depth at which a crumb ends: a tenth of a percent of the light."""
+
+
+@dataclass(frozen=True)
+class Crumb:
+    """A round Gaussian cloud as a frame shows it, cut off where it is thinner than SEEN.
+
+    Attributes:
+        row, col: of its middle.
+        sigma: pixels.
+        depth: optical depth through its middle.
+    """
+
+    row: float
+    col: float
+    sigma: float
+    depth: float
+
+    def box(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+        """(first row, row after the last, first column, column after the last); empty where it is not in the frame."""
+        middle, size = np.array([self.row, self.col]), np.array(shape)
+        aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # of a circle, the frame may have only a cap
+        reach = np.sqrt(np.maximum(2 * math.log(self.depth / SEEN) * self.sigma**2 - aside**2, 0.0))
+        top, left = np.maximum(np.ceil(middle - reach).astype(int), 0).tolist()
+        below, right = np.minimum(np.floor(middle + reach).astype(int) + 1, size).tolist()
+        return top, below, left, right
+
+
+@dataclass(frozen=True)
+class Floaters:
+    """Crumbs on the can's outside or in the beam's way.
+
+    Those that turn with the stage cross the frame twice a turn, before the axis and behind it, where they are farther
+    out than the frame reaches: within half a turn once, for a stretch of views and on one side of the rotation only.
+    Loose ones drift through at a speed of their own. Both are seen as at the time of the frame's first row.
+
+    Attributes:
+        distance: [least, most] mm from the rotation axis; a loose one is there while it is no farther from it.
+        count: how many.
+        size: [least, most] mm, standard deviation of the cloud.
+        depth: optical depth through the middle of the densest; others have from half of it on.
+        heights: [least, most] mm, down the rows from z = 0.
+        motion: "turning" with the stage, or "loose".
+        speed: mm a view by which a loose one drifts, from either side to the other.
+        views: [first, one after the last] outside of which none is there; a loose one passes the axis between them.
+        seed: which crumbs.
+    """
+
+    distance: tuple[float, float]
+    count: int = 3
+    size: tuple[float, float] = (0.01, 0.03)
+    depth: float = 0.5
+    heights: tuple[float, float] = (-0.2, 0.2)
+    motion: Literal["turning", "loose"] = "turning"
+    speed: float = 0.05
+    views: Views | None = None
+    seed: int = 0
+
+    name: ClassVar[str] = "floaters"
+    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check(self.views)
+        if not (0 < self.distance[0] <= self.distance[1] and 0 < self.size[0] <= self.size[1]):
+            raise ValueError(
+                f"distance and size must be [least, most] > 0 in mm, got {list(self.distance)} and {list(self.size)}"
+            )
+        if not (self.count >= 1 and self.depth >= 4 * SEEN and self.speed > 0 and self.heights[0] <= self.heights[1]):
+            raise ValueError(
+                f"count must be >= 1, depth >= {4 * SEEN}, speed positive in mm a view and heights [least, most], got "
+                f"{self.count}, {self.depth}, {self.speed} and {list(self.heights)}"
+            )
+        if self.motion == "loose" and self.views is None:
+            raise ValueError("loose floaters need views, [first, one after the last], between which they pass the axis")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        for crumb in self.crumbs(shot):
+            top, below, left, right = crumb.box(shot.detector.shape)
+            down, across = (
+                np.exp(-0.5 * ((np.arange(*ends) - middle) / crumb.sigma) ** 2)
+                for ends, middle in (((top, below), crumb.row), ((left, right), crumb.col))
+            )
+            image[top:below, left:right] += crumb.depth * down[:, None] * across
+        return image
+
+    def label(self, shot: Shot) -> Label | None:
+        boxes = [crumb.box(shot.detector.shape) for crumb in self.crumbs(shot)] if shot.beam and shot.sample else []
+        if not boxes:
+            return None
+        tops, belows, lefts, rights = zip(*boxes, strict=True)
+        return Label(self.name, (min(tops), max(belows), min(lefts), max(rights)))
+
+    def crumbs(self, shot: Shot) -> Iterator[Crumb]:
+        """Those that the frame shows."""
+        loose = self.motion == "loose"
+        if not (loose or within(self.views, shot)):
+            return
+        rng = np.random.default_rng(self.seed)
+        detector = shot.detector
+        for _ in range(self.count):
+            distance, size, height = (rng.uniform(*ends) for ends in (self.distance, self.size, self.heights))
+            depth, at, passing = self.depth * rng.uniform(0.5, 1.0), rng.uniform(0, 2 * math.pi), rng.uniform()
+            u, b = distance * math.cos(shot.angle - at), -distance * math.sin(shot.angle - at)
+            if loose:
+                first, after = self.views or (0, 0)
+                u = math.copysign(self.speed, math.cos(at)) * (shot.view - first - passing * (after - first))
+                b = 0.0 if abs(u) <= distance else math.inf
+            if b == math.inf or detector.sod + b <= 0:
+                continue
+            nearer = 1.0 if math.isinf(detector.sod) else detector.sod / (detector.sod + b)
+            crumb = Crumb(
+                row=detector.axis_row + height * nearer / detector.pitch,
+                col=detector.axis_col + u * nearer / detector.pitch,
+                sigma=size * nearer / detector.pitch,
+                depth=depth,
+            )
+            top, below, left, right = crumb.box(detector.shape)
+            if top < below and left < right:
+                yield crumb

@@ -1,0 +1,74 @@
+"""Ghost: something like fog crosses the frame from right to left in a few views and changes the light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.chain import Label
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+SEEN = 1e-3
+"""Share of the light from which on a change counts as seen."""
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """A smooth hump cos² of the light, as high as the frame. It is gone when the next flat is taken.
+
+    An early data set of a battery has it: "fog" that crosses the frame in a few views, with intensities that no other
+    view has; what it was in the beam is not recorded. It may brighten (light scattered into the detector) or darken.
+
+    Attributes:
+        view: the first in which it is seen, at the right edge.
+        width: mm of the hump at half its height; it ends `width` from its middle.
+        speed: mm by which it has moved on to the left in the next view.
+        gain: light that is added in its middle, as a share of the light that is there; negative where it is taken away.
+    """
+
+    view: int
+    width: float
+    speed: float
+    gain: float = 0.3
+
+    name: ClassVar[str] = "ghost"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.view >= 0 and self.width > 0 and self.speed > 0):
+            raise ValueError(
+                f"view must be >= 0, and width (mm) and speed (mm a view) positive, got {self.view}, {self.width} and "
+                f"{self.speed}"
+            )
+        if self.gain == 0 or not self.gain >= -1:
+            raise ValueError(f"gain must be >= -1 and not 0, got {self.gain}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        first, change = self._change(shot)
+        image[:, first : first + change.size] *= 1 + change
+        return image
+
+    def label(self, shot: Shot) -> Label | None:
+        first, change = self._change(shot)
+        seen = np.flatnonzero(np.abs(change) >= SEEN)
+        if not shot.beam or not seen.size:
+            return None
+        return Label(self.name, (0, shot.detector.shape[0], first + int(seen[0]), first + int(seen[-1]) + 1))
+
+    def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
+        """The first column that the hump covers, and by what share it changes the light there and further right."""
+        cols, pitch = shot.detector.shape[1], shot.detector.pitch
+        if not shot.sample or shot.view < self.view:
+            return 0, np.zeros(0)
+        # The middle, in columns: half a step after the hump's left end has touched the frame's right edge.
+        middle = cols - 0.5 + (self.width - self.speed * (shot.view - self.view + 0.5)) / pitch
+        reach = self.width / pitch
+        first = max(0, math.ceil(middle - reach))
+        away = (np.arange(first, min(cols, math.floor(middle + reach) + 1)) - middle) / reach
+        return first, self.gain * np.cos(0.5 * np.pi * away) ** 2

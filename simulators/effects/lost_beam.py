@@ -1,0 +1,57 @@
+"""Lost beam: for a while there is no light, or less of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from simulators.effects.chain import Label
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+from simulators.effects.views import Views, check, within
+
+
+@dataclass(frozen=True)
+class LostBeam:
+    """The beam is off for a stretch of views, or of time; a frame that is exposed partly in it loses its part.
+
+    Attributes:
+        views: [first, one after the last]; flats taken just before one of them lose their light too.
+        seconds: [from, to] since the camera was connected.
+        share: of the light that is left.
+    """
+
+    views: Views | None = None
+    seconds: tuple[float, float] | None = None
+    share: float = 0.0
+
+    name: ClassVar[str] = "lost_beam"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check(self.views)
+        if (self.views is None) == (self.seconds is None):
+            raise ValueError("a lost beam needs either views or seconds, and not both")
+        if self.seconds is not None and not self.seconds[0] < self.seconds[1]:
+            raise ValueError(f"seconds must be [from, to] with from < to, got {list(self.seconds)}")
+        if not 0 <= self.share < 1:
+            raise ValueError(f"share must lie in 0 ... 1 (excluded), got {self.share}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        lost = self._lost(shot)
+        if lost > 0:
+            image *= 1 - lost
+        return image
+
+    def label(self, shot: Shot) -> Label | None:
+        rows, cols = shot.detector.shape
+        return Label(self.name, (0, rows, 0, cols)) if shot.beam and self._lost(shot) > 0 else None
+
+    def _lost(self, shot: Shot) -> float:
+        """Share of the frame's light that is lost."""
+        if self.seconds is None:
+            return 1 - self.share if within(self.views, shot) else 0.0
+        begin, end = self.seconds
+        off = min(end, shot.elapsed + shot.exposure) - max(begin, shot.elapsed)
+        return (1 - self.share) * max(off, 0.0) / shot.exposure

@@ -1,0 +1,81 @@
+"""Narrow field: the beam is narrower than the sample, and what stands beside it gets no light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.chain import Label
+from simulators.effects.domain import Domain
+from simulators.effects.penumbra import lit
+from simulators.effects.shot import Image, Shot
+
+
+@dataclass(frozen=True)
+class NarrowField:
+    """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
+
+    Flats are as narrow. The label goes around all that is not fully lit: the whole frame where both sides are cut.
+
+    Attributes:
+        width: mm of the rectangle across the beam, between the places where half of the light is there.
+        height: mm up and down; the whole frame where not given.
+        centre: mm of its middle, (across, down the rows) from where the rotation axis is seen and z = 0.
+        penumbra: mm over which the light goes from none to all.
+    """
+
+    width: float
+    height: float | None = None
+    centre: tuple[float, float] = (0.0, 0.0)
+    penumbra: float = 0.0
+
+    name: ClassVar[str] = "narrow_field"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0 and (self.height is None or self.height > 0) and self.penumbra >= 0):
+            raise ValueError(
+                f"width and height must be positive and penumbra >= 0 in mm, got {self.width}, {self.height} and "
+                f"{self.penumbra}"
+            )
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        down, across = self._light(shot)
+        first, last = _lit_fully(across)
+        image[:, :first] *= across[:first]
+        image[:, last:] *= across[last:]
+        first, last = _lit_fully(down)
+        image[:first] *= down[:first, None]
+        image[last:] *= down[last:, None]
+        return image
+
+    def label(self, shot: Shot) -> Label | None:
+        down, across = self._light(shot)
+        rows, cols = np.flatnonzero(down < 1), np.flatnonzero(across < 1)
+        if not shot.beam or not (rows.size or cols.size):
+            return None
+        height, width = shot.detector.shape
+        top, below = (0, height) if cols.size else (int(rows[0]), int(rows[-1]) + 1)
+        left, right = (0, width) if rows.size else (int(cols[0]), int(cols[-1]) + 1)
+        return Label(self.name, (top, below, left, right))
+
+    def _light(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Shares of the light in each row and in each column; a pixel has their product."""
+        detector = shot.detector
+        across = self._between(detector.u() - self.centre[0], self.width)
+        if self.height is None:
+            return np.ones(detector.shape[0]), across
+        return self._between(detector.v() - self.centre[1], self.height), across
+
+    def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+        return lit(width / 2 - place, self.penumbra) * lit(width / 2 + place, self.penumbra)
+
+
+def _lit_fully(light: NDArray[np.float64]) -> tuple[int, int]:
+    """First pixel with all the light, and the one after the last; the light falls off to both sides."""
+    full = np.flatnonzero(light >= 1)
+    return (int(full[0]), int(full[-1]) + 1) if full.size else (light.size, light.size)

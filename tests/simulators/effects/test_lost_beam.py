@@ -1,0 +1,49 @@
+"""Lost beam: no light for a while, by views or by the clock."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simulators.effects.lost_beam import LostBeam
+from tests.simulators import anomalies, shots
+
+
+@pytest.mark.parametrize("view", range(8))
+def test_its_views_lose_their_light(view: int) -> None:
+    lost = {"kind": "lost_beam", "views": [3, 6], "share": 0.02}
+    for sample in (True, False):
+        shot = shots.shot(view=view, sample=sample)
+        assert anomalies.check_region(lost, shot, loose=0) == (3 <= view < 6)
+        np.testing.assert_allclose(anomalies.change(lost, shot), -0.98 if 3 <= view < 6 else 0.0, atol=2e-4)
+    assert anomalies.label(lost, shots.shot(view=view, beam=False)) is None
+
+
+@given(begin=st.floats(49.9, 50.1), lasts=st.floats(1e-4, 0.1))
+def test_by_the_clock_a_frame_loses_the_part_of_its_exposure(begin: float, lasts: float) -> None:
+    """A frame is exposed from 50 s to 50.01 s; counted on a fine grid of its moments."""
+    effect = LostBeam(seconds=(begin, begin + lasts), share=0.2)
+    moments = 50.0 + 0.01 * (np.arange(20_000) + 0.5) / 20_000
+    off = np.mean((moments >= begin) & (moments < begin + lasts))
+    image = effect.apply(np.ones((60, 80)), shots.shot())
+    np.testing.assert_allclose(image, 1 - 0.8 * off, atol=2e-4)
+    assert (effect.label(shots.shot()) is None) == bool((image == 1).all())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({}, "either views or seconds, and not both"),
+        ({"views": (0, 1), "seconds": (0.0, 1.0)}, "either views or seconds, and not both"),
+        ({"views": (3, 1)}, "views must be"),
+        ({"seconds": (1.0, 1.0)}, r"seconds must be \[from, to\] with from < to, got \[1.0, 1.0\]"),
+        ({"views": (0, 1), "share": 1.0}, r"share must lie in 0 \.\.\. 1"),
+    ],
+)
+def test_wrong_parameters_are_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        LostBeam(**wrong)

@@ -1,0 +1,57 @@
+"""Narrow field: a rectangle of light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simulators.detector import Detector
+from simulators.effects.narrow_field import NarrowField
+from tests.simulators import anomalies, shots
+
+
+def test_the_light_is_a_rectangle_with_soft_edges() -> None:
+    field = {"kind": "narrow_field", "width": 0.4, "height": 0.3, "centre": [0.1, -0.05], "penumbra": 0.06}
+    light = 1 + anomalies.change(field, shots.shot(sample=False))
+
+    def share(place: np.ndarray, middle: float, width: float) -> np.ndarray:
+        return np.interp(np.abs(place - middle), [width / 2 - 0.03, width / 2 + 0.03], [1.0, 0.0])
+
+    detector = shots.shot().detector
+    expected = share(detector.v(), -0.05, 0.3)[:, None] * share(detector.u(), 0.1, 0.4)
+    np.testing.assert_allclose(light, expected, atol=2e-4)
+
+
+def test_it_is_the_same_on_both_sides_of_the_axis_wherever_that_is() -> None:
+    shot = shots.shot(sample=False, detector=Detector((60, 80), 0.01, 30.0, 29.5))
+    light = 1 + anomalies.change({"kind": "narrow_field", "width": 0.35, "penumbra": 0.05}, shot)
+    np.testing.assert_array_equal(light[:, :61], light[:, 60::-1])
+    assert light[5].sum() == pytest.approx(35, abs=0.01)  # all light of 0.35 mm, in pixels of 0.01 mm
+
+
+@given(
+    width=st.floats(0.01, 1.2),
+    height=st.none() | st.floats(0.01, 1.0),
+    across=st.floats(-0.3, 0.3),
+    penumbra=st.floats(0.0, 0.3),
+)
+def test_the_region_goes_around_all_that_is_not_fully_lit(
+    width: float, height: float | None, across: float, penumbra: float
+) -> None:
+    field = {"kind": "narrow_field", "width": width, "height": height, "centre": [across, 0.0], "penumbra": penumbra}
+    anomalies.check_region(field, shots.shot(sample=False))
+
+
+def test_projections_are_as_narrow_and_darks_show_nothing() -> None:
+    field = {"kind": "narrow_field", "width": 0.3}
+    assert anomalies.check_region(field, shots.shot())
+    assert anomalies.label(field, shots.shot(beam=False)) is None
+    assert anomalies.label({"kind": "narrow_field", "width": 2.0}, shots.shot()) is None
+
+
+@pytest.mark.parametrize("wrong", [{"width": 0.0}, {"width": 0.1, "height": 0.0}, {"width": 0.1, "penumbra": -1.0}])
+def test_wrong_parameters_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="width and height must be positive and penumbra >= 0 in mm"):
+        NarrowField(**wrong)  # type: ignore[arg-type]
