@@ -18,6 +18,7 @@ from drivers.protocols import RotationStage
 from drivers.stages.pi_gcs import PiGcsStage
 from drivers.stages.pm16c import PM16CStage
 from drivers.stages.zaber import ZaberStage
+from simulators.clock import ScaledClock
 from simulators.serial_url import register
 from simulators.transports import serve_pty, serve_tcp
 from simulators.trigger_line import TriggerLine
@@ -44,6 +45,9 @@ needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no p
 PLUGS = [pytest.param(serve_pty, marks=needs_pty, id="pty"), pytest.param(serve_tcp, id="tcp")]
 """Those that can be pulled out."""
 TRANSPORTS = [pytest.param(serve_sim, id="sim"), *PLUGS]
+SPEEDS: dict[Serve, float] = {serve_sim: 8.0, serve_pty: 2.0, serve_tcp: 1.0}
+"""Seconds of the clock of controller and driver in one real second. In one thread nothing can be late, so that sim://
+may be fast; a terminal is as real at twice the speed, with twice the timeout."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,9 @@ class Kind:
 
 
 GARBAGE = (b"\xff\xfe\x00\x80 noise \r\n", b"\r\n\r\n\r\n", b"x" * 3000)
-QUICK = {"max_speed": FAST, "acceleration": math.radians(2000), "timeout": 0.25}
+QUICK = {"max_speed": FAST, "acceleration": math.radians(2000)}
+PATIENCE = 0.25
+"""s of real time for a reply."""
 
 
 def _pm16c(clock: Clock, line: TriggerLine, **faults: Any) -> PM16CController:
@@ -152,11 +158,12 @@ class Real:
         *,
         unreferenced: bool = False,
     ) -> None:
-        clock = SystemClock()
+        clock = ScaledClock(SystemClock(), SPEEDS[serve])
         line = TriggerLine(clock)
         self.kind = kind
         self.wire = Disturbed(kind.wire(clock, line, **(kind.unreferenced if unreferenced else {})))
         self.unplug = plugged.close
         url = plugged.enter_context(serve(self.wire))
-        self.stage = kind.stage(url, clock=SystemClock(), **(kind.usual | (settings or {})))
+        timeout = PATIENCE * SPEEDS[serve] if serve is not serve_sim else PATIENCE
+        self.stage = kind.stage(url, clock=clock, **(kind.usual | {"timeout": timeout} | (settings or {})))
         self.bench = StageBench(self.stage, clock, line)
