@@ -164,6 +164,9 @@ def _locate(data: Any, folder: Path) -> None:
             simulation["scene"] = found.relative_to(shipped).as_posix()
         elif found.is_file():  # else it is taken for one of those that come with the package
             simulation["scene"] = str(found)
+    for key in ("file", "labels"):  # of a volume in a scene that stands in the configuration itself
+        if (phantom := _group(data, "simulation", "scene", "phantom", key)) is not None:
+            phantom[key] = str((folder / phantom[key]).resolve())
 
 
 def _group(data: Any, *path: str) -> dict[str, Any] | None:

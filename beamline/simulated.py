@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config import Config, scene_mapping
+from beamline.config import Config, config_folder, scene_mapping
 from beamline.config_devices import StageOutputShutter
 from beamline.config_models import Simulation, Speed
 from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
@@ -119,12 +119,16 @@ def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, C
 
 
 def scene_of(config: Config) -> Scene:
-    """The simulated scene. Raises ConfigError: it is wrong."""
+    """The simulated scene. Raises ConfigError: it is wrong; DataError: a volume that it names cannot be read."""
+    from beamline.simulate.scene_file import volumes_beside
     from simulators.mapping import SceneError
     from simulators.scene import load_scene
 
+    said = config.simulation.scene if config.simulation else {}
+    # Paths in a scene that stands in the configuration itself are full ones by now.
+    folder = config_folder() if isinstance(said, dict) else (config_folder() / said).parent
     try:
-        return load_scene(scene_mapping(config))
+        return load_scene(scene_mapping(config), volumes_beside(folder))
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
 

@@ -8,21 +8,25 @@ from typing import Any
 from simulators.beam import Beam
 from simulators.mapping import SceneError, build, choose, items, keys, named
 from simulators.sample import Sample
+from simulators.stored import ReadVolume
 
 Builder = Callable[[str, Mapping[str, Any], Beam], Sample]
 
 
-def build_sample(where: str, entry: Any, beam: Beam) -> Sample:
+def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = None) -> Sample:
     """The sample of a scene.
 
     Args:
         where: path of the entry, for messages.
         beam: what decides how materials attenuate.
+        read: reads a volume that the sample names; None: none can be named.
 
     Raises:
         SceneError: an unknown kind, a wrong value, or a sample that cannot be built.
     """
-    kind, rest = named(where, list(_BUILDERS), entry)
+    kind, rest = named(where, [*_BUILDERS, "volume"], entry)
+    if kind == "volume":
+        return _volume(f"{where} ({kind})", rest, read)
     return _BUILDERS[kind](f"{where} ({kind})", rest, beam)
 
 
@@ -43,6 +47,18 @@ def _solids(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
 
     mapping = keys(where, mapping, legal=("solids",), needed=("solids",))
     return Phantom.of([choose(f"{where}.solids[{i}]", SOLIDS, entry) for i, entry in items(where, "solids", mapping)])
+
+
+def _volume(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Sample:
+    from simulators.voxel_scene import VolumeSettings, voxels_of
+
+    settings = build(VolumeSettings, where, mapping)
+    if read is None:
+        raise SceneError(f"{where}: {settings.file} cannot be read: whoever opened the scene reads no volumes")
+    try:
+        return voxels_of(settings, read)
+    except ValueError as error:
+        raise SceneError(f"{where}: {error}") from None
 
 
 _BUILDERS: Mapping[str, Builder] = {"battery": _battery, "solids": _solids}

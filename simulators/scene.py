@@ -24,6 +24,7 @@ from simulators.mapping import SceneError, build, items, keys, named, number
 from simulators.phantoms import build_sample
 from simulators.sample import Sample
 from simulators.shooting import DetectorSettings, ScanSettings
+from simulators.stored import ReadVolume
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +47,11 @@ class Scene:
     scan: ScanSettings = field(default_factory=ScanSettings)
 
 
-def load_scene(mapping: Mapping[str, Any]) -> Scene:
+def load_scene(mapping: Mapping[str, Any], read: ReadVolume | None = None) -> Scene:
     """A scene from a mapping as YAML gives it; the keys are shown at the head of this module.
+
+    Args:
+        read: reads the files of volumes that the scene names; None: none can be named.
 
     Raises:
         SceneError: an unknown or missing key, a wrong value, or effects in an order that physics does not allow.
@@ -65,7 +69,7 @@ def load_scene(mapping: Mapping[str, Any]) -> Scene:
     except ValueError as error:
         raise SceneError(f"scene.effects: {error}") from None
     return Scene(
-        sample=build_sample("scene.phantom", mapping["phantom"], beam),
+        sample=build_sample("scene.phantom", mapping["phantom"], beam, read),
         beam=beam,
         chain=chain,
         axis_offset_px=number("scene.axis_offset_px", mapping.get("axis_offset_px", 0.0)),

@@ -8,8 +8,10 @@ from pathlib import Path
 from beamline.config import config_folder
 from beamline.config_text import read
 from beamline.errors import ConfigError
+from beamline.storage.volume_file import read_volume
 from simulators.mapping import SceneError
 from simulators.scene import Scene, load_scene
+from simulators.stored import ReadVolume, Stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,7 @@ def open_scene(name: str) -> SceneFile:
 
     Raises:
         ConfigError: there is no such scene, or it is wrong.
+        DataError: a volume that it names cannot be read.
     """
     shipped = shipped_scenes()
     path = Path(name)
@@ -49,6 +52,15 @@ def open_scene(name: str) -> SceneFile:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read ({error}). Nothing was simulated.") from error
     try:
-        return SceneFile(load_scene(read(text, str(path)).data), path, text)
+        return SceneFile(load_scene(read(text, str(path)).data, volumes_beside(path.parent)), path, text)
     except SceneError as error:
         raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
+
+
+def volumes_beside(folder: Path) -> ReadVolume:
+    """Reads the volumes that a scene in `folder` names: by full paths, or by paths from there. It raises DataError."""
+
+    def read_beside(file: str, dataset: str | None) -> Stored:
+        return Stored(*read_volume(folder / file, dataset))  # a full path stays itself
+
+    return read_beside

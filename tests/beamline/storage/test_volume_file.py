@@ -1,0 +1,140 @@
+"""Volume files: what is written by other hands is read as it is, and what is no volume is refused by name."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.errors import DataError
+from beamline.storage.volume_file import read_volume
+
+VALUES = np.arange(24, dtype=np.int16).reshape(2, 3, 4) - 5
+
+
+def nifti(values: np.ndarray = VALUES, order: str = "<", **changed: object) -> bytes:
+    """A NIfTI-1 file by hand, field after field as the standard's table lists them; `changed` by name."""
+    codes = {"u1": (2, 8), "i2": (4, 16), "i4": (8, 32), "f4": (16, 32), "f8": (64, 64), "u2": (512, 16)}
+    code, bits = codes[values.dtype.str[1:]]
+    field: dict[str, object] = {
+        "size": 348,
+        "dim": (3, *values.shape[::-1], 1, 1, 1, 1),
+        "datatype": code,
+        "bitpix": bits,
+        "pixdim": (1.0, 0.5, 0.6, 0.7, 0.0, 0.0, 0.0, 0.0),
+        "offset": 352.0,
+        "slope": 0.0,
+        "intercept": 0.0,
+        "units": 2,
+        "magic": b"n+1\0",
+    } | changed
+    header = struct.pack(
+        f"{order}i35xB8h3fh2h h8f3fhBB4f2i80s24s2h6f12f16s4s",
+        field["size"], 0, *field["dim"], 0.0, 0.0, 0.0, 0, field["datatype"], field["bitpix"], 0, *field["pixdim"],
+        field["offset"], field["slope"], field["intercept"], 0, 0, field["units"], 0.0, 0.0, 0.0, 0.0, 0, 0,
+        b"", b"", 0, 0, *[0.0] * 6, *[0.0] * 12, b"", field["magic"],
+    )  # fmt: skip
+    assert len(header) == 348
+    return header + b"\0" * 4 + values.astype(values.dtype.newbyteorder(order)).tobytes()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("dtype", ["u1", "i2", "i4", "f4", "f8", "u2"])
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_nifti_is_read_whatever_its_type_and_byte_order(tmp_path: Path, order: str, dtype: str, suffix: str) -> None:
+    values = np.arange(24).reshape(2, 3, 4).astype(dtype)
+    path = tmp_path / f"v{suffix}"
+    path.write_bytes(gzip.compress(nifti(values, order)) if suffix == ".nii.gz" else nifti(values, order))
+    read, spacing = read_volume(path)
+    np.testing.assert_array_equal(read, values)
+    assert read.dtype == values.dtype and read.dtype.isnative
+    assert spacing == pytest.approx((0.7, 0.6, 0.5))
+
+
+def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> None:
+    path = tmp_path / "v.nii"
+    path.write_bytes(nifti(slope=2.0, intercept=-1000.0, units=3, offset=352.0))
+    read, spacing = read_volume(path)
+    np.testing.assert_array_equal(read, VALUES * 2.0 - 1000)
+    assert spacing == pytest.approx((0.7e-3, 0.6e-3, 0.5e-3))
+    path.write_bytes(nifti(units=1, pixdim=(1, -2, 3, 4, 0, 0, 0, 0)))  # a negative step says how the patient lies
+    assert read_volume(path)[1] == pytest.approx((4e3, 3e3, 2e3))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (nifti()[:-1], "ends after 47 of the 48 bytes"),
+        (nifti()[:100], "no single-file NIfTI-1"),
+        (nifti(magic=b"ni1\0"), "no single-file NIfTI-1"),
+        (nifti(size=540), "no single-file NIfTI-1"),
+        (nifti(datatype=128, bitpix=24), "type 128 with 24 bits"),
+        (nifti(bitpix=8), "type 4 with 8 bits"),
+        (nifti(dim=(2, 4, 3, 2, 1, 1, 1, 1)), "a volume has three"),
+        (nifti(dim=(4, 4, 3, 2, 5, 1, 1, 1)), "a volume has three"),
+        (nifti(dim=(3, 4, -3, 2, 1, 1, 1, 1)), "a volume has three"),
+        (nifti(pixdim=(1, 0, 1, 1, 0, 0, 0, 0)), "header is damaged"),
+        (nifti(offset=float("nan")), "header is damaged"),
+        (nifti(offset=3.0), "header is damaged"),
+        (nifti(units=5), "unit 5"),
+        (b"", "no single-file NIfTI-1"),
+    ],
+)
+def test_a_damaged_nifti_is_refused(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "v.nii"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=said):
+        read_volume(path)
+
+
+def test_a_nifti_that_is_not_compressed_is_no_gz(tmp_path: Path) -> None:
+    path = tmp_path / "v.nii.gz"
+    path.write_bytes(nifti())
+    with pytest.raises(DataError, match="cannot be read as NIfTI"):
+        read_volume(path)
+    path.write_bytes(gzip.compress(nifti())[:-20])
+    with pytest.raises(DataError, match=r"cannot be read as NIfTI|ends after"):
+        read_volume(path)
+
+
+def test_the_thorax_is_read(shared_data: Path) -> None:
+    values, spacing = read_volume(shared_data / "totalseg_thorax_ct_191x167x233.nii.gz")
+    assert sorted(values.shape) == [167, 191, 233]
+    assert spacing == pytest.approx((1.5,) * 3)
+    assert values.min() < -900 and 1000 < values.max() < 4000  # HU: air and bone
+
+
+def test_arrays_tiffs_and_hdf5_are_read(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", VALUES)
+    np.savez(tmp_path / "v.npz", volume=VALUES, voxel_mm=np.float32(0.25), title="a walnut")
+    np.savez(tmp_path / "two.npz", a=VALUES, b=VALUES + 1)
+    tifffile.imwrite(tmp_path / "v.tif", VALUES, photometric="minisblack")
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file["entry/data/data"], file["entry/theta"] = VALUES, np.zeros(3)
+    for name, spacing in (("v.npy", None), ("v.npz", (0.25,) * 3), ("v.tif", None), ("v.h5", None)):
+        read, found = read_volume(tmp_path / name)
+        np.testing.assert_array_equal(read, VALUES)
+        assert found == spacing
+    np.testing.assert_array_equal(read_volume(tmp_path / "two.npz", "b")[0], VALUES + 1)
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.h5", "entry/data/data")[0], VALUES)
+    for name, dataset, said in (
+        ("two.npz", None, r"holds 2 volumes \(a, b\)"),
+        ("two.npz", "c", "has no array 'c'"),
+        ("v.h5", "entry/data", "has no dataset 'entry/data'"),
+        ("v.npy", "volume", "holds one volume"),
+        ("none.npy", None, "There is no volume"),
+    ):
+        with pytest.raises(DataError, match=said):
+            read_volume(tmp_path / name, dataset)
+
+
+@pytest.mark.parametrize("name", ["v.tif", "v.npy", "v.npz", "v.h5", "v.jpg"])
+def test_what_is_no_volume_file_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"no volume at all, but some text that is long enough for a header")
+    with pytest.raises(DataError, match=r"cannot be read|not a readable|no volume file|HDF5"):
+        read_volume(tmp_path / name)
