@@ -1,24 +1,60 @@
-"""Beam: the light that meets the sample, and where it comes from."""
+"""Beam: the light that meets the sample, where it comes from and which energies it has."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tube:
+    """An X-ray tube: the bremsstrahlung of a thick target, (kv - E) / E photons an energy interval at E (Kramers, Phil.
+    Mag. 46, 836, 1923), behind filters. It has no characteristic lines: a table of [keV, weight] has what it holds.
+
+    Attributes:
+        kv: the voltage, and the highest energy in keV.
+        filters: mm of each material in the beam; {Al: 1.0, Cu: 0.1}.
+    """
+
+    kv: float
+    filters: Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not 5 <= self.kv <= 800:
+            raise ValueError(f"kv must lie in 5 ... 800, got {self.kv}")
+        if bad := {name: mm for name, mm in (self.filters or {}).items() if not mm >= 0}:
+            raise ValueError(f"filters are mm >= 0 of a material, got {bad}")
 
 
 @dataclass(frozen=True)
 class Beam:
     """A parallel beam, or a cone where the distances are given.
 
+    Its energies matter to materials only: a grey solid attenuates all of them alike. Weights are shares of the photons
+    that are detected where nothing stands in the way, so that `photons_per_s` means the same for any light. A detector
+    that sees energies unlike is part of the table's weights.
+
     Attributes:
         photons_per_s: detected a second by each (unbinned) sensor pixel where nothing stands in the way.
         sod: mm from the source to the rotation axis; None for a parallel beam.
         sdd: mm from the source to the detector.
+        energy_kev: of a monochromatic beam; of its middle, where there is a bandwidth.
+        bandwidth: full width at half maximum over energy of a Gaussian line: 1e-4 behind Si 111, 0.01 to 0.05 for pink
+            beams. None: none.
+        harmonics: shares of the light at multiples of the energy: {3: 0.01}. None: none.
+        spectrum: [keV, weight] pairs of any sum, instead of energy_kev.
+        tube: instead of energy_kev.
     """
 
     photons_per_s: float
     sod: float | None = None
     sdd: float | None = None
+    energy_kev: float | None = None
+    bandwidth: float | None = None
+    harmonics: Mapping[int, float] | None = None
+    spectrum: tuple[tuple[float, float], ...] | None = None
+    tube: Tube | None = None
 
     def __post_init__(self) -> None:
         if not self.photons_per_s >= 0:
@@ -27,8 +63,31 @@ class Beam:
             raise ValueError("a cone needs both sod and sdd in mm; a parallel beam neither")
         if self.sod is not None and self.sdd is not None and not self.sdd >= self.sod > 0:
             raise ValueError(f"sod must be positive and sdd no less, got {self.sod} and {self.sdd} mm")
+        said = [name for name in ("energy_kev", "spectrum", "tube") if getattr(self, name) is not None]
+        if len(said) > 1:
+            raise ValueError(f"{' and '.join(said)} are different lights; name one of them")
+        for name in ("bandwidth", "harmonics"):
+            if getattr(self, name) is not None and self.energy_kev is None:
+                raise ValueError(f"{name} belongs to an energy_kev, which is missing")
+        if self.energy_kev is not None and not 0 < self.energy_kev < math.inf:
+            raise ValueError(f"energy_kev must be positive, got {self.energy_kev}")
+        if self.bandwidth is not None and not 0 < self.bandwidth <= 0.2:
+            raise ValueError(f"bandwidth is a share of the energy above 0 and up to 0.2, got {self.bandwidth}")
+        shares = self.harmonics or {}
+        if any(n < 2 or not share >= 0 for n, share in shares.items()) or sum(shares.values()) >= 1:
+            raise ValueError(f"harmonics are shares >= 0 at multiples >= 2, below 1 in sum, got {dict(shares)}")
+        if self.spectrum is not None and not (
+            all(energy > 0 and weight >= 0 for energy, weight in self.spectrum)
+            and sum(weight for _, weight in self.spectrum) > 0
+        ):
+            raise ValueError(f"spectrum is a list of [keV > 0, weight >= 0], not all 0, got {self.spectrum}")
 
     @property
     def source_distance(self) -> float:
         """mm from the source to the rotation axis; infinite for a parallel beam."""
         return math.inf if self.sod is None else self.sod
+
+    @property
+    def has_energy(self) -> bool:
+        """Whether it says which energies it has, as materials ask."""
+        return any(light is not None for light in (self.energy_kev, self.spectrum, self.tube))

@@ -94,7 +94,7 @@ def _value(where: str, kind: Any, value: Any) -> Any:
         return _values(where, choices, value)
     if origin is Mapping:
         return _entries(where, choices, value)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         return build(kind, where, value)
     if kind is bool or kind is str:
         if not isinstance(value, kind):

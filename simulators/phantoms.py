@@ -42,11 +42,23 @@ def _battery(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
 
 
 def _solids(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    from simulators.phantom import Phantom
-    from simulators.solids import SOLIDS
+    """Solids, each grey (`attenuation` in 1/mm) or of a `material`, and then perhaps `instead_of` another."""
+    mapping = keys(where, mapping, legal=("solids", "materials"), needed=("solids",))
+    entries = [(f"{where}.solids[{i}]", entry) for i, entry in items(where, "solids", mapping)]
+    said = {key for _, entry in entries if isinstance(entry, Mapping) for key in entry}
+    if "materials" in mapping or said & {"material", "instead_of"}:
+        from simulators.made_of import sample_made_of
 
-    mapping = keys(where, mapping, legal=("solids",), needed=("solids",))
-    return Phantom.of([choose(f"{where}.solids[{i}]", SOLIDS, entry) for i, entry in items(where, "solids", mapping)])
+        return sample_made_of(where, entries, mapping.get("materials"), beam)
+    from simulators.phantom import Phantom
+    from simulators.solids import SOLIDS, kind_of
+
+    solids, names = [], []
+    for at, entry in entries:
+        own = {"name": str(entry["name"])} if isinstance(entry, Mapping) and "name" in entry else {}
+        solids.append(choose(at, SOLIDS, {key: entry[key] for key in entry if key != "name"} if own else entry))
+        names.append(own.get("name", kind_of(solids[-1])))
+    return Phantom.of(solids, names)
 
 
 def _volume(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Sample:

@@ -107,7 +107,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s, sod, sdd"),
         (_with(beam={"photons_per_s": -1}), "scene.beam: photons_per_s must be >= 0, got -1.0"),
         (_with(beam={"photons_per_s": "many"}), "scene.beam.photons_per_s must be a finite number, got 'many'"),
-        (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd; got 5"),
+        (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd, energy_kev"),
         (_with(axis_offset_px=True), "scene.axis_offset_px must be a finite number, got True"),
         (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
         (_with(phantom={"kind": "battery"}), "scene.phantom (battery): key 'field_of_view' is missing"),

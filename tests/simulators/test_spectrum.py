@@ -1,0 +1,138 @@
+"""Spectrum: beam hardening in closed form, quadratures against fine sums, and no more energies than are needed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import ArrayLike, NDArray
+
+from simulators.beam import Beam, Tube
+from simulators.spectrum import Attenuation, Spectrum, effective_depth, light
+
+Reals = NDArray[np.float64]
+
+
+def _smooth(energies: ArrayLike) -> Reals:
+    """A photoelectric-like material: 2/mm at 10 keV."""
+    return 2.0 * (np.asarray(energies) / 10.0) ** -3.0
+
+
+def _step(energies: ArrayLike) -> Reals:
+    return np.where(np.asarray(energies) < 10.0, 1.0, 6.0)
+
+
+def _no_filters(name: str) -> Attenuation:
+    raise AssertionError(f"nobody named {name}")
+
+
+def _light(beam: Beam, *materials: Attenuation, thickness: float = 1.0) -> Spectrum:
+    return light(beam, materials or (_smooth,), thickness, _no_filters)
+
+
+def test_a_slab_in_two_energies_is_the_closed_form() -> None:
+    """-log(w exp(-a t) + (1-w) exp(-b t)): slope w a + (1-w) b where it is thin, and the harder of both in the end."""
+    spectrum = Spectrum.of([20.0, 30.0], [3.0, 1.0])
+    mu = np.array([[4.0], [1.0]])
+    t = np.geomspace(1e-6, 1e3, 50).reshape(1, 5, 10)
+    got = effective_depth(t, mu, spectrum.weights)
+    expected = -np.logaddexp(np.log(0.75) - 4 * t[0], np.log(0.25) - t[0])
+    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-15)
+    assert got[0, 0] / t[0, 0, 0] == pytest.approx(0.75 * 4 + 0.25 * 1, rel=1e-5)
+    assert got[-1, -1] - 1.0 * t[0, -1, -1] == pytest.approx(-math.log(0.25))
+
+
+@given(
+    thickness=arrays(np.float64, (2, 3, 4), elements=st.floats(0, 50)),
+    mu=arrays(np.float64, (3, 2), elements=st.floats(-0.5, 60)),
+    weights=arrays(np.float64, 3, elements=st.floats(0.01, 1)),
+)
+def test_the_effective_depth_lies_between_the_least_and_the_mean(thickness: Reals, mu: Reals, weights: Reals) -> None:
+    """Jensen: light that is added up never looks deeper than the mean depth; matter of one attenuation is exact."""
+    weights = weights / weights.sum()
+    depths = np.tensordot(mu, thickness, 1)
+    got = effective_depth(thickness, mu, weights)
+    slack = 1e-9 * (1 + np.abs(depths).max())
+    assert (got <= np.tensordot(weights, depths, 1) + slack).all()
+    assert (got >= depths.min(axis=0) - slack).all()
+    same = effective_depth(thickness, np.repeat(mu[:1], 3, axis=0), weights)
+    np.testing.assert_allclose(same, depths[0], atol=slack)
+
+
+def test_air_is_exactly_nothing_and_no_matter_is_too_deep() -> None:
+    thickness = np.zeros((1, 2, 2))
+    thickness[0, 1] = 1e6
+    depth = effective_depth(thickness, np.array([[5.0], [4.0]]), np.array([0.3, 0.7]))
+    assert (depth[0] == 0).all() and np.isfinite(depth[1]).all()
+
+
+def test_many_rows_are_shared_out_and_come_out_the_same() -> None:
+    thickness = np.random.default_rng(0).uniform(0, 2, (2, 300, 301))  # more than threads are taken for
+    mu, weights = np.array([[3.0, 1.0], [1.0, 2.0]]), np.array([0.4, 0.6])
+    expected = -np.log(np.tensordot(weights, np.exp(-np.tensordot(mu, thickness, 1)), 1))
+    np.testing.assert_allclose(effective_depth(thickness, mu, weights), expected, rtol=1e-12)
+
+
+def test_one_energy_is_one_energy() -> None:
+    spectrum = _light(Beam(1.0, energy_kev=8.3485))
+    assert (spectrum.energies.tolist(), spectrum.weights.tolist()) == ([8.3485], [1.0])
+    assert spectrum.mean(_smooth) == _smooth(8.3485)
+
+
+def test_harmonics_take_their_share_of_the_light() -> None:
+    spectrum = _light(Beam(1.0, energy_kev=8.0, harmonics={3: 0.01, 2: 0.002}))
+    np.testing.assert_array_equal(spectrum.energies, [8.0, 24.0, 16.0])
+    np.testing.assert_allclose(spectrum.weights, [0.988, 0.01, 0.002], rtol=1e-12)
+
+
+def test_a_table_is_taken_as_it_is_less_what_has_no_weight() -> None:
+    spectrum = _light(Beam(1.0, spectrum=((20.0, 1.0), (25.0, 0.0), (30.0, 3.0))))
+    assert (spectrum.energies.tolist(), spectrum.weights.tolist()) == ([20.0, 30.0], [0.25, 0.75])
+
+
+@pytest.mark.parametrize(("material", "most"), [(_smooth, 5), (_step, 129)])
+def test_a_pink_beam_has_the_nodes_that_its_sample_needs(material: Attenuation, most: int) -> None:
+    """Against a sum over 200 001 energies; a smooth material needs few nodes, an edge in the line many."""
+    beam = Beam(1.0, energy_kev=10.0, bandwidth=0.02)
+    spectrum = _light(beam, material)
+    sigma = 10.0 * 0.02 / math.sqrt(8 * math.log(2))
+    fine = 10.0 + sigma * np.linspace(-6, 6, 200_001)
+    exact = Spectrum.of(fine, np.exp(-((fine - 10.0) ** 2) / (2 * sigma**2)))
+    t = np.array([0.01, 0.1, 0.5, 1.0])
+    worst = 1e-5 if material is _smooth else 1e-2  # half a node's weight
+    np.testing.assert_allclose(spectrum.transmission(material, t), exact.transmission(material, t), atol=worst)
+    assert spectrum.energies.size <= most
+    assert spectrum.weights @ spectrum.energies == pytest.approx(10.0, rel=1e-6)
+
+
+def test_the_width_is_full_at_half_maximum() -> None:
+    spectrum = _light(Beam(1.0, energy_kev=10.0, bandwidth=0.02), _step)
+    spread = math.sqrt(spectrum.weights @ (spectrum.energies - 10.0) ** 2)
+    assert spread * math.sqrt(8 * math.log(2)) == pytest.approx(0.2, rel=1e-4)
+
+
+def test_a_tube_is_kramers_behind_its_filter() -> None:
+    """Against a sum over 1/E - 1/kV, filtered, on 100 000 energies; the mean energy rises with the filter."""
+    means = []
+    for mm in (0.5, 2.0):
+        beam = Beam(1.0, tube=Tube(60.0, {"it": mm}))
+        spectrum = light(beam, [_smooth], 5.0, lambda name: {"it": _smooth}[name])
+        fine = np.linspace(1.0, 60.0, 100_001)
+        exact = Spectrum.of(fine, (1 / fine - 1 / 60.0) * np.exp(-mm * _smooth(fine)))
+        t = np.geomspace(0.01, 5, 8)
+        np.testing.assert_allclose(spectrum.transmission(_smooth, t), exact.transmission(_smooth, t), atol=2e-5)
+        assert spectrum.energies.size < 40
+        assert spectrum.energies.max() < 60.0
+        means.append(float(spectrum.weights @ spectrum.energies))
+    assert means[1] > means[0] > 20
+
+
+def test_light_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ValueError, match="give it energy_kev, spectrum or tube"):
+        _light(Beam(1.0))
+    with pytest.raises(ValueError, match=r"nothing of the tube's 60 kV comes through its filters {'it': 1000000.0} mm"):
+        light(Beam(1.0, tube=Tube(60.0, {"it": 1e6})), [_smooth], 1.0, lambda name: _smooth)
