@@ -30,19 +30,18 @@ class _Orca(Section):
     roi: Roi | None = None
     """null: the full sensor, 2304 x 4096."""
     binning: Literal[1, 2, 4] = 1
+    readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
+    """photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."""
     trigger_polarity: Literal["positive", "negative"] = "positive"
     """The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here."""
 
 
 class SimulatedOrca(_Orca):
     kind: Literal["simulated_orca"]
-    readout: Literal["standard", "ultra_quiet"] = "standard"
 
 
 class DcamOrca(_Orca):
     kind: Literal["dcam"]
-    readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
-    """photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."""
     library: str | None = None
     """Path of the DCAM-API library; null: the installed one."""
     index: Annotated[int, Field(ge=0)] = 0

@@ -22,7 +22,7 @@ from simulators.detector import Detector
 from simulators.effects.shot import Shot
 from simulators.exposure import expose
 from simulators.scene import Scene
-from simulators.sensor import CONVERSION, OFFSET, READ_NOISE
+from simulators.sensor import CONVERSION, OFFSET
 from simulators.shutter import BeamGate, SimulatedSampleMover
 from simulators.trigger_line import TriggerLine
 
@@ -120,8 +120,6 @@ class SimulatedOrcaQuest:
         with self._lock:
             self._answer()
             problem = orca_quest.refusal(settings)
-            if settings.readout not in READ_NOISE:
-                problem = f"does not simulate the readout {settings.readout!r}; legal: {', '.join(READ_NOISE)}"
             if self._armed_for:
                 problem = "is capturing and takes no settings; disarm it first"
             if problem:
@@ -206,7 +204,7 @@ class SimulatedOrcaQuest:
             "roi_rows": rows,
             "roi_cols": cols,
             "conversion_factor": CONVERSION[self._settings.readout],
-            "conversion_offset": OFFSET,
+            "conversion_offset": OFFSET[self._settings.readout],
             "sensor_pitch_mm": orca_quest.PITCH_MM,
             "min_period": self._timing.min_period,
             "row_period": self._timing.row_period,

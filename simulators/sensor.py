@@ -3,6 +3,11 @@
 A beam's photons are those detected, so that one photon is one electron, unless a scene names the quantum efficiency.
 The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000 electrons.
 Binning is digital: charge and noise of the summed pixels add up.
+
+Photon number resolving is a readout of the camera and follows from three figures, without an effect: a count is an
+electron, there is no offset, and so `digitise` gives round(max(electrons, 0)). That the camera subtracts its offset
+pixel by pixel, reads with the noise of ultra quiet and counts to about 200 is from memory, to be checked on a camera.
+A binned pixel is rounded once, after its sum; the camera rounds each pixel first, which leaves a little less noise.
 """
 
 from __future__ import annotations
@@ -14,17 +19,27 @@ from numpy.typing import NDArray
 
 from drivers.orca_quest import BITS
 
-CONVERSION = MappingProxyType({"standard": 0.107, "ultra_quiet": 0.107})
+CONVERSION = MappingProxyType({"standard": 0.107, "ultra_quiet": 0.107, "photon_number": 1.0})
 """Electrons a count in each readout."""
-OFFSET = 200.0
-"""Counts of a pixel without charge."""
-READ_NOISE = MappingProxyType({"standard": 0.43, "ultra_quiet": 0.27})
+OFFSET = MappingProxyType({"standard": 200.0, "ultra_quiet": 200.0, "photon_number": 0.0})
+"""Counts of a pixel without charge in each readout."""
+READ_NOISE = MappingProxyType({"standard": 0.43, "ultra_quiet": 0.27, "photon_number": 0.27})
 """Electrons rms in each readout."""
+LARGEST_PHOTON_NUMBER = 200
+"""Of an unbinned pixel."""
 DARK_CURRENT = 0.0036
 """Electrons a second and pixel."""
+FULL_WELL = 7000.0
+"""Electrons that a pixel holds."""
 
 
-def digitise(counts: NDArray[np.float64]) -> NDArray[np.uint16]:
+def largest_count(readout: str, binning: int) -> int:
+    """What the converter ends at."""
+    whole = 2**BITS - 1
+    return min(LARGEST_PHOTON_NUMBER * binning**2, whole) if readout == "photon_number" else whole
+
+
+def digitise(counts: NDArray[np.float64], largest: int = 2**BITS - 1) -> NDArray[np.uint16]:
     """Round to whole counts and clip to what the converter has; `counts` is written over."""
     np.rint(counts, out=counts)
-    return np.clip(counts, 0, 2**BITS - 1, out=counts).astype(np.uint16)
+    return np.clip(counts, 0, largest, out=counts).astype(np.uint16)

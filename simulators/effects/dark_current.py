@@ -5,19 +5,43 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
+from simulators.noise import poisson
 from simulators.sensor import DARK_CURRENT
+
+FEW = 0.1
+"""Electrons a pixel below which it is less work to scatter electrons than to ask every pixel."""
 
 
 @dataclass(frozen=True)
 class DarkCurrent:
-    """Poisson around the dark current times the exposure."""
+    """Poisson around the dark current times the exposure.
+
+    Few electrons are scattered over the frame: their number is Poisson, and each falls on any pixel alike, which makes
+    every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
+
+    `rate`: electrons a second and sensor pixel.
+    """
+
+    rate: float = DARK_CURRENT
 
     name: ClassVar[str] = "dark_current"
     domain: ClassVar[Domain] = Domain.ELECTRONS
     final: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        if not self.rate >= 0:
+            raise ValueError(f"rate must be >= 0 electrons/s, got {self.rate}")
+
     def apply(self, image: Image, shot: Shot) -> Image:
-        image += draws(self.name, shot).poisson(DARK_CURRENT * shot.exposure * shot.binning**2, image.shape)
+        rng = draws(self.name, shot)
+        mean = self.rate * shot.exposure * shot.binning**2
+        if mean < FEW:
+            falls = rng.integers(image.size, size=rng.poisson(mean * image.size))
+            np.add.at(image.reshape(-1), falls, 1.0)
+        else:
+            image += poisson(np.full(image.shape, mean), rng)
         return image

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.orca_quest import SENSOR_SHAPE
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
+from simulators.pattern import places
 
 
 @dataclass(frozen=True)
@@ -32,21 +31,11 @@ class HotPixels:
     final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if not (0 <= self.fraction <= 0.1 and self.rate >= 0):
-            raise ValueError(f"fraction must lie in 0 ... 0.1 and rate be >= 0 electrons/s, got {self}")
+        if not (0 <= self.fraction <= 0.1 and self.rate >= 0 and self.seed >= 0):
+            raise ValueError(f"fraction must lie in 0 ... 0.1 and rate (electrons/s) and seed be >= 0, got {self}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        rows, cols, rate = self.pixels()
-        row0, col0, height, width = shot.roi
-        seen = (rows >= row0) & (rows < row0 + height) & (cols >= col0) & (cols < col0 + width)
-        rng = draws(self.name, shot)
-        at = (rows[seen] - row0) // shot.binning, (cols[seen] - col0) // shot.binning
-        np.add.at(image, at, rng.poisson(rate[seen] * shot.exposure))
+        at, even = places(self.name, self.seed, self.fraction, shot)
+        rates = -self.rate * np.log1p(-even)
+        np.add.at(image, at, draws(self.name, shot).poisson(rates * shot.exposure))
         return image
-
-    def pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Sensor rows, sensor columns and dark currents (electrons/s) of the hot pixels."""
-        rng = np.random.default_rng(self.seed)
-        n = round(self.fraction * SENSOR_SHAPE[0] * SENSOR_SHAPE[1])
-        rows, cols = (rng.integers(extent, size=n) for extent in SENSOR_SHAPE)
-        return rows, cols, rng.exponential(self.rate, n)

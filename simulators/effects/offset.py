@@ -7,17 +7,35 @@ from typing import ClassVar
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
+from simulators.pattern import binned, normals
 from simulators.sensor import OFFSET
 
 
 @dataclass(frozen=True)
 class Offset:
-    """The same for every pixel, whatever is binned (to check on a camera)."""
+    """The same whatever is binned (to check on a camera); none where the camera resolves photon numbers.
+
+    Attributes:
+        spread: counts by which sensor pixels differ (standard deviation of a normal distribution), about 1 on an
+            ORCA-Quest; those of binned pixels add up.
+        seed: which pixel has how much.
+    """
+
+    spread: float = 0.0
+    seed: int = 0
 
     name: ClassVar[str] = "offset"
     domain: ClassVar[Domain] = Domain.COUNTS
     final: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        if not (self.spread >= 0 and self.seed >= 0):
+            raise ValueError(f"spread (counts) and seed must be >= 0, got {self.spread} and {self.seed}")
+
     def apply(self, image: Image, shot: Shot) -> Image:
-        image += OFFSET
+        image += OFFSET[shot.readout]
+        if self.spread > 0 and shot.readout != "photon_number":
+            pattern = binned(normals(self.name, self.seed, shot), shot.binning)
+            pattern *= self.spread
+            image += pattern
         return image

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
+from simulators.noise import poisson
 
 
 @dataclass(frozen=True)
@@ -20,4 +19,4 @@ class PhotonNoise:
     final: ClassVar[bool] = True
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        return draws(self.name, shot).poisson(image).astype(np.float64)
+        return poisson(image, draws(self.name, shot))

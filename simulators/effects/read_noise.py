@@ -5,19 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
+from simulators.noise import add_normal
+from simulators.pattern import binned, normals
 from simulators.sensor import READ_NOISE
 
 
 @dataclass(frozen=True)
 class ReadNoise:
-    """Gaussian; pixels summed by binning are read one by one, so that their noise adds up.
+    """Gaussian; pixels summed by binning are read one by one, so that their variances add up.
 
-    `rms`: electrons of a sensor pixel, in place of the readout's.
+    Attributes:
+        rms: electrons of a sensor pixel, in place of the readout's.
+        spread: of the pixels' amplifiers: the standard deviation of ln(rms of a pixel), whose median stays.
+        seed: which pixel has how much.
     """
 
     rms: float | None = None
+    spread: float = 0.0
+    seed: int = 0
 
     name: ClassVar[str] = "read_noise"
     domain: ClassVar[Domain] = Domain.ELECTRONS
@@ -26,8 +35,19 @@ class ReadNoise:
     def __post_init__(self) -> None:
         if self.rms is not None and not self.rms >= 0:
             raise ValueError(f"rms must be >= 0 electrons, got {self.rms}")
+        if not (0 <= self.spread <= 2 and self.seed >= 0):
+            raise ValueError(f"spread must lie in 0 ... 2 and seed be >= 0, got {self.spread} and {self.seed}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
         rms = READ_NOISE[shot.readout] if self.rms is None else self.rms
-        image += draws(self.name, shot).normal(0.0, rms * shot.binning, image.shape)
+        add_normal(image, rms * self._spreads(shot), draws(self.name, shot))
         return image
+
+    def _spreads(self, shot: Shot) -> Image | float:
+        """Noise of each frame pixel over that of a typical sensor pixel."""
+        if self.spread == 0:
+            return shot.binning
+        pixels = normals(self.name, self.seed, shot)
+        pixels *= self.spread * (1 if shot.binning == 1 else 2)
+        np.exp(pixels, out=pixels)
+        return pixels if shot.binning == 1 else np.sqrt(binned(pixels, shot.binning))

@@ -1,4 +1,4 @@
-"""Zingers: stray X-rays that hit the sensor itself and leave a bright pixel in one frame only."""
+"""Zingers: stray X-rays and muons hit the sensor itself and leave bright pixels in one frame only."""
 
 from __future__ import annotations
 
@@ -10,18 +10,27 @@ import numpy as np
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
 
+DROPS = 200
+"""Parts of a charge that spreads."""
+
 
 @dataclass(frozen=True)
 class Zingers:
-    """Single bright pixels at random places.
+    """Bright pixels at random places; some may be tracks, and charge may spread.
 
     Attributes:
         rate: mean number a second in the frame.
         charge: mean electrons of one (exponentially distributed).
+        tracks: share of them that run along the sensor, in any direction.
+        length: mean length of a track (exponentially distributed), pixels of the frame.
+        radius: standard deviation of the charge around its point or track, pixels of the frame; 0: a single pixel.
     """
 
     rate: float
     charge: float = 3000.0
+    tracks: float = 0.0
+    length: float = 20.0
+    radius: float = 0.0
 
     name: ClassVar[str] = "zingers"
     domain: ClassVar[Domain] = Domain.ELECTRONS
@@ -30,9 +39,27 @@ class Zingers:
     def __post_init__(self) -> None:
         if not (self.rate >= 0 and self.charge > 0):
             raise ValueError(f"rate must be >= 0 a second and charge positive, got {self}")
+        if not (0 <= self.tracks <= 1 and self.length > 0 and self.radius >= 0):
+            raise ValueError(f"tracks must lie in 0 ... 1, length be positive and radius >= 0, got {self}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
         rng = draws(self.name, shot)
         n = int(rng.poisson(self.rate * shot.exposure))
-        np.add.at(image.reshape(-1), rng.integers(image.size, size=n), rng.exponential(self.charge, n))
+        where = np.array(np.unravel_index(rng.integers(image.size, size=n), image.shape), dtype=np.float64)
+        charge = rng.exponential(self.charge, n)
+        if self.tracks > 0 or self.radius > 0:
+            where, charge = self._spread(where, charge, rng)
+        row, col = np.rint(where).astype(np.int64)
+        inside = (row >= 0) & (row < image.shape[0]) & (col >= 0) & (col < image.shape[1])
+        np.add.at(image, (row[inside], col[inside]), charge[inside])
         return image
+
+    def _spread(self, where: Image, charge: Image, rng: np.random.Generator) -> tuple[Image, Image]:
+        """Each charge in DROPS parts along its track and around it; where [2, part] and charge [part]."""
+        n = charge.size
+        runs = rng.random(n) < self.tracks
+        length, heading = rng.exponential(self.length, n) * runs, rng.uniform(0, 2 * np.pi, n)
+        ends = np.stack([length * np.sin(heading), length * np.cos(heading)])
+        parts = where[:, :, None] + ends[:, :, None] * (np.arange(DROPS) / DROPS)
+        parts += self.radius * rng.standard_normal(parts.shape)
+        return parts.reshape(2, -1), np.repeat(charge / DROPS, DROPS)

@@ -21,6 +21,7 @@ from simulators.sensor import CONVERSION
 from simulators.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.trigger_line import Pulse, TriggerLine
 from tests.drivers.camera_conformance import SETTINGS, CameraBench, CameraConformance
+from tests.simulators import chance
 
 FLUX = 4e5
 FULL = round(FLUX * SETTINGS.exposure / CONVERSION["standard"])  # counts without sample and effects
@@ -30,7 +31,9 @@ BALL = {"kind": "ellipsoid", "semi_axes": [0.03, 0.03, 0.03], "attenuation": 20.
 class _Bench:
     """A camera over one small ball, its trigger line, clock, shutter (open) and sample mover."""
 
-    def __init__(self, *effects: Any, clock: Clock | None = None, axis_offset_px: float = 0.0, **options: Any) -> None:
+    def __init__(
+        self, *effects: Any, clock: Clock | None = None, axis_offset_px: float = 0.0, flux: float = FLUX, **options: Any
+    ) -> None:
         self.clock = clock or VirtualClock()
         self.line = TriggerLine(self.clock)
         self.shutter, self.sample = SimulatedShutter(), SimulatedSampleMover()
@@ -38,7 +41,7 @@ class _Bench:
         self.scene = load_scene(
             {
                 "phantom": {"kind": "solids", "solids": [BALL]},
-                "beam": {"photons_per_s": FLUX},
+                "beam": {"photons_per_s": flux},
                 "effects": list(effects),
                 "axis_offset_px": axis_offset_px,
             }
@@ -156,12 +159,39 @@ def test_axis_and_pitch_follow_offset_roi_and_binning() -> None:
     ).detector.pitch == pytest.approx(6.5e-4)
 
 
-def test_photon_numbers_are_not_simulated() -> None:
-    with pytest.raises(DeviceRefused, match="does not simulate the readout 'photon_number'"):
-        _Bench().camera.configure(replace(SETTINGS, readout="photon_number"))
+def test_photon_numbers_are_whole_electrons_without_offset() -> None:
+    bench = _Bench("photon_noise", "read_noise", {"kind": "offset", "spread": 1.0}, flux=1000.0)
+    bench.sample.out()
+    counts = bench.one(readout="photon_number", roi=(1024, 1920, 200, 200)).counts
+    described = bench.camera.describe()
+    assert (described["readout"], described["conversion_factor"], described["conversion_offset"]) == (
+        "photon_number",
+        1.0,
+        0.0,
+    )
+    # Ten photons, 0.27 electrons rms of the readout, and 1/12 of rounding (Janesick 2007).
+    chance.mean_is(counts, 10.0, 10 + 0.27**2 + 1 / 12)
+    chance.variance_is(counts, 10 + 0.27**2 + 1 / 12, 1 / 10)
+    bench.shutter.close()
+    # In the dark a pixel shows an electron where its noise exceeds one half.
+    dark = bench.one(readout="photon_number", roi=(1024, 1920, 200, 200)).counts
+    ones = 0.5 * math.erfc(0.5 / 0.27 / math.sqrt(2))
+    chance.mean_is(dark > 0, ones, ones * (1 - ones))
+    standard = bench.one(readout="standard").counts
+    assert 195 < standard.mean() < 205
 
 
-@pytest.mark.parametrize(("readout", "line_time"), [("standard", 7.2e-6), ("ultra_quiet", 172.8e-6)])
+def test_photon_numbers_end_at_two_hundred_a_pixel() -> None:
+    bench = _Bench()  # 4000 photons
+    bench.sample.out()
+    assert (bench.one(readout="photon_number").counts == 200).all()
+    assert (bench.one(readout="photon_number", binning=2).counts == 800).all()
+    assert (bench.one(readout="standard").counts == FULL).all()
+
+
+@pytest.mark.parametrize(
+    ("readout", "line_time"), [("standard", 7.2e-6), ("ultra_quiet", 172.8e-6), ("photon_number", 172.8e-6)]
+)
 def test_timing_is_the_orca_quest_s(readout: str, line_time: float) -> None:
     bench = _Bench()
     bench.camera.configure(replace(SETTINGS, readout=readout))

@@ -1,17 +1,36 @@
-"""Dark current: it grows with the exposure and the pixels summed."""
+"""Dark current: Poisson of rate x exposure, scattered or asked of every pixel."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from simulators import sensor
-from tests.simulators import shots
-
-CONVERSION = sensor.CONVERSION["standard"]
+from simulators.effects.dark_current import FEW, DarkCurrent
+from tests.simulators import chance, shots
 
 
-def test_dark_current_grows_with_the_exposure() -> None:
-    dark = shots.frame(shots.scene("dark_current"), shots.shot(exposure=100.0), beam=False) * CONVERSION
-    assert dark.mean() == pytest.approx(0.36, abs=0.04)
-    binned = shots.frame(shots.scene("dark_current"), shots.shot(exposure=100.0, binning=2), beam=False) * CONVERSION
-    assert binned.mean() == pytest.approx(4 * 0.36, abs=0.1)
+@pytest.mark.parametrize(("exposure", "binning"), [(0.05, 1), (20.0, 1), (20.0, 2), (100.0, 1), (100.0, 4)])
+def test_dark_electrons_are_poisson(exposure: float, binning: int) -> None:
+    shot = shots.sized(600, 700, exposure=exposure, binning=binning)
+    dark, mean = DarkCurrent().apply(np.zeros((600, 700)), shot), 0.0036 * exposure * binning**2
+    chance.mean_is(dark, mean, mean)
+    chance.variance_is(dark, mean, 1 / mean)
+    chance.poisson_like(dark, mean)
+    chance.uncorrelated(dark[1:], dark[:-1])
+
+
+def test_either_way_has_one_distribution() -> None:
+    for rate in (0.99 * FEW, 1.01 * FEW):
+        dark = DarkCurrent(rate).apply(np.zeros((600, 700)), shots.sized(600, 700, exposure=1.0))
+        chance.poisson_like(dark, rate)
+
+
+def test_it_adds_to_what_is_there_anew_in_each_frame() -> None:
+    one, other = (DarkCurrent(5.0).apply(np.full((60, 80), 10.5), shots.shot(frame=k)) for k in (1, 2))
+    assert set(np.unique(one)) <= {10.5, 11.5, 12.5}
+    assert (one != other).any()
+
+
+def test_a_wrong_parameter_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"rate must be >= 0 electrons/s, got -1.0"):
+        DarkCurrent(-1.0)

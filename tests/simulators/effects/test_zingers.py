@@ -1,27 +1,83 @@
-"""Zingers: as many as their rate says, in one frame only."""
+"""Zingers: as many as their rate says with exponential charges, in one frame only; tracks are straight."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy import stats
 
-from simulators import sensor
 from simulators.effects.zingers import Zingers
-from tests.simulators import shots
+from tests.simulators import chance, shots
 
-CONVERSION = sensor.CONVERSION["standard"]
+
+def _frame(effect: Zingers, number: int, side: int = 400) -> NDArray[np.float64]:
+    return effect.apply(np.zeros((side, side)), shots.sized(side, side, exposure=0.01, frame=number))
 
 
 def test_zingers_are_as_many_as_their_rate_says_and_in_one_frame_only() -> None:
-    scene = shots.scene({"kind": "zingers", "rate": 1000.0, "charge": 500.0})
-    frames = np.stack([shots.frame(scene, shots.shot(frame=k), beam=False) for k in range(30)])
-    assert (frames > 0).sum() == pytest.approx(300, abs=4 * math.sqrt(300))  # 30 frames x 10 ms x 1000/s
-    assert frames[frames > 0].mean() * CONVERSION == pytest.approx(500, rel=0.3)
+    frames = np.stack([_frame(Zingers(1000.0, 500.0), k) for k in range(60)])
+    chance.mean_is((frames > 0).sum(axis=(1, 2)), 10.0, 10.0)  # 10 ms of 1000/s
+    charges = frames[frames > 0]
+    assert stats.kstest(charges, "expon", args=(0, 500)).pvalue > chance.FALSE_ALARM
     assert ((frames > 0).sum(axis=0) <= 2).all()
+    assert not _frame(Zingers(0.0), 0).any()
 
 
-def test_a_wrong_parameter_is_refused() -> None:
-    with pytest.raises(ValueError, match="rate must be >= 0"):
-        Zingers(rate=-2.0)
+def test_places_are_even() -> None:
+    rows, cols = np.nonzero(_frame(Zingers(2e5), 0))
+    for at in (rows, cols):
+        assert stats.chisquare(np.bincount(at // 40, minlength=10)).pvalue > chance.FALSE_ALARM
+
+
+def test_tracks_are_straight_and_as_long_as_they_should_be() -> None:
+    lengths, charges = [], []
+    for k in range(400):
+        frame = _frame(Zingers(100.0, tracks=1.0, length=15.0), k)
+        rows, cols = np.nonzero(frame)
+        alone = abs(np.ptp(rows)) < 150 and abs(np.ptp(cols)) < 150 if rows.size else False
+        inside = alone and min(rows.min(), cols.min(), 399 - rows.max(), 399 - cols.max()) > 0
+        if not inside:
+            continue
+        points = np.stack([rows - rows.mean(), cols - cols.mean()])
+        _, across = np.linalg.svd(points, compute_uv=False) if rows.size > 1 else (0.0, 0.0)
+        if across > 0.5 * np.sqrt(rows.size):
+            continue  # two that met
+        lengths.append(np.hypot(np.ptp(rows), np.ptp(cols)))
+        charges.append(frame.sum())
+    assert len(lengths) > 100
+    assert np.mean(lengths) == pytest.approx(15.0, abs=1 + chance.SIGMAS * 15 / np.sqrt(len(lengths)))
+    assert max(lengths) > 40
+    assert np.mean(charges) == pytest.approx(3000, rel=1.5 * chance.SIGMAS / np.sqrt(len(charges)))
+
+
+def test_charge_spreads_by_the_radius_and_is_kept() -> None:
+    row, col = np.indices((400, 400))
+    spreads = []
+    for k in range(60):
+        frame = _frame(Zingers(60.0, radius=2.0), k)
+        if not frame.any():
+            continue
+        total = frame.sum()
+        variances = [(frame * (axis - (frame * axis).sum() / total) ** 2).sum() / total for axis in (row, col)]
+        if max(variances) < 16:  # one alone
+            spreads.extend(variances)
+    assert len(spreads) > 20
+    # Each of n numbers is a variance of 200 drops: 2² and rounding's 1/12, times 199/200.
+    expected = (4 + 1 / 12) * 199 / 200
+    assert np.mean(spreads) == pytest.approx(expected, abs=chance.SIGMAS * expected * np.sqrt(2 / 200 / len(spreads)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"rate": -2.0}, "rate must be >= 0"),
+        ({"rate": 1.0, "charge": 0.0}, "charge positive"),
+        ({"rate": 1.0, "tracks": 2.0}, "tracks must lie in 0"),
+        ({"rate": 1.0, "length": 0.0}, "length be positive"),
+        ({"rate": 1.0, "radius": -1.0}, "radius >= 0"),
+    ],
+)
+def test_a_wrong_parameter_is_refused(wrong: dict[str, float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Zingers(**wrong)

@@ -1,0 +1,47 @@
+"""ADC: a converter of fewer bits, or one that is not quite straight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from drivers.orca_quest import BITS
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+
+@dataclass(frozen=True)
+class Adc:
+    """Counts in steps of 2^(16 - bits), from 0 to the last step: the codes stand at the upper end of 16 bits, so that
+    conversion factor and offset hold at every depth. Without this effect the converter is straight and has 16 bits.
+
+    Attributes:
+        bits: of a code.
+        nonlinearity: integral: the largest departure of the response from the straight line through its ends, as a
+            share of the full range F; the response bows, y = x + 4 nonlinearity x (1 - x / F).
+    """
+
+    bits: Literal[8, 12, 16] = 16
+    nonlinearity: float = 0.0
+
+    name: ClassVar[str] = "adc"
+    domain: ClassVar[Domain] = Domain.COUNTS
+    final: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.bits not in (8, 12, 16):
+            raise ValueError(f"bits must be 8, 12 or 16, got {self.bits}")
+        if not -0.25 <= self.nonlinearity <= 0.25:
+            raise ValueError(f"nonlinearity must lie in -0.25 ... 0.25 of the full range, got {self.nonlinearity}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        step, codes = 2.0 ** (BITS - self.bits), 2**self.bits - 1
+        if self.nonlinearity:
+            np.clip(image, 0, step * codes, out=image)
+            image *= 1 + 4 * self.nonlinearity * (1 - image / (step * codes))
+        image /= step
+        np.clip(np.rint(image, out=image), 0, codes, out=image)
+        image *= step
+        return image

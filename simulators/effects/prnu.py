@@ -1,0 +1,44 @@
+"""PRNU, photo response non-uniformity: pixels differ in how much of the light they detect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+from simulators.pattern import binned, normals
+
+
+@dataclass(frozen=True)
+class Prnu:
+    """The expected light times 1 + spread * a normal number of the sensor pixel, not below 0.
+
+    It acts on the light, so that photon noise around it stays Poisson, and belongs after all that blurs light.
+
+    Attributes:
+        spread: standard deviation as a share of the light; 1 % is typical of sensors (Janesick 2007, "Photon
+            transfer"), and assumed here: ORCA-Quest's is not published.
+        seed: which pixel has how much.
+    """
+
+    spread: float = 0.01
+    seed: int = 0
+
+    name: ClassVar[str] = "prnu"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.spread <= 0.2 and self.seed >= 0):
+            raise ValueError(f"spread must lie in 0 ... 0.2 and seed be >= 0, got {self.spread} and {self.seed}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        gain = binned(normals(self.name, self.seed, shot), shot.binning)
+        gain *= self.spread / shot.binning**2
+        gain += 1.0
+        np.maximum(gain, 0.0, out=gain)
+        gain *= image
+        return gain

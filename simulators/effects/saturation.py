@@ -1,0 +1,44 @@
+"""Saturation: a pixel holds no more than its full well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+from simulators.sensor import FULL_WELL
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """Charge x is clipped at the full well W; with a knee, charge above x0 = (1 - knee) W becomes
+    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))), which bends off smoothly and never quite fills the well.
+
+    Named after all that makes charge, and before the read noise. Pixels that are summed share their light evenly.
+
+    Attributes:
+        full_well: electrons of a sensor pixel.
+        knee: share of the full well over which the response bends.
+    """
+
+    full_well: float = FULL_WELL
+    knee: float = 0.0
+
+    name: ClassVar[str] = "saturation"
+    domain: ClassVar[Domain] = Domain.ELECTRONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.full_well > 0 and 0 <= self.knee <= 1):
+            raise ValueError(f"full_well must be positive (electrons) and knee lie in 0 ... 1, got {self}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        well = self.full_well * shot.binning**2
+        bend = self.knee * well
+        if bend > 0:
+            above = image > well - bend
+            image[above] = well - bend - bend * np.expm1(-(image[above] - (well - bend)) / bend)
+        return np.minimum(image, well, out=image)
