@@ -1,4 +1,4 @@
-"""Beam profile: the beam is bright in the middle and striped across, so that a flat is not flat."""
+"""Beam profile: the beam is bright in the middle, striped across and wanders, so that flats are not flat and age."""
 
 from __future__ import annotations
 
@@ -13,19 +13,31 @@ from simulators.effects.shot import Image, Shot
 
 @dataclass(frozen=True)
 class BeamProfile:
-    """A Gaussian of 1 at u = v = 0 times horizontal stripes, as a multilayer monochromator leaves them.
+    """A Gaussian of 1 in its middle times horizontal stripes, as a multilayer monochromator leaves them.
+
+    The middle of the beam, stripes and all, is at centre + wander_speed t + wander sin(2 pi t / wander_period), t in s
+    since the camera was connected. Wander belongs here and is no shift of the image: the beam moves, and the sample and
+    the scintillator stay. Within an exposure the beam stands.
 
     Attributes:
         sigma: (horizontal, vertical) in mm.
         stripes: amplitude of the stripes, as a share of the beam.
         stripe_period: mm, vertically.
-        drift: mm/s by which the stripes move up; what makes flats age.
+        drift: mm/s by which the stripes move up within the beam.
+        centre: (horizontal, vertical) in mm from the rotation axis and z = 0.
+        wander_speed: (horizontal, vertical) in mm/s.
+        wander: amplitude (horizontal, vertical) in mm.
+        wander_period: s.
     """
 
     sigma: tuple[float, float]
     stripes: float = 0.0
     stripe_period: float = 0.1
     drift: float = 0.0
+    centre: tuple[float, float] = (0.0, 0.0)
+    wander_speed: tuple[float, float] = (0.0, 0.0)
+    wander: tuple[float, float] = (0.0, 0.0)
+    wander_period: float = 60.0
 
     name: ClassVar[str] = "beam_profile"
     domain: ClassVar[Domain] = Domain.PHOTONS
@@ -34,10 +46,24 @@ class BeamProfile:
     def __post_init__(self) -> None:
         if not (min(self.sigma) > 0 and 0 <= self.stripes < 1 and self.stripe_period > 0):
             raise ValueError(f"sigma and stripe_period must be positive and stripes in 0 ... 1 (excluded), got {self}")
+        if not self.wander_period > 0:
+            raise ValueError(f"wander_period must be positive, got {self.wander_period} s")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        u, v = shot.detector.u(), shot.detector.v()
+        middle = self.middle(shot.elapsed)
+        u, v = shot.detector.u() - middle[0], shot.detector.v() - middle[1]
         across = np.exp(-0.5 * (u / self.sigma[0]) ** 2)
         phase = 2 * np.pi * (v - self.drift * shot.elapsed) / self.stripe_period
         down = np.exp(-0.5 * (v / self.sigma[1]) ** 2) * (1 + self.stripes * np.sin(phase))
-        return image * down[:, None] * across
+        image *= down[:, None]
+        image *= across
+        return image
+
+    def middle(self, elapsed: float) -> tuple[float, float]:
+        """Where the middle of the beam is (horizontal, vertical), mm, `elapsed` s after the camera was connected."""
+        swing = np.sin(2 * np.pi * elapsed / self.wander_period)
+        horizontal, vertical = (
+            centre + speed * elapsed + amplitude * swing
+            for centre, speed, amplitude in zip(self.centre, self.wander_speed, self.wander, strict=True)
+        )
+        return float(horizontal), float(vertical)

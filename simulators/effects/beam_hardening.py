@@ -1,0 +1,66 @@
+"""Beam hardening: the beam has several energies, and the sample takes the softer ones away first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+
+@dataclass(frozen=True)
+class BeamHardening:
+    """exp(-d') = sum of w_k exp(-r_k d), with sum w_k = 1 and sum w_k r_k = 1, for a sample given by its attenuation.
+
+    The sample's attenuation is the mean over the spectrum, so that a thin sample is seen as it is (d' = d at d -> 0)
+    and a thick one as less. Costs one exponential of the image for each energy. A sample of materials has its true
+    attenuation at each energy in the beam's spectrum instead.
+
+    Attributes:
+        weights: shares of the detected photons of the open beam; only their proportions count.
+        energies: keV; attenuation goes as E^-3, as photoelectric absorption does between edges (Als-Nielsen &
+            McMorrow 2011, Elements of Modern X-ray Physics, ch. 1.3).
+        ratios: the attenuations at the energies, in any unit, in place of the energies.
+    """
+
+    weights: tuple[float, ...]
+    energies: tuple[float, ...] | None = None
+    ratios: tuple[float, ...] | None = None
+
+    name: ClassVar[str] = "beam_hardening"
+    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        given = self.energies if self.ratios is None else self.ratios
+        if given is None or (self.energies is not None and self.ratios is not None):
+            raise ValueError(f"give either energies in keV or ratios of attenuations, got {self}")
+        if len(given) != len(self.weights) or not self.weights:
+            raise ValueError(f"each weight needs an energy or a ratio and the other way round, got {self}")
+        if not (min(given) > 0 and min(self.weights) >= 0 and sum(self.weights) > 0):
+            raise ValueError(f"energies and ratios must be positive, weights >= 0 and one of them positive, got {self}")
+
+    def terms(self) -> tuple[tuple[float, float], ...]:
+        """(w_k, r_k) of the energies that have photons, the most penetrating first."""
+        ratios = self.ratios if self.energies is None else tuple(energy**-3 for energy in self.energies)
+        assert ratios is not None
+        total = sum(self.weights)
+        mean = sum(w * r for w, r in zip(self.weights, ratios, strict=True)) / total
+        seen = ((r / mean, w / total) for w, r in zip(self.weights, ratios, strict=True) if w > 0)
+        return tuple((w, r) for r, w in sorted(seen))
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        # The most penetrating energy's exponential is taken out of the sum, so that no depth is too large.
+        (weight, least), *others = self.terms()
+        seen = np.full_like(image, weight)
+        term = np.empty_like(image)
+        for w, ratio in others:
+            np.exp(np.multiply(image, least - ratio, out=term), out=term)
+            term *= w
+            seen += term
+        image *= least
+        image -= np.log(seen, out=seen)
+        return image

@@ -1,0 +1,126 @@
+"""Flat structure: dust and scratches on scintillator and optics, which stay where they are and make flats uneven."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.orca_quest import SENSOR_SHAPE
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+Reals = NDArray[np.float64]
+REACH = 4.0
+"""Sigmas of a Gaussian that are drawn; beyond lies less than 4e-4 of its depth."""
+
+
+@dataclass(frozen=True)
+class FlatStructure:
+    """Each speck and scratch takes light away by 1 - depth x Gaussian; where they cross, the factors multiply.
+
+    A flat divides them out, unless the light has moved (beam_profile) or been blurred after them: dust on the
+    scintillator comes before scintillator_blur, dust on the camera's window after it. They are worked out for each
+    sensor pixel and averaged over a binned one, so that the same ones are seen in any ROI and binning.
+
+    Attributes:
+        specks: number of specks on the whole sensor.
+        radius_um: mean of their radii (sigmas; half to one and a half times this), um at the sample.
+        depth: mean share of the light that is lost in the middle of a speck; between 0 and twice this.
+        scratches: number of straight scratches on the whole sensor.
+        scratch_length_um: mean of their lengths (exponentially distributed), um at the sample.
+        scratch_width_um: sigma across them, um at the sample.
+        scratch_depth: mean share of the light that is lost along a scratch; between 0 and twice this.
+        seed: which.
+    """
+
+    specks: int = 200
+    radius_um: float = 10.0
+    depth: float = 0.1
+    scratches: int = 5
+    scratch_length_um: float = 2000.0
+    scratch_width_um: float = 3.0
+    scratch_depth: float = 0.05
+    seed: int = 0
+
+    name: ClassVar[str] = "flat_structure"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.specks <= 100_000 and 0 <= self.scratches <= 1000):
+            raise ValueError(f"specks must lie in 0 ... 100000 and scratches in 0 ... 1000, got {self}")
+        if not min(self.radius_um, self.scratch_length_um, self.scratch_width_um) > 0:
+            raise ValueError(f"radius_um, scratch_length_um and scratch_width_um must be positive, got {self}")
+        if not (0 <= self.depth <= 0.5 and 0 <= self.scratch_depth <= 0.5):
+            raise ValueError(
+                f"depth and scratch_depth (means of up to twice as much) must lie in 0 ... 0.5, got {self}"
+            )
+        if self.seed < 0:
+            raise ValueError(f"seed must be >= 0, got {self.seed}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        image *= self.transmission(shot)
+        return image
+
+    def transmission(self, shot: Shot) -> Image:
+        """Share of the light that is left, float64 [row, col]."""
+        pixel_um = shot.detector.pitch / shot.binning * 1e3
+        row0, col0, rows, cols = shot.roi
+        left = np.ones((rows, cols))
+        rng = np.random.default_rng(self.seed)
+        for row, col, radius, depth in self._specks(rng, pixel_um):
+            _draw_speck(left, row - row0, col - col0, radius, depth)
+        for row, col, angle, length, depth in self._scratches(rng, pixel_um):
+            _draw_scratch(left, row - row0, col - col0, angle, length, self.scratch_width_um / pixel_um, depth)
+        n = shot.binning
+        return left if n == 1 else left.reshape(rows // n, n, cols // n, n).mean(axis=(1, 3))
+
+    def _specks(self, rng: np.random.Generator, pixel_um: float) -> Reals:
+        """Sensor row and column, radius in sensor pixels and depth; float64 [speck, 4]."""
+        draw = rng.random((self.specks, 4))
+        draw[:, 2] += 0.5
+        return draw * (*SENSOR_SHAPE, self.radius_um / pixel_um, 2 * self.depth)
+
+    def _scratches(self, rng: np.random.Generator, pixel_um: float) -> Reals:
+        """Sensor row and column of the middle, angle, length in sensor pixels and depth; float64 [scratch, 5]."""
+        draw = rng.random((self.scratches, 5))
+        draw[:, 3] = -np.log1p(-draw[:, 3])
+        return draw * (*SENSOR_SHAPE, np.pi, self.scratch_length_um / pixel_um, 2 * self.scratch_depth)
+
+
+def _draw_speck(left: Reals, row: float, col: float, radius: float, depth: float) -> None:
+    """Multiply a round Gaussian into `left`; row and column may lie outside."""
+    rows = _window(row, REACH * radius, left.shape[0])
+    cols = _window(col, REACH * radius, left.shape[1])
+    if rows.size and cols.size:
+        down, across = (np.exp(-0.5 * ((at - middle) / radius) ** 2) for at, middle in ((rows, row), (cols, col)))
+        left[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] *= 1 - depth * down[:, None] * across
+
+
+def _draw_scratch(left: Reals, row: float, col: float, angle: float, length: float, width: float, depth: float) -> None:
+    """Multiply a straight line with a Gaussian across it and at its ends into `left`; only pixels near it are touched.
+
+    The line is followed along the axis that it is nearer to, and drawn square to that axis at each pixel of it.
+    """
+    if abs(np.sin(angle)) < abs(np.cos(angle)):
+        left, row, col, angle = left.T, col, row, np.pi / 2 - angle
+    along, beside = np.sin(angle), np.cos(angle)
+    steps = _window(row, abs(along) * length / 2 + REACH * width, left.shape[0])
+    # Across a line at an angle, a width w is w / cos as seen along the axis: at most √2 w.
+    reach = int(np.ceil(REACH * width * np.sqrt(2)))
+    middle = np.rint(col + (steps - row) * beside / along).astype(np.int64)
+    at = middle[:, None] + np.arange(-reach, reach + 1)
+    dy, dx = (steps - row)[:, None], at - col
+    t, s = dy * along + dx * beside, dx * along - dy * beside  # pixels along the line and across
+    beyond = np.maximum(np.abs(t) - length / 2, 0.0)
+    loss = depth * np.exp(-0.5 * (s**2 + beyond**2) / width**2)
+    inside = (at >= 0) & (at < left.shape[1])
+    left[np.broadcast_to(steps[:, None], at.shape)[inside], at[inside]] *= 1 - loss[inside]
+
+
+def _window(middle: float, reach: float, extent: int) -> NDArray[np.int64]:
+    """Indices 0 ... extent - 1 within reach of the middle."""
+    return np.arange(max(0, int(np.ceil(middle - reach))), min(extent, int(np.floor(middle + reach)) + 1))

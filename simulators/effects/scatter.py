@@ -1,0 +1,51 @@
+"""Scatter: photons that the sample deflects arrive elsewhere, and stray light arrives whatever stands in the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from simulators.broad_blur import add_enlarged, broad_blur, gaussian
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Adds ratio x the transmitted image, levelled or broadly blurred, and a background.
+
+    The ratio is that of scattered to primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). Without the sample
+    (a flat) nothing scatters; the background is there as long as the shutter is open. Name it before the effects of the
+    scintillator.
+
+    Attributes:
+        ratio: scattered photons over transmitted ones, both as means over the frame.
+        width_mm: standard deviation of the Gaussian by which the scattered image is blurred, mm at the sample; None
+            spreads it evenly. Light beyond the edges comes back as in a mirror.
+        background: photons/s and unbinned sensor pixel; p x photons_per_s is a share p of the open beam.
+    """
+
+    ratio: float = 0.0
+    width_mm: float | None = None
+    background: float = 0.0
+
+    name: ClassVar[str] = "scatter"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.ratio >= 0 and self.background >= 0):
+            raise ValueError(f"ratio and background must be >= 0, got {self}")
+        if self.width_mm is not None and not self.width_mm > 0:
+            raise ValueError(f"width_mm must be positive (leave it out to spread evenly), got {self.width_mm} mm")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        level = self.background * shot.exposure * shot.binning**2
+        if self.ratio > 0 and shot.sample:
+            if self.width_mm is None:
+                level += self.ratio * float(image.mean())
+            else:
+                add_enlarged(image, broad_blur(image, self.width_mm / shot.detector.pitch, gaussian), self.ratio)
+        if level > 0:
+            image += level
+        return image

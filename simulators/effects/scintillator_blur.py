@@ -1,0 +1,120 @@
+"""Scintillator blur: scintillator and optics spread light over neighbours, and a little of it far away as glare."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, Literal
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from simulators.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Image, Shot
+
+TAILS = MappingProxyType({"exponential": exponential, "lorentzian": lorentzian})
+NEGLIGIBLE = 1e-9
+"""Share of a kernel's light beyond its last tap; it is given back by making the taps sum to 1."""
+MAX_CORE = 64.0
+"""Pixels of the core's sigma; the work grows with it."""
+
+
+@dataclass(frozen=True)
+class ScintillatorBlur:
+    """Point spread (1 - tail_share) Gaussian + tail_share tail, of integral 1; the frame's edges are mirrors.
+
+    The core's taps go as exp(-b n²) with the b that gives the Gaussian's variance, however narrow (the discrete normal
+    law, Kemp 1997, J. Stat. Plan. Inference 63:223); from 1 pixel of sigma on that is the Gaussian, with the transfer
+    exp(-2 (pi f sigma)²). Nothing is negative. Name it before what sits on the sensor's side of the optics.
+
+    Attributes:
+        fwhm_um: full width at half maximum of the core, um at the sample.
+        tail_share: of the light that goes into the tail, 0 ... 1 (excluded).
+        tail_um: width w of the tail, um at the sample.
+        tail: "exponential", exp(-r/w) / 2πw² with the transfer (1 + (2πfw)²)^-1.5; or "lorentzian",
+            w / 2π(r² + w²)^1.5 with the transfer exp(-2πfw), which reaches much farther.
+    """
+
+    fwhm_um: float
+    tail_share: float = 0.0
+    tail_um: float = 100.0
+    tail: Literal["exponential", "lorentzian"] = "exponential"
+
+    name: ClassVar[str] = "scintillator_blur"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not (self.fwhm_um >= 0 and self.tail_um > 0 and 0 <= self.tail_share < 1):
+            raise ValueError(f"fwhm_um must be >= 0, tail_um positive and tail_share in 0 ... 1 (excluded), got {self}")
+        if self.tail not in TAILS:
+            raise ValueError(f"tail must be one of {', '.join(TAILS)}, got {self.tail!r}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        """Raises ValueError where the core is wider than MAX_CORE pixels: a slip of units."""
+        pixel_um = shot.detector.pitch * 1e3
+        sigma = self.fwhm_um / pixel_um / math.sqrt(8 * math.log(2))
+        if sigma > MAX_CORE:
+            raise ValueError(
+                f"scintillator_blur: a core of {self.fwhm_um:g} um FWHM is {sigma:.0f} pixels (sigma) of "
+                f"{pixel_um:g} um, more than the {MAX_CORE:g} that are worked out; give a wide blur as the tail"
+            )
+        blurred = np.empty_like(image)
+        _blur(image, discrete_gaussian(sigma**2), 1 - self.tail_share, blurred)
+        if self.tail_share > 0:
+            add_enlarged(blurred, broad_blur(image, self.tail_um / pixel_um, TAILS[self.tail]), self.tail_share)
+        return blurred
+
+
+def discrete_gaussian(variance: float) -> NDArray[np.float64]:
+    """Taps 0 ... r of the discrete normal law of a variance in pixels², float64 [tap]; both sides sum to 1."""
+    if variance < NEGLIGIBLE:
+        return np.ones(1)
+    offsets = np.arange(2 + math.ceil(8 * math.sqrt(variance)), dtype=np.float64)
+
+    def taps(steepness: float) -> NDArray[np.float64]:
+        unscaled = np.exp(-steepness * offsets**2)
+        return unscaled / (2 * unscaled.sum() - 1)
+
+    steepness = 0.5 / variance
+    if variance < 1:  # narrower than the sampling: steeper than the continuous one, which would lose variance
+        steepness = brentq(lambda b: 2 * float(offsets**2 @ taps(b)) - variance, 0.4, 1 + math.log(2 / variance))
+    kept = taps(steepness)
+    beyond = 2 * np.cumsum(kept[::-1])[::-1]  # light at this tap or beyond
+    kept = kept[beyond >= NEGLIGIBLE]
+    return kept / (2 * kept.sum() - kept[0])
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _blur(image: Image, taps: NDArray[np.float64], weight: float, out: Image) -> None:
+    """out = weight x image convolved with the symmetric taps along rows and columns; the edges are mirrors."""
+    rows, cols = image.shape
+    reach = taps.size - 1
+    for j in prange(rows):
+        line = np.zeros(cols + 2 * reach)
+        middle = line[reach : reach + cols]
+        for k in range(-reach, reach + 1):
+            source = image[_mirrored(j + k, rows)]
+            tap = weight * taps[abs(k)]
+            for i in range(cols):
+                middle[i] += tap * source[i]
+        for i in range(reach):
+            line[reach - 1 - i] = middle[_mirrored(-1 - i, cols)]
+            line[reach + cols + i] = middle[_mirrored(cols + i, cols)]
+        into = out[j]
+        into[:] = 0.0
+        for k in range(2 * reach + 1):
+            tap = taps[abs(k - reach)]
+            for i in range(cols):
+                into[i] += tap * line[i + k]
+
+
+@njit(cache=True, nogil=True)
+def _mirrored(index: int, n: int) -> int:
+    """Where a line of n pixels that is mirrored at both ends, again and again, has `index`."""
+    within = index % (2 * n)
+    return within if within < n else 2 * n - 1 - within
