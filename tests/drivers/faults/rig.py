@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -291,6 +291,12 @@ class _Recorder(Recorder):
         self._at_frame.get(frame.index, lambda: None)()
 
 
+@cache
+def _instrument(*overrides: str) -> Config:
+    """A value, read once: a scan takes less time than reading it."""
+    return load(config_folder() / "instrument.yaml", overrides, environment={})
+
+
 class Rig:
     """One controller and one camera, for any number of scans.
 
@@ -330,17 +336,8 @@ class Rig:
         )
         shutter = "manual" if self.kind.levels is None else f"stage_output, output: {SHUTTER}, settle_s: 0"
         camera = f"kind: dcam, library: {self.world.path}, ring_mb: 1"
-        return load(
-            config_folder() / "instrument.yaml",
-            [
-                f"devices.stage={{{stage}}}",
-                f"devices.shutter={{kind: {shutter}}}",
-                f"devices.camera={{{camera}}}",
-                *SMALL,
-                *overrides,
-            ],
-            environment={},
-        )
+        devices = f"devices.stage={{{stage}}}", f"devices.shutter={{kind: {shutter}}}", f"devices.camera={{{camera}}}"
+        return _instrument(*devices, *SMALL, *overrides)
 
     def scan(self, runs: Path, *overrides: str) -> Scanned:
         """A whole scan: devices opened, run, closed."""

@@ -14,6 +14,7 @@ from beamline.doctor.check import Verdict
 from beamline.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.codes import Error, Property
+from tests.drivers.dcam.fake import World
 from tests.drivers.faults import table
 from tests.drivers.faults.aftermath import (
     assert_at_rest,
@@ -68,20 +69,26 @@ def test_camera_absent_at_start(rig: Rig, tmp_path: Path) -> None:
     assert_next_scan_works(rig, tmp_path)
 
 
-def calls_of_a_scan(rig: Rig, call: str, runs: Path) -> int:
-    """Calls from the moment when all devices are open, in a scan without a fault."""
-    before: list[int] = []
-    rig.after_connecting = lambda: before.append(rig.world.calls(call))
-    assert_complete(rig.scan(runs))
-    rig.repair()
-    return rig.world.calls(call) - before[0]
+CALLS = sorted(set(ARGUMENTS) - AT_CONNECTING - AFTER_A_REFUSAL)
 
 
-@pytest.mark.parametrize("call", sorted(set(ARGUMENTS) - AT_CONNECTING - AFTER_A_REFUSAL))
-def test_an_error_of_the_library(rig: Rig, call: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def calls_of_a_scan(library: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
+    """Of each kind, from the moment when all devices are open, in a scan without a fault."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        world = World(library)
+        rig = Rig(world, monkeypatch, table.CAMERA_KIND)
+        before: list[dict[str, int]] = []
+        rig.after_connecting = lambda: before.append({call: world.calls(call) for call in CALLS})
+        assert_complete(rig.scan(tmp_path_factory.mktemp("runs")))
+        return {call: world.calls(call) - before[0][call] for call in CALLS}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_an_error_of_the_library(rig: Rig, call: str, calls_of_a_scan: dict[str, int], tmp_path: Path) -> None:
     """At the first, a middle and the last such call of a scan: it ends with that error; or, where it came while frames
     were waited for, it is told and nothing is lost, or what is lost is named."""
-    n = calls_of_a_scan(rig, call, tmp_path)
+    n = calls_of_a_scan[call]
     assert n > 0
     for nth in sorted({1, (n + 1) // 2, n}):
         rig.after_connecting = lambda nth=nth: rig.world.fail(call, Error.FAILREADCAMERA, nth)  # type: ignore[misc]
