@@ -1,0 +1,91 @@
+"""On demand: a scene pays for no effect that it does not name, effects leave each other's random numbers alone, and a
+frame is the same whether it is made alone or in sequence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simulators.effects.catalogue import CATALOGUE, load_effect
+from simulators.effects.domain import Domain
+from simulators.effects.shot import Shot, draws
+from tests.simulators.effects import on_demand
+from tests.simulators.effects.parameters import PARAMETERS
+
+CHECKOUT = Path(__file__).parents[3]
+ADDITIVE = ("dark_current", "hot_pixels", "zingers", "read_noise")
+
+
+def test_every_effect_has_parameters_and_every_parameter_an_effect() -> None:
+    assert not (missing := set(CATALOGUE) - set(PARAMETERS)), f"add to parameters.py: {sorted(missing)}"
+    assert not (unknown := set(PARAMETERS) - set(CATALOGUE)), f"parameters.py names no effects: {sorted(unknown)}"
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_shows_in_some_frame(name: str) -> None:
+    """Otherwise what follows would prove nothing of it."""
+    assert not on_demand.same(on_demand.frames(on_demand.scene([name])), on_demand.frames(on_demand.scene([])))
+
+
+def test_without_an_effect_named_its_file_is_not_read_and_the_frames_are_the_same_without_it(tmp_path: Path) -> None:
+    """For each effect: a scene with all others, with its module on the disk and without it, in one other process."""
+    shutil.copytree(CHECKOUT / "simulators", tmp_path / "simulators")  # with what numba has compiled
+    worker = Path(__file__).with_name("without_its_file.py")
+    ran = subprocess.run(
+        [sys.executable, str(worker), str(tmp_path), str(CHECKOUT)], capture_output=True, text=True, timeout=200
+    )
+    assert ran.returncode == 0, ran.stderr
+    said = json.loads(ran.stdout)
+    assert said["wrong"] == {}
+    assert said["taken"] == list(CATALOGUE)
+
+
+def test_an_effect_draws_the_same_numbers_whatever_else_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And asks for none but its own; each frame has others."""
+    states: dict[str, dict[int, str]] = defaultdict(dict)
+
+    def noted(name: str, effect: str, shot: Shot) -> np.random.Generator:
+        assert effect == name
+        rng = draws(effect, shot)
+        states[name][shot.frame] = str(rng.bit_generator.state)
+        return rng
+
+    for name in CATALOGUE:
+        module = sys.modules[load_effect(name).__module__]
+        if "draws" in vars(module):
+            monkeypatch.setattr(module, "draws", partial(noted, name))
+    on_demand.frames(on_demand.scene(list(CATALOGUE)), range(4))
+    among = dict(states)
+    assert {"photon_noise", "runout", "read_noise"} <= set(among)
+    for name, drawn in among.items():
+        states.clear()
+        on_demand.frames(on_demand.scene([name]), range(4))
+        assert states == {name: drawn}
+        assert len(set(drawn.values())) == len(drawn) >= 2
+
+
+@pytest.mark.parametrize(("first", "second"), list(combinations(ADDITIVE, 2)))
+def test_what_two_effects_add_is_what_each_adds_alone(first: str, second: str) -> None:
+    shot = on_demand.shot(2)
+
+    def added(*names: str) -> np.ndarray:
+        return on_demand.scene(names).chain.apply(Domain.ELECTRONS, np.zeros(shot.detector.shape), shot)
+
+    np.testing.assert_allclose(added(first, second), added(first) + added(second), atol=1e-9)
+
+
+def test_a_frame_alone_is_the_frame_in_sequence() -> None:
+    names = list(CATALOGUE)
+    in_sequence = on_demand.frames(on_demand.scene(names), range(5))
+    assert not on_demand.same(in_sequence[2:3], in_sequence[3:4])
+    for number in (4, 0, 3):
+        assert on_demand.same(on_demand.frames(on_demand.scene(names), [number]), in_sequence[number : number + 1])
