@@ -25,6 +25,7 @@ from beamline.terminal import Terminal
 from drivers.clock import SystemClock
 from simulators.shots import Scan
 
+_OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
@@ -41,6 +42,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option("--picture", type=_FILE, help="Write a PNG with some of the frames; beside --out unless given.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all random numbers.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def simulate(
     scene: str,
@@ -51,6 +53,7 @@ def simulate(
     truth_bin: int | None,
     picture: Path | None,
     seed: int,
+    overrides: tuple[str, ...],
     as_json: bool,
 ) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
@@ -64,7 +67,7 @@ def simulate(
         raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
     clock = SystemClock()
     with told_as_json(as_json) as sinks:
-        opened = open_scene(scene)
+        opened = open_scene(scene, overrides)
         scan = Scan.of(opened.scene, seed, views, clock.now())
         picture = out.with_suffix(".png") if out and not picture else picture
         for path in filter(None, (truth, picture)):

@@ -15,6 +15,7 @@ from simulators.exposure import expose
 from simulators.shots import Scan
 
 COLUMNS, PICTURES = 4, 8
+_COLOURS = ("tab:orange", "tab:cyan", "tab:pink", "tab:olive", "tab:green", "tab:red", "tab:purple")
 MOST = 512  # pixels a side that a picture of 2 inches can show
 
 
@@ -44,12 +45,12 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
         kind = planned.kind.name.lower()
         angle = f" at {np.degrees(planned.shot.angle):.1f}°" if planned.kind is FrameKind.PROJECTION else ""
         axes.set_title(f"{number}: {kind}{angle}", fontsize=8)
-        for label in scan.scene.chain.labels(planned.shot):
+        for row, label in enumerate(scan.scene.chain.labels(planned.shot)):
             top, bottom, left, right = (edge / step for edge in label.region)
-            axes.add_patch(
-                Rectangle((left - 0.5, top - 0.5), right - left, bottom - top, fill=False, color="tab:orange", lw=1.2)
-            )
-            axes.text(left, top, label.kind, color="tab:orange", fontsize=7, va="top")
+            colour = _COLOURS[sum(label.kind.encode()) % len(_COLOURS)]
+            corner, size = (left - 0.5, top - 0.5), (right - left, bottom - top)
+            axes.add_patch(Rectangle(corner, *size, fill=False, color=colour, lw=1.2))
+            axes.text(0.02, 0.97 - 0.07 * row, label.kind, color=colour, fontsize=7, va="top", transform=axes.transAxes)
     figure.suptitle(f"counts {low:.0f} (black) to {high:.0f} (white)", fontsize=8)
     figure.tight_layout()
     out = io.BytesIO()

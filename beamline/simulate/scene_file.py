@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from beamline.config import config_folder
-from beamline.config_text import read
+from beamline.config_text import override, read
 from beamline.errors import ConfigError
 from beamline.storage.volume_file import read_volume
 from simulators.mapping import SceneError
@@ -19,7 +22,7 @@ class SceneFile:
     """A scene, and where it stands.
 
     Attributes:
-        text: the file's, for the record.
+        text: the file's, for the record; with what was put over it.
     """
 
     scene: Scene
@@ -32,8 +35,8 @@ def shipped_scenes() -> dict[str, Path]:
     return {path.stem: path for path in sorted((config_folder() / "scenes").glob("*.yaml"))}
 
 
-def open_scene(name: str) -> SceneFile:
-    """The scene that `name` says: a file, or the name of a shipped one.
+def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
+    """The scene that `name` says: a file, or the name of a shipped one, with KEY=VALUE `overrides` put over it.
 
     Raises:
         ConfigError: there is no such scene, or it is wrong.
@@ -52,7 +55,10 @@ def open_scene(name: str) -> SceneFile:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read ({error}). Nothing was simulated.") from error
     try:
-        return SceneFile(load_scene(read(text, str(path)).data, volumes_beside(path.parent)), path, text)
+        tree = override(read(text, str(path)), overrides, environment={})
+        if overrides:
+            text = yaml.safe_dump(tree.data, sort_keys=False)
+        return SceneFile(load_scene(tree.data, volumes_beside(path.parent)), path, text)
     except SceneError as error:
         raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
 
