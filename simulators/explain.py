@@ -127,7 +127,7 @@ def _steps(scene: Scene, shot: Shot, now: Seconds, repeats: int) -> tuple[dict[s
 
 
 def _whole(scenes: Sequence[Scene], shot: Shot, now: Seconds, repeats: int) -> list[list[float]]:
-    """Seconds of a frame of each scene, [repeat][scene]: in turns, so that a machine that slows down does so for all."""
+    """Seconds of a frame of each scene, [repeat][scene]; in turns, for a machine that slows down does so for all."""
     runs: list[list[float]] = []
     for _ in range(repeats + 1):
         run = []
