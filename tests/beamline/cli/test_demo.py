@@ -31,7 +31,7 @@ SCENE = (
 def _small(*more: str) -> Config:
     overrides = (
         f"simulation.scene={SCENE}",
-        "simulation.clock={speed: 4.0}",
+        "simulation.clock={speed: 10.0}",
         "devices.camera.roi=[1140, 2032, 24, 32]",
         "devices.stage.low_deg=-90",
         "scan.angles.views=24",
