@@ -37,23 +37,30 @@ def test_the_expansion_lies_within_its_bound() -> None:
 
 
 @pytest.mark.parametrize("mean", [LEAST, 3.3, 17.0, 240.0, 5e3, 1e5])
-def test_the_sums_find_the_quantile(mean: float) -> None:
-    for w in np.random.default_rng(1).uniform(-7, 7, 100):
+def test_the_sums_find_the_quantile_at_its_very_edges(mean: float) -> None:
+    """Where Φ(w) passes scipy's P(K <= k), the quantile goes from k to k + 1; seven standard deviations either way."""
+    spread = math.sqrt(mean)
+    for k in np.unique(np.rint(np.linspace(max(mean - 7 * spread, 0), mean + 7 * spread, 40))):
+        lower, upper = stats.poisson.cdf(k, mean), stats.poisson.sf(k, mean)
+        edge = special.ndtri(lower) if lower < 0.5 else -special.ndtri(upper)
+        assert summed(edge - 1e-8, mean) == k
+        assert summed(edge + 1e-8, mean) == k + 1
+    for w in (-8.2, -5.5, 5.5, 8.2):  # far from where the expansion is right
         k = summed(w, mean)
-        if w < 0:
-            below = special.ndtr(w)
-            assert stats.poisson.cdf(k, mean) >= below * (1 - 1e-9)
-            assert stats.poisson.cdf(k - 1, mean) <= below * (1 + 1e-9)
-        else:
-            above = special.ndtr(-w)
-            assert stats.poisson.sf(k, mean) <= above * (1 + 1e-9)
-            assert stats.poisson.sf(k - 1, mean) >= above * (1 - 1e-9)
+        tail = special.ndtr(-abs(w))
+        inner, outer = (stats.poisson.cdf(k + n, mean) if w < 0 else stats.poisson.sf(k - 1 - n, mean) for n in (0, -1))
+        assert outer <= tail <= inner or k == 0
 
 
 @pytest.mark.parametrize("mean", [1e-6, 0.01, 0.7, LEAST])
 def test_small_expectations_are_looked_up(mean: float) -> None:
-    u = np.random.default_rng(2).random(500)
-    np.testing.assert_array_equal([searched(value, mean) for value in u], stats.poisson.ppf(u, mean))
+    for k in range(6):
+        edge = stats.poisson.cdf(k, mean)
+        if stats.poisson.pmf(k, mean) > 1e-12:
+            assert searched(edge - 1e-13, mean) == k
+        if stats.poisson.pmf(k + 1, mean) > 1e-12:
+            assert searched(edge + 1e-13, mean) == k + 1
+    assert searched(0.0, mean) == 0
     assert searched(1 - 2**-53, mean) < 30
 
 
