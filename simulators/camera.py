@@ -19,7 +19,7 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.detector import Detector
-from simulators.effects.shot import Shot
+from simulators.effects.shot import CannotExposeError, Shot
 from simulators.exposure import expose
 from simulators.scene import Scene
 from simulators.sensor import CONVERSION, OFFSET
@@ -298,5 +298,9 @@ class SimulatedOrcaQuest:
             frame=frame.number,
             view=frame.view,
         )
-        counts = expose(self._scene, shot)
+        try:
+            counts = expose(self._scene, shot)
+        except CannotExposeError as error:
+            advice = "Change the scene, or the settings that it does not go with"
+            raise DeviceRefused(self.name, f"cannot show the scene: {error}", advice=advice) from error
         return CameraFrame(counts, frame.framestamp, frame.time)

@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
 from beamline.cli.scan import stop_signals
 from beamline.cli.told import told_as_json
 from beamline.errors import ConfigError, ScanStopped
-from beamline.events import Event, fan_out
+from beamline.events import Event, Sink, fan_out
 from beamline.machine import machine, machine_line
 from beamline.simulate.explained import explained, table
 from beamline.simulate.figure import sheet
-from beamline.simulate.scene_file import open_scene
+from beamline.simulate.scene_file import Scan, SceneFile, begun, open_scene, shown
 from beamline.simulate.truth import binning_of, truth_of, write_truth
-from beamline.simulate.write import write_scan
+from beamline.simulate.write import Simulated, write_scan
 from beamline.stop import StopRequest
 from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
 from beamline.terminal import Terminal
-from drivers.clock import SystemClock
-from simulators.shots import Scan
+from drivers.clock import Clock, SystemClock
 
 _OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -66,54 +67,73 @@ def simulate(
     if not (explains or out or truth or picture):
         raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
     clock = SystemClock()
-    with told_as_json(as_json) as sinks:
+    with told_as_json(as_json) as sinks, shown(scene):
         opened = open_scene(scene, overrides)
-        scan = Scan.of(opened.scene, seed, views, clock.now())
+        scan = begun(opened, seed, views, clock.now())
         picture = out.with_suffix(".png") if out and not picture else picture
         for path in filter(None, (truth, picture)):
             refuse_existing(path)
+        tell = _Teller(fan_out(*sinks), clock, plain=not as_json)
         if explains:
-            found = explained(scan, time.perf_counter)
-            for sink in sinks:
-                sink(Event("explain", clock.now(), asdict(found) | {"machine": machine()}))
-            if not as_json:
-                click.echo(f"{machine_line(machine())}\n\n{table(found)}")
-        data: dict[str, object] = {}
+            _explain(scan, tell)
+        made: dict[str, object] = {}
         if truth:
-            try:
-                made = truth_of(scan.scene.sample, scan.detector, truth_bin or binning_of(scan.detector))
-            except ValueError as error:
-                raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
-            write_truth(truth, made)
-            data["truth"] = truth
-            _say(
-                as_json,
-                "truth",
-                f"{truth}  {' x '.join(map(str, made.grid.shape))} voxels of {made.grid.voxel_size:.4g} mm",
-            )
-        written = None
-        if out:
-            stop = StopRequest()
-            with stop_signals(stop), Terminal(sys.stderr) as terminal:
-                written = write_scan(opened, scan, out, fan_out(terminal, *sinks), clock, lambda: stop.stopping)
-            data |= {"output": out, "labels": written.labels, "n_frames": written.n_frames}
-            _say(as_json, "scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
-            counts = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
-            _say(as_json, "labels", f"{written.labels}  {counts or 'no anomaly'}")
+            made |= _truth(scan, truth, truth_bin, tell)
+        written = _scan(opened, scan, out, tell, fan_out(*sinks)) if out else None
+        if written:
+            made |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
         if picture and not (written and written.stopped):
             marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
             with named_on_failure(picture), whole_file(picture) as partial:
                 partial.write_bytes(sheet(scan, marked))
-            data["picture"] = picture
-            _say(as_json, "picture", str(picture))
+            made |= {"picture": picture}
+            tell("picture", str(picture))
         if written and written.stopped:
             raise ScanStopped(
                 f"Stopped after {written.n_frames} of {len(scan)} frames; {out} is complete as far as it goes."
             )
-        for sink in sinks:
-            sink(Event("done", clock.now(), data))
+        tell.event("done", made)
 
 
-def _say(as_json: bool, what: str, text: str) -> None:
-    if not as_json:
-        click.echo(f"{what:<10}{text}")
+class _Teller:
+    """Tells people in lines, programs in events."""
+
+    def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
+        self._sink, self._clock, self._plain = sink, clock, plain
+
+    def __call__(self, what: str, text: str) -> None:
+        self.lines(f"{what:<10}{text}")
+
+    def lines(self, text: str) -> None:
+        if self._plain:
+            click.echo(text)
+
+    def event(self, name: str, data: Mapping[str, Any]) -> None:
+        self._sink(Event(name, self._clock.now(), data))
+
+
+def _explain(scan: Scan, tell: _Teller) -> None:
+    found, where = explained(scan, time.perf_counter), machine()
+    tell.event("explain", asdict(found) | {"machine": where})
+    tell.lines(f"{machine_line(where)}\n\n{table(found)}")
+
+
+def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[str, object]:
+    try:
+        truth = truth_of(scan.scene.sample, scan.detector, binning or binning_of(scan.detector))
+    except ValueError as error:
+        raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
+    write_truth(path, truth)
+    voxels = " x ".join(map(str, truth.grid.shape))
+    tell("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm")
+    return {"truth": path}
+
+
+def _scan(scene: SceneFile, scan: Scan, out: Path, tell: _Teller, sink: Sink) -> Simulated:
+    stop = StopRequest()
+    with stop_signals(stop), Terminal(sys.stderr) as terminal:
+        written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), lambda: stop.stopping)
+    tell("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
+    found = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
+    tell("labels", f"{written.labels}  {found or 'no anomaly'}")
+    return written

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +13,14 @@ from beamline.config import config_folder
 from beamline.config_text import override, read
 from beamline.errors import ConfigError
 from beamline.storage.volume_file import read_volume
+from simulators.effects.shot import CannotExposeError
+from simulators.exposure import expose
 from simulators.mapping import SceneError
 from simulators.scene import Scene, load_scene
+from simulators.shots import Scan
 from simulators.stored import ReadVolume, Stored
+
+__all__ = ["Scan", "SceneFile", "begun", "open_scene", "shipped_scenes", "shown", "volumes_beside"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +67,30 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
         return SceneFile(load_scene(tree.data, volumes_beside(path.parent)), path, text)
     except SceneError as error:
         raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
+
+
+def begun(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
+    """The scan of a scene, see Scan.of; its last frame has been made once, so that what cannot be is known by now.
+
+    Raises:
+        CannotExposeError: the scene cannot be exposed as it asks for.
+    """
+    scan = Scan.of(scene.scene, seed, views, start)
+    expose(scan.scene, scan.frame(len(scan) - 1).shot)
+    return scan
+
+
+@contextmanager
+def shown(scene: str) -> Iterator[None]:
+    """What a scene cannot show, though each of its values is legal, is told as what is wrong with it.
+
+    Raises:
+        ConfigError: instead of CannotExposeError.
+    """
+    try:
+        yield
+    except CannotExposeError as error:
+        raise ConfigError(f"{scene} cannot be exposed: {error}.") from error
 
 
 def volumes_beside(folder: Path) -> ReadVolume:

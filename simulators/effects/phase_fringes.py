@@ -14,7 +14,7 @@ from scipy import fft
 from simulators.broad_blur import add_enlarged
 from simulators.detector import Detector
 from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.effects.shot import CannotExposeError, Image, Shot
 
 HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""
@@ -65,7 +65,7 @@ class PhaseFringes:
         return HC / self.energy
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises ValueError where the wave or the propagator would alias, with what would help."""
+        """Raises CannotExposeError where the wave or the propagator would alias, with what would help."""
         z = self.distance / (1 + self.distance / shot.detector.sod)
         self._check_propagator(z, shot.detector)
         self._check_wave(image)
@@ -83,17 +83,18 @@ class PhaseFringes:
         return np.negative(image, out=image)
 
     def _check_propagator(self, z: float, detector: Detector) -> None:
-        """Between neighbouring frequencies 1 / (2 N p) the propagator may turn by less than pi at the highest, 1 / 2p:
-        wavelength z < N p² (Voelz & Roggemann 2009, Appl. Opt. 48:6132), p the oversampled pixel."""
-        pitch = detector.pitch / self.oversampling
-        extent = min(detector.shape) * self.oversampling * pitch**2
-        if self.wavelength * z > extent:
-            fresnel = math.inf if z == 0 else detector.pitch**2 / (self.wavelength * z)
-            raise ValueError(
+        """Critical sampling of N (finer) pixels p: wavelength z <= N p² (Voelz & Roggemann 2009, Appl. Opt. 48:6132).
+
+        There the finest fringes walk wavelength z / 2p, half the frame, and meet their mirrors.
+        """
+        n, pitch = min(detector.shape), detector.pitch
+        farthest = n * pitch**2 / self.oversampling / self.wavelength
+        if z > farthest:
+            raise CannotExposeError(
                 f"phase_fringes: the propagator would alias over {z:g} mm (effective) at {self.energy:g} keV: pixels "
-                f"of {detector.pitch * 1e3:g} um have a Fresnel number of {fresnel:.2g} and {min(detector.shape)} of "
-                f"them with oversampling {self.oversampling} need at least {self.oversampling / min(detector.shape):.2g}; "
-                f"give at most {extent / self.wavelength:.3g} mm, larger pixels or a larger frame"
+                f"of {pitch * 1e3:g} um have a Fresnel number of {pitch**2 / (self.wavelength * z):.2g}, and {n} of "
+                f"them with oversampling {self.oversampling} need {self.oversampling / n:.2g} or more; give at most "
+                f"{farthest:.3g} mm, larger pixels or a larger frame"
             )
 
     def _check_wave(self, depth: Image) -> None:
@@ -102,7 +103,7 @@ class PhaseFringes:
         step = max((float(np.abs(np.diff(seen, axis=axis)).max(initial=0.0)) for axis in (0, 1)), default=0.0)
         turn = step * self.delta_beta / 2
         if turn > math.pi * self.oversampling:
-            raise ValueError(
+            raise CannotExposeError(
                 f"phase_fringes: the wave would alias: with delta_beta {self.delta_beta:g} its phase turns by "
                 f"{turn:.3g} rad from pixel to pixel, and oversampling {self.oversampling} follows "
                 f"{math.pi * self.oversampling:.3g}; give oversampling {math.ceil(turn / math.pi)}, smaller pixels or "

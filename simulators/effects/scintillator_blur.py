@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from simulators.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
 from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.effects.shot import CannotExposeError, Image, Shot
 
 TAILS = MappingProxyType({"exponential": exponential, "lorentzian": lorentzian})
 NEGLIGIBLE = 1e-9
@@ -55,11 +55,11 @@ class ScintillatorBlur:
             raise ValueError(f"tail must be one of {', '.join(TAILS)}, got {self.tail!r}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises ValueError where the core is wider than MAX_CORE pixels: a slip of units."""
+        """Raises CannotExposeError where the core is wider than MAX_CORE pixels: a slip of units."""
         pixel_um = shot.detector.pitch * 1e3
         sigma = self.fwhm_um / pixel_um / math.sqrt(8 * math.log(2))
         if sigma > MAX_CORE:
-            raise ValueError(
+            raise CannotExposeError(
                 f"scintillator_blur: a core of {self.fwhm_um:g} um FWHM is {sigma:.0f} pixels (sigma) of "
                 f"{pixel_um:g} um, more than the {MAX_CORE:g} that are worked out; give a wide blur as the tail"
             )

@@ -15,6 +15,10 @@ Image = NDArray[np.float64]
 AngleAt = Callable[[float], float]
 
 
+class CannotExposeError(ValueError):
+    """The scene cannot be exposed in this way, though each of its values is legal; the message says what would help."""
+
+
 @dataclass(frozen=True, eq=False)
 class Shot:
     """The circumstances of one exposure.

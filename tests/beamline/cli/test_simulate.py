@@ -32,6 +32,8 @@ scan: {views: 12, darks: 2, flats: 2}
 effects: [photon_noise, read_noise, offset]
 """
 
+FRINGES = "{kind: phase_fringes, delta_beta: 3000, distance: 1, energy: 20}"
+
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -126,6 +128,7 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
         (("scene.yaml",), 2, "Nothing to do: ask for --explain"),
         (("broken.yaml", "--explain"), 2, "scene.beam: key 'photons' is unknown"),
         (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
+        (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
         (("scene.yaml", "--out", "there.h5"), 5, "there.h5 exists"),
         (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),
     ],
