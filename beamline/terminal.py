@@ -71,7 +71,7 @@ class Terminal:
     def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
-        elif event.event == "progress" and event.data.get("stage") == "ingest":
+        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs"):
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
         elif event.event == "progress" and event.data.get("stage") == "tradeoff":
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))
@@ -118,7 +118,7 @@ def rates(data: Mapping[str, Any]) -> str:
 
 
 def copied(data: Mapping[str, Any]) -> str:
-    """n/N, frames/s and the time left, of an ingest's `progress` event."""
+    """n/N, frames/s and the time left, of a `progress` event of frames that are copied, or taken at one energy each."""
     return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
 
 

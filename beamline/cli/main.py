@@ -33,6 +33,7 @@ _COMMANDS = {
     "home": _Entry("home", "Search the stage's reference; the stage turns."),
     "scan": _Entry("scan", "Run a scan (or, with --dry-run, say what it would do)."),
     "simulate": _Entry("simulate", "Frames of a scene without an instrument: file, labels, truth, cost."),
+    "xafs": _Entry("xafs", "At which energy a material stands out most: absorption edge, white line, contrast."),
     "recon": _Entry("recon", "Reconstruct a scan, finished or still growing."),
     "tradeoff": _Entry("tradeoff", "What accuracy costs in time: many reconstructions of a scan, compared."),
     "bench": _Entry("bench", "Measure this machine: kernels, fits, and the quality they give in a time."),

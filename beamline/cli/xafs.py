@@ -1,0 +1,161 @@
+"""`beamline xafs`: at which energy a material stands out most, from a scene or from measured energies."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.cli.numbers import POSITIVE, SEED, FiniteRange
+from beamline.cli.scan import stop_signals
+from beamline.cli.scan_options import underscored
+from beamline.cli.told import told_as_json
+from beamline.errors import DataError, QualityError, ScanStopped
+from beamline.events import Event, fan_out
+from beamline.simulate.energy_scan import open_energy_scan
+from beamline.stop import StopRequest
+from beamline.terminal import Terminal
+from beamline.xafs.contrast import Curve
+from beamline.xafs.edge import LEAST, find_edge
+from beamline.xafs.measured import Asked, open_series
+from beamline.xafs.results import Found, lines, refuse_existing_results, table_beside, write
+from beamline.xafs.series import Series, Taken, take
+from drivers.clock import SystemClock
+
+Box = tuple[int, int, int, int]
+
+MOST = 5000
+_SCENES = (".yaml", ".yml", "")
+_OF_SCENES = ("step", "material", "angle", "seed")
+_OF_FILES = ("region", "around", "unit", "quantity")
+_BOX = "ROW:END,COL:END"
+
+
+def box(ctx: click.Context, param: click.Parameter, value: str | None) -> Box | None:
+    """`first:end,first:end` of rows and columns."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+):(\d+),(\d+):(\d+)", value)
+    if match is None or int(match[1]) >= int(match[2]) or int(match[3]) >= int(match[4]):
+        raise click.BadParameter(f"{value!r} is not {_BOX}, e.g. 100:200,50:120")
+    return int(match[1]), int(match[2]), int(match[3]), int(match[4])
+
+
+@click.command()
+@click.argument("source", metavar="SCENE|FILE")
+@click.option("--from", "low", type=POSITIVE, metavar="KEV", help="First energy; a scene needs it.")
+@click.option("--to", "high", type=POSITIVE, metavar="KEV", help="Last energy; a scene needs it.")
+@click.option("--step", type=POSITIVE, metavar="KEV", help="Between a scene's energies; 0.001 unless given.")
+@click.option("--material", metavar="NAME", help="Of the scene; the one with a state of charge unless given.")
+@click.option("--angle", type=FiniteRange(), metavar="DEG", help="At which the scene's stage stands; 0 unless given.")
+@click.option("--seed", type=SEED, help="Of all random numbers of a scene; 0 unless given.")
+@click.option("--region", callback=box, metavar=_BOX, help="The material in a file's frames; all of them unless given.")
+@click.option("--around", callback=box, metavar=_BOX, help="What it is compared with; nothing unless given.")
+@click.option("--unit", type=click.Choice(["keV", "eV"]), help="Of a file's energies; as the file says, else keV.")
+@click.option(
+    "--quantity",
+    type=click.Choice(["counts", "line-integrals"]),
+    callback=underscored,
+    help="What a file's frames are; counts, with flats, unless given.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Picture (.png), with the table beside it (.csv). Default: the source's stem + _xafs.png, here.",
+)
+@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+def xafs(
+    source: str,
+    low: float | None,
+    high: float | None,
+    step: float | None,
+    material: str | None,
+    angle: float | None,
+    seed: int | None,
+    region: Box | None,
+    around: Box | None,
+    unit: str | None,
+    quantity: str | None,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Find the energy at which a material stands out most of what is around it, and its absorption edge.
+
+    SCENE is a YAML file or the name of a scene that comes with the package: its radiographs are simulated at all
+    energies from --from to --to. FILE is a text table of energy and absorption, or an HDF5 file with `energy` and
+    either `mu` or `frames` and `flats`.
+
+    Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6 where no edge is
+    seen: picture and table are written all the same.
+    """
+    target = output or Path(f"{Path(source).stem}_xafs.png")
+    if target.suffix.lower() != ".png":
+        raise click.BadParameter(f"{str(target)!r} is no picture; name a .png file", param_hint="--output")
+    is_scene = Path(source).suffix.lower() in _SCENES
+    _refuse_foreign(click.get_current_context(), _OF_FILES if is_scene else _OF_SCENES)
+    refuse_existing_results(target)
+    clock, stop = SystemClock(), StopRequest()
+    with told_as_json(as_json) as sinks, ExitStack() as opened:
+        opened.enter_context(stop_signals(stop))
+        series: Series | Curve
+        if is_scene:
+            series = open_energy_scan(
+                source, _grid(low, high, step or 0.001), material, math.radians(angle or 0.0), seed or 0
+            ).series()
+        else:
+            asked = Asked(low or 0.0, high or math.inf, region, around, unit, quantity)
+            series = opened.enter_context(open_series(Path(source), asked))
+        with Terminal(sys.stderr) as terminal:
+            sink = fan_out(*(sinks or [terminal]))
+            taken = Taken(series) if isinstance(series, Curve) else take(series, sink, clock, lambda: stop.stopping)
+        found = _found(Path(source).name if isinstance(series, Curve) else series.what, taken)
+        write(found, target)
+        for done in sinks:
+            said = found.data() | {"picture": target, "table": table_beside(target), "stopped": taken.cut}
+            done(Event("done", clock.now(), said))
+    if not as_json:
+        click.echo("\n".join([*lines(found), f"written     {target}, {table_beside(target)}"]))
+    if taken.cut:
+        raise ScanStopped(f"Stopped after {taken.curve.energies.size} energies; picture and table hold them.")
+    if not found.edge.seen:
+        raise QualityError(f"No absorption edge is seen: {found.edge.why}. Picture and table were written.")
+
+
+def _found(what: str, taken: Taken) -> Found:
+    """What a curve shows. Raises ScanStopped or DataError, with nothing written: it has too few energies."""
+    energies = taken.curve.energies
+    if energies.size < LEAST:
+        if taken.cut:
+            raise ScanStopped(f"Stopped after {energies.size} energies, too few for an edge; nothing was written.")
+        raise DataError(f"{what}: {energies.size} energies are too few for an edge, which takes {LEAST}.")
+    if not (np.diff(energies) > 0).all():
+        raise DataError(f"{what}: an energy occurs twice. Nothing was written.")
+    return Found(what, taken.curve, find_edge(energies, taken.curve.absorption))
+
+
+def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.float64]:
+    """Energies from low to high, keV. Raises UsageError: they are not said, too few, or too many."""
+    if low is None or high is None:
+        raise click.UsageError("A scene is scanned over energies that you say: --from 8.30 --to 8.42, in keV.")
+    n = math.floor((high - low) / step * (1 + 1e-9) + 1e-9) + 1
+    if not LEAST <= n <= MOST:
+        raise click.UsageError(
+            f"From {low:g} to {high:g} keV in steps of {step:g} are {max(n, 0)} energies; it must be {LEAST} to {MOST}."
+        )
+    return low + step * np.arange(n, dtype=np.float64)
+
+
+def _refuse_foreign(ctx: click.Context, foreign: Sequence[str]) -> None:
+    """Raises UsageError where an option is given that says nothing of such a source."""
+    given = [name for name in foreign if ctx.params.get(name) is not None]
+    if given:
+        kind = "measured files, not for scenes" if foreign is _OF_FILES else "scenes, not for measured files"
+        raise click.UsageError(f"--{given[0]} is for {kind}.")

@@ -1,0 +1,174 @@
+"""Energy scan: radiographs of a scene at one energy after another, and where in them a material is to be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from beamline.config_text import read
+from beamline.errors import ConfigError
+from beamline.simulate.scene_file import open_scene, volumes_beside
+from beamline.xafs.contrast import Regions
+from beamline.xafs.series import Series
+from simulators.beam import Beam
+from simulators.exposure import expose
+from simulators.mapping import SceneError
+from simulators.parts import Constituent, Mixture
+from simulators.scene import load_scene
+from simulators.shots import Scan
+from simulators.spectrum import Attenuation, light
+
+Reals = NDArray[np.float64]
+
+FLATS = 4
+"""Frames without the sample before each energy's radiograph, as at a beamline: the beam changes with the energy."""
+THICK = 0.5  # of the most: pixels with so much of the material show it
+NEAR = 24  # pixels around the material that are its surrounding
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyScan:
+    """A scene to be seen at many energies. Make one with `open_energy_scan`.
+
+    Attributes:
+        name: of the scene.
+        beam: its light, of any energy.
+        energies: keV, [n].
+        angle: radians at which the stage stands.
+        material: what is looked at.
+        regions: where it is.
+    """
+
+    name: str
+    scan: Scan
+    sample: Mixture
+    beam: Beam
+    energies: Reals
+    angle: float
+    material: str
+    regions: Regions
+
+    def series(self) -> Series:
+        """Its radiographs, made as they are asked for."""
+        what = f"{self.material} in {self.name}, simulated"
+        return Series(what, self.energies.size, self.frames(self.energies), self.regions)
+
+    def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
+        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene: a dark level once, then
+        flats and a radiograph each, one after the other as the scene's period has it."""
+        n_darks = max(self.scan.scene.scan.darks, 1)
+        dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(n_darks)], axis=0)
+        number = n_darks
+        for energy in energies.tolist():
+            here = self._at(energy)
+            flat = np.mean([here._counts(number + k, sample=False) for k in range(FLATS)], axis=0) - dark
+            signal = here._counts(number + FLATS) - dark
+            number += FLATS + 1
+            # A pixel without light is taken to have half a count, as the correction of scans takes it.
+            yield energy, -np.log(np.maximum(signal, 0.5) / np.maximum(flat, 0.5))
+
+    def _at(self, energy: float) -> EnergyScan:
+        """The same scan in light of that energy."""
+        beam = replace(self.beam, energy_kev=energy)
+        matter = [m.attenuation for c in self.sample.constituents for m in (c.material, c.instead_of) if m is not None]
+        spectrum = light(beam, matter, 2 * self.sample.radius, _no_filters)
+        sample = self.sample.under(spectrum)
+        scene = replace(self.scan.scene, sample=sample, beam=beam)
+        return replace(self, scan=replace(self.scan, scene=scene), sample=sample)
+
+    def _counts(self, number: int, beam: bool = True, sample: bool = True) -> Reals:
+        """A frame, counts [row, col]; the stage stands."""
+        time = number * self.scan.scene.scan.period_s
+        shot = replace(
+            self.scan.frame(len(self.scan) - self.scan.views).shot,
+            angle=self.angle,
+            angle_at=lambda at: self.angle,
+            time=self.scan.start + time,
+            elapsed=time,
+            beam=beam,
+            sample=sample,
+            frame=number,
+            view=0,
+        )
+        return expose(self.scan.scene, shot).astype(np.float64)
+
+
+def open_energy_scan(
+    name: str, energies: Reals, material: str | None = None, angle: float = 0.0, seed: int = 0
+) -> EnergyScan:
+    """A scene, ready to be seen at `energies` (keV).
+
+    Args:
+        name: a scene file, or the name of a shipped scene.
+        material: that is looked at; None: the one with a state of charge.
+        angle: radians at which the stage stands.
+        seed: of all random numbers.
+
+    Raises:
+        ConfigError: there is no such scene, its sample is grey, or the material is not to be seen.
+    """
+    opened = open_scene(name)
+    mapping = dict(read(opened.text, str(opened.path)).data)
+    said = opened.scene.beam
+    # Light of all the range makes any phantom of materials a mixture, whose chords serve every energy.
+    ends: dict[str, Any] = {"spectrum": [[float(energies.min()), 1.0], [float(energies.max()), 1.0]]}
+    kept = {key: value for key, value in mapping["beam"].items() if key in ("photons_per_s", "sod", "sdd")}
+    try:
+        scene = load_scene(mapping | {"beam": kept | ends}, volumes_beside(opened.path.parent))
+    except SceneError as error:
+        raise ConfigError(f"{opened.path}: {error}. Nothing was simulated.") from None
+    if not isinstance(scene.sample, Mixture):
+        raise ConfigError(
+            f"{opened.path}: no solid of the sample names a material, so that it is alike at every energy; give them "
+            "material: instead of attenuation:. Nothing was simulated."
+        )
+    beam = Beam(said.photons_per_s, said.sod, said.sdd, float(energies.mean()), said.bandwidth, said.harmonics)
+    chosen = _chosen(scene.sample, material)
+    scan = Scan.of(scene, seed)
+    try:
+        regions = _regions(scene.sample, chosen, scan, angle)
+    except ValueError as error:
+        raise ConfigError(f"{opened.path}: {chosen} cannot be compared: {error}. Nothing was simulated.") from None
+    return EnergyScan(opened.path.stem, scan, scene.sample, beam, energies, angle, chosen, regions)
+
+
+def _chosen(sample: Mixture, wanted: str | None) -> str:
+    """The material to look at. Raises ConfigError: it is not there, or several could be meant."""
+    there = {c.material.name: c.material for c in sample.constituents if c.material is not None}
+    if wanted is None:
+        charged = [name for name, material in there.items() if material.state_of_charge is not None]
+        if len(charged) == 1:
+            return charged[0]
+        raise ConfigError(
+            f"{len(charged)} materials of the scene have a state_of_charge; say which one to look at with --material, "
+            f"of {', '.join(there)}. Nothing was simulated."
+        )
+    if wanted not in there:
+        raise ConfigError(f"The scene has no material {wanted!r}; it has {', '.join(there)}. Nothing was simulated.")
+    return wanted
+
+
+def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Regions:
+    """Pixels with much of the material, and those next to it with none of it but in the sample (or in the air)."""
+    thickness = sample.thickness(angle, scan.detector)
+    mine = np.array([_is(c, material) for c in sample.constituents])
+    own = thickness[mine].sum(axis=0)
+    if not own.max() > 0:
+        raise ValueError("nothing of it is in the field of view")
+    inside = own >= THICK * own.max()
+    near = binary_dilation(own > 0, iterations=min(NEAR, max(own.shape))) & (own == 0)
+    matter = near & (thickness != 0).any(axis=0)
+    return Regions(inside, matter if matter.any() else near, float(own[inside].mean()))
+
+
+def _is(constituent: Constituent, material: str) -> bool:
+    return constituent.material is not None and constituent.material.name == material
+
+
+def _no_filters(name: str) -> Attenuation:
+    raise AssertionError(f"an energy scan has no tube, and so no filter {name}")

@@ -1,0 +1,232 @@
+"""Measured: energies with absorption or radiographs, from a text table or an HDF5 file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.errors import ConfigError, DataError
+from beamline.storage import hdf5
+from beamline.xafs.contrast import Curve, Regions
+from beamline.xafs.series import Series
+
+Reals = NDArray[np.float64]
+Box = tuple[int, int, int, int]
+
+EV_BEYOND = 500.0
+"""An energy above this is none in keV that a beamline has."""
+_KEV = {"keV": 1.0, "eV": 1e-3}
+
+
+@dataclass(frozen=True, eq=False)
+class Radiographs:
+    """A file of frames over energies, open for reading.
+
+    Attributes:
+        energies: keV, [n].
+        frames: dataset [n, row, col].
+        flats: [n, row, col], or [row, col] for all energies; None where frames are line integrals.
+        dark: [row, col], of the same unit as frames.
+    """
+
+    energies: Reals
+    frames: h5py.Dataset
+    flats: h5py.Dataset | None
+    dark: Reals
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return int(self.frames.shape[1]), int(self.frames.shape[2])
+
+    def line_integrals(self, which: Sequence[int]) -> Iterator[tuple[float, Reals]]:
+        """(keV, line integrals [row, col]) of the frames `which`, in that order."""
+        for i in which:
+            energy = float(self.energies[i])
+            frame = np.asarray(self.frames[i], dtype=np.float64)
+            if self.flats is None:
+                yield energy, frame
+                continue
+            flat = np.asarray(self.flats[i] if self.flats.ndim == 3 else self.flats[()], dtype=np.float64)
+            yield energy, -np.log(np.maximum(frame - self.dark, 0.5) / np.maximum(flat - self.dark, 0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Energies in keV and absorption, each [n], as they stand in a file."""
+
+    energies: Reals
+    absorption: Reals
+
+
+def read_table(path: Path, unit: str | None) -> Table:
+    """Two columns of text, energy and absorption, split by commas, semicolons or blanks; lines that begin with a letter
+    or # are left out.
+
+    Args:
+        unit: of the energy, "keV" or "eV"; None: keV.
+
+    Raises:
+        DataError: it is not there, or not such a table.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read ({error}).") from error
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or re.match(r"\s*[#A-Za-z\"]", line):
+            continue
+        try:
+            energy, absorption = (float(field) for field in re.split(r"[,;\s]+", line.strip())[:2])
+        except ValueError:
+            raise DataError(f"{path}, line {number}: {line.strip()!r} is not an energy and an absorption.") from None
+        rows.append((energy, absorption))
+    values = np.array(rows, dtype=np.float64).reshape(-1, 2)
+    return Table(_in_kev(path, values[:, 0], unit), _finite(path, "absorption", values[:, 1]))
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which part of a file, and what it does not say itself.
+
+    Attributes:
+        low, high: keV, the first and the last energy.
+        region, around: (first row, row after the last, first column, column after the last) of the material, and of
+            what it is compared with; None: all of the frame, and nothing.
+        unit: of the energies, "keV" or "eV"; None: as the file says, else keV.
+        quantity: of the frames, "counts" or "line_integrals"; None: counts.
+    """
+
+    low: float = 0.0
+    high: float = np.inf
+    region: Box | None = None
+    around: Box | None = None
+    unit: str | None = None
+    quantity: str | None = None
+
+
+@contextmanager
+def open_series(path: Path, asked: Asked) -> Iterator[Series | Curve]:
+    """A file's curve, or the radiographs that make one, while it is open.
+
+    Raises:
+        ConfigError: a region is not in the frame.
+        DataError: it is no such file; see `open_measured`.
+    """
+    with open_measured(path, asked.unit, asked.quantity) as found:
+        order = np.argsort(found.energies, kind="stable")
+        kept = order[(found.energies[order] >= asked.low) & (found.energies[order] <= asked.high)]
+        if isinstance(found, Table):
+            if asked.region or asked.around:
+                raise ConfigError(f"{path} holds no frames, so that regions say nothing of it. Nothing was written.")
+            yield Curve(found.energies[kept], found.absorption[kept], unit="as in the file")
+            return
+        everything = (0, found.shape[0], 0, found.shape[1])
+        regions = Regions(
+            _mask(found.shape, asked.region or everything),
+            None if asked.around is None else _mask(found.shape, asked.around),
+        )
+        yield Series(path.name, kept.size, found.line_integrals(kept.tolist()), regions)
+
+
+def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
+    if box[1] > shape[0] or box[3] > shape[1]:
+        raise ConfigError(
+            f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is not in frames of {shape[0]} x {shape[1]} pixels. "
+            "Nothing was written."
+        )
+    mask = np.zeros(shape, dtype=np.bool_)
+    mask[box[0] : box[1], box[2] : box[3]] = True
+    return mask
+
+
+@contextmanager
+def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[Table | Radiographs]:
+    """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col] beside `flats`
+    ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]).
+
+    Args:
+        unit: of the energies, "keV" or "eV"; None: as the dataset says, else keV.
+        quantity: "line_integrals" where frames need no flats.
+
+    Raises:
+        DataError: it is not such a file.
+    """
+    if path.is_file() and not h5py.is_hdf5(path):
+        yield read_table(path, unit)
+        return
+    with hdf5.open_hdf5(path) as file:
+        energies = _energies(path, file, unit)
+        if (mu := hdf5.dataset(file, "mu")) is not None:
+            yield Table(energies, _finite(path, "mu", _like(path, "mu", mu, energies)))
+            return
+        frames, flats = _needed(path, file, "frames"), hdf5.dataset(file, "flats")
+        if frames.ndim != 3 or frames.shape[0] != energies.size:
+            raise DataError(f"{path}: frames are {frames.shape}; they must be [energy, row, col] of {energies.size}.")
+        if quantity == "line_integrals":
+            flats = None
+        elif flats is None:
+            raise DataError(
+                f"{path}: frames without flats may be counts or line integrals. Add flats, or say --quantity "
+                "line-integrals."
+            )
+        elif flats.shape not in (frames.shape, frames.shape[1:]):
+            raise DataError(f"{path}: flats are {flats.shape}; they must be {frames.shape} or {frames.shape[1:]}.")
+        yield Radiographs(energies, frames, flats, _dark(path, file, frames.shape[1:]))
+
+
+def _energies(path: Path, file: h5py.File, unit: str | None) -> Reals:
+    item = _needed(path, file, "energy")
+    if unit is None and (said := hdf5.attribute(item, "units").lower()):
+        unit = {"kev": "keV", "ev": "eV"}.get(said)
+        if unit is None:
+            raise DataError(f"{path}: energies are in {said!r}, which is neither keV nor eV; say --unit.")
+    return _in_kev(path, np.asarray(item[()], dtype=np.float64).reshape(-1), unit)
+
+
+def _dark(path: Path, file: h5py.File, shape: tuple[int, ...]) -> Reals:
+    item = hdf5.dataset(file, "darks")
+    if item is None:
+        return np.zeros(shape)
+    dark = np.asarray(item[()], dtype=np.float64)
+    if dark.shape[-2:] != shape or dark.ndim not in (2, 3):
+        raise DataError(f"{path}: darks are {dark.shape}; they must be {shape} or several of them.")
+    return dark if dark.ndim == 2 else np.asarray(dark.mean(axis=0))
+
+
+def _needed(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    item = hdf5.dataset(file, name)
+    if item is None:
+        raise DataError(f"{path} has no dataset {name}; it needs energy, and mu or frames (with flats).")
+    return item
+
+
+def _like(path: Path, name: str, item: h5py.Dataset, energies: Reals) -> Any:
+    if item.shape != energies.shape:
+        raise DataError(f"{path}: {name} is {item.shape}, but there are {energies.size} energies.")
+    return item[()]
+
+
+def _finite(path: Path, name: str, values: Any) -> Reals:
+    found = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(found).all():
+        raise DataError(f"{path}: {name} is not a number at {int((~np.isfinite(found)).sum())} energies.")
+    return found
+
+
+def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
+    energies = _finite(path, "energy", values) * _KEV[unit or "keV"]
+    if energies.size and not 0 < energies.min() <= energies.max() <= EV_BEYOND:
+        raise DataError(
+            f"{path}: energies from {energies.min():g} to {energies.max():g} keV cannot be; where they are eV, say "
+            "--unit eV."
+        )
+    return energies

@@ -1,0 +1,143 @@
+"""Results: what an energy scan shows, as sentences, as a table and as a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from beamline.figures import png
+from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
+from beamline.xafs.contrast import Curve
+from beamline.xafs.edge import Edge
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Attributes:
+    what: whose absorption it is.
+    """
+
+    what: str
+    curve: Curve
+    edge: Edge
+
+    @property
+    def by(self) -> str:
+        """What the best energy is best in."""
+        return "absorption" if self.curve.contrast_to_noise is None else "contrast-to-noise"
+
+    def data(self) -> dict[str, Any]:
+        """For programs; energies in keV."""
+        curve, edge = self.curve, self.edge
+        first, last = curve.nearly_best
+        cnr = curve.contrast_to_noise
+        return {
+            "what": self.what,
+            "n_energies": curve.energies.size,
+            "from_kev": curve.energies[0],
+            "to_kev": curve.energies[-1],
+            "edge_seen": edge.seen,
+            "why_not": edge.why or None,
+            "edge_kev": edge.energy,
+            "white_line_kev": edge.white_line,
+            "best_kev": curve.energies[curve.best],
+            "best_by": self.by,
+            "best_from_kev": first,
+            "best_to_kev": last,
+            "contrast_to_noise": None if cnr is None else cnr[curve.best],
+            "absorption": curve.absorption[curve.best],
+            "unit": curve.unit,
+            "noise": edge.noise,
+        }
+
+
+def lines(found: Found) -> list[str]:
+    """For people."""
+    curve, edge = found.curve, found.edge
+    said = [f"{found.what}: {curve.energies.size} energies, {curve.energies[0]:.4f} to {curve.energies[-1]:.4f} keV"]
+    if edge.energy is None:
+        said.append(f"no edge     {edge.why}")
+    else:
+        said.append(f"edge        {edge.energy:.4f} keV, where the absorption rises most steeply")
+        said.append(
+            "white line  none above the edge within the range"
+            if edge.white_line is None
+            else f"white line  {edge.white_line:.4f} keV, the top of the absorption"
+        )
+    first, last = curve.nearly_best
+    cnr = curve.contrast_to_noise
+    height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel"
+    said.append(
+        f"best        {curve.energies[curve.best]:.4f} keV: highest {found.by}{height} "
+        f"(95 % of it from {first:.4f} to {last:.4f} keV)"
+    )
+    return said
+
+
+def table(curve: Curve) -> str:
+    """CSV: energy, absorption and, where they are known, contrast, noise and contrast-to-noise."""
+    columns: dict[str, Any] = {"energy_kev": curve.energies, f"absorption ({curve.unit})": curve.absorption}
+    if curve.contrast is not None and curve.noise is not None:
+        columns |= {"contrast": curve.contrast, "noise": curve.noise}
+    if (cnr := curve.contrast_to_noise) is not None:
+        columns["contrast_to_noise"] = cnr
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True))
+    return out.getvalue()
+
+
+def picture(found: Found) -> bytes:
+    """PNG: the absorption over energy with edge, white line and best energy, and the contrast-to-noise below."""
+    curve, edge, cnr = found.curve, found.edge, found.curve.contrast_to_noise
+    figure = Figure(figsize=(8.6, 3.4 if cnr is None else 5.4), dpi=110, layout="constrained")
+    panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(1 if cnr is None else 2, 1, sharex=True))))
+    top = panels[0]
+    top.plot(curve.energies, curve.absorption, color="0.25", lw=1.2, marker=".", ms=3)
+    top.set(ylabel=f"absorption ({curve.unit})", title=found.what)
+    if cnr is not None:
+        panels[1].plot(curve.energies, cnr, color="tab:green", lw=1.2, marker=".", ms=3)
+        panels[1].set(ylabel="contrast-to-noise a pixel")
+    panels[-1].set(xlabel="energy (keV)")
+    marks = (
+        (edge.energy, "edge", "tab:blue"),
+        (edge.white_line, "white line", "tab:orange"),
+        (float(curve.energies[curve.best]), "best", "tab:green"),
+    )
+    for axes in panels:
+        for energy, name, colour in marks:
+            if energy is not None:
+                axes.axvline(energy, color=colour, lw=1.1, ls="--", label=f"{name} {energy:.4f} keV")
+        axes.grid(alpha=0.3)
+    top.legend(fontsize=8, title=None if edge.seen else "no edge seen")
+    return png(figure)
+
+
+def table_beside(target: Path) -> Path:
+    """Where the table of a picture stands."""
+    return target.with_suffix(".csv")
+
+
+def refuse_existing_results(target: Path) -> None:
+    """Raises DataError where picture or table exists, or there is no folder for them."""
+    for path in (target, table_beside(target)):
+        refuse_existing(path)
+
+
+def write(found: Found, target: Path) -> None:
+    """The picture and the table beside it.
+
+    Raises:
+        DataError: one of them exists, or the disk refuses.
+    """
+    for path, content in ((target, picture(found)), (table_beside(target), table(found.curve).encode())):
+        with named_on_failure(path), whole_file(path) as partial:
+            partial.write_bytes(content)
