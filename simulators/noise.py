@@ -26,13 +26,14 @@ LARGEST = 1e9
 @njit(cache=True, nogil=True, inline="always")
 def expansion(w, mean, root):  # type: ignore[no-untyped-def]
     """x with Q(x, mean) = Φ(w), where Q is the regularised upper incomplete gamma function: the Poisson quantile is its
-    integer part; `root` is √mean. And a bound of its error, twice Giles's: it holds for |w| <= 3, and for |w| <= 5 from
-    an expectation of 30."""
+    integer part; `root` is √mean. And a bound of its error: twice Giles's where |w| <= 3 (from an expectation of 30 on
+    where |w| <= 5), none elsewhere."""
     s = 1.0 / root
     ww = w * w
     x = mean + root * w + (1 / 3 + ww / 6) - s * w * (1 / 36 + ww / 72)
     x += s * s * (-8 / 405 + ww * (7 / 810 + ww / 270))
-    return x, s * s * s * (1 / 20 + ww * (1 / 40 + ww / 80))
+    close = (mean >= LEAST) & (ww <= (9.0 if mean < 30.0 else 25.0))
+    return x, s * s * s * (1 / 20 + ww * (1 / 40 + ww / 80)) if close else math.inf
 
 
 @njit(cache=True, nogil=True)
@@ -58,7 +59,7 @@ def summed(w, mean):  # type: ignore[no-untyped-def]
             lower += share
     else:  # the least k with P(K > k) < Φ(-w)
         upper, term, j = 0.0, share, k
-        while j < mean or term > 1e-17 * upper:
+        while term > 1e-17 * upper:
             j += 1
             term *= mean / j
             upper += term
@@ -98,8 +99,7 @@ def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pr
             m, z = mean[col], w[col]
             x, error = expansion(z, m, math.sqrt(m))
             low = math.floor(x - error)
-            sure = (low == math.floor(x + error)) & (m >= LEAST) & (z * z <= (9.0 if m < 30.0 else 25.0))
-            k[col] = low if sure else -1.0
+            k[col] = low if low == math.floor(x + error) else -1.0
         for col in range(cols):
             if k[col] < 0.0:
                 if mean[col] >= LEAST:
