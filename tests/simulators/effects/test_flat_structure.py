@@ -17,7 +17,9 @@ from simulators.effects.shot import Shot
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]
-MANY = FlatStructure(specks=3000, radius_um=30.0, scratches=40, scratch_length_um=3000.0, scratch_width_um=12.0, seed=5)
+MANY = FlatStructure(
+    specks=3000, radius_um=30.0, scratches=800, scratch_length_um=3000.0, scratch_width_um=12.0, seed=5
+)
 
 
 def _roi(row0: int, col0: int, rows: int, cols: int, binning: int = 1) -> Shot:
