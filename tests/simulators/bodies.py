@@ -1,0 +1,160 @@
+"""Bodies: one solid of each kind, where they are by definition, and chords of any ray found by search in that alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from simulators.detector import Detector
+from simulators.packing import rotation
+from simulators.pose import Pose
+from simulators.solids import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Octahedron,
+    Plate,
+    Polyhedron,
+    Solid,
+    TruncatedOctahedron,
+    Tube,
+    Vector,
+)
+
+Reals = NDArray[np.float64]
+
+CENTRE, QUATERNION = (0.11, -0.07, 0.05), (0.8, -0.3, 0.5, 0.4)
+CORNERS = ((-0.2, -0.15, -0.1), (0.3, -0.1, -0.12), (0.05, 0.28, -0.08), (0.1, 0.05, 0.3), (-0.15, 0.2, 0.15))
+WEDGE = (
+    (0, 0, -1, 0.1),
+    (1, 0, 1, 0.15),
+    (-2, 0, 2, 0.15),
+    (0, 3, 0, 0.2),
+    (0.1, -1, 0, 0.12),
+)  # normals of any length
+SOLIDS: dict[str, Solid] = {
+    "cylinder": Cylinder(0.3, 0.5, 2.0, CENTRE),
+    "tube": Tube(0.3, 0.22, 0.5, 2.0, CENTRE),
+    "sphere": Ellipsoid((0.25, 0.25, 0.25), 1.5, CENTRE),
+    "ellipsoid": Ellipsoid((0.35, 0.2, 0.1), 1.5, CENTRE, QUATERNION),
+    "upright box": Box((0.5, 0.3, 0.4), 1.2, CENTRE),
+    "box": Box((0.5, 0.3, 0.4), 1.2, CENTRE, QUATERNION),
+    "octahedron": Octahedron((0.3, 0.25, 0.35), 1.2, CENTRE, QUATERNION),
+    "plate": Plate(0.5, 0.15, 1.3, CENTRE, QUATERNION),
+    "upright plate": Plate(0.5, 0.15, 1.3, CENTRE),
+    "truncated octahedron": TruncatedOctahedron((0.3, 0.25, 0.35), 1.2, 0.7, CENTRE, QUATERNION),
+    "corners": Polyhedron(1.4, vertices=CORNERS, centre=CENTRE, quaternion=QUATERNION),
+    "wedge": Polyhedron(1.4, faces=WEDGE, centre=CENTRE, quaternion=QUATERNION),
+}
+CONVEX = [name for name in SOLIDS if name != "tube"]
+TURNABLE = [name for name in CONVEX if name != "cylinder"]
+
+
+def level(solid: Solid, points: Reals) -> Reals:
+    """A convex function of points [..., 3], <= 0 inside, written from the definition of each solid alone."""
+    q = points - np.array(solid.centre)
+    if isinstance(solid, Cylinder):
+        return np.maximum(np.hypot(q[..., 0], q[..., 1]) - solid.radius, np.abs(q[..., 2]) - solid.height / 2)
+    assert not isinstance(solid, Tube), "a tube is not convex"
+    w, x, y, z = solid.quaternion
+    q = Rotation.from_quat([x, y, z, w]).inv().apply(q.reshape(-1, 3)).reshape(q.shape)
+    if isinstance(solid, Ellipsoid):
+        return np.linalg.norm(q / np.array(solid.semi_axes), axis=-1) - 1
+    if isinstance(solid, Box):
+        return (np.abs(q) - np.array(solid.edges) / 2).max(-1)
+    if isinstance(solid, Octahedron):
+        return (np.abs(q) / np.array(solid.half_diagonals)).sum(-1) - 1
+    if isinstance(solid, TruncatedOctahedron):
+        share = np.abs(q) / np.array(solid.half_diagonals)
+        return np.maximum(share.sum(-1) - 1, share.max(-1) - solid.cut)
+    if isinstance(solid, Plate):
+        turn = np.deg2rad([30, 90, 150])
+        across = np.abs(np.multiply.outer(q[..., 0], np.cos(turn)) + np.multiply.outer(q[..., 1], np.sin(turn))).max(-1)
+        return np.maximum(across - solid.width / 2 * math.cos(math.pi / 6), np.abs(q[..., 2]) - solid.thickness / 2)
+    if solid.vertices is not None:
+        planes = _hull(solid.vertices)
+        return (q @ planes[:, :3].T + planes[:, 3]).max(-1)
+    planes = np.array(solid.faces, dtype=np.float64)
+    length = np.linalg.norm(planes[:, :3], axis=1)
+    return (q @ (planes[:, :3] / length[:, None]).T - planes[:, 3]).max(-1)
+
+
+@cache
+def _hull(vertices: tuple[Vector, ...]) -> Reals:
+    """Planes n · p + d <= 0, [face, 4]."""
+    return np.asarray(ConvexHull(vertices).equations)
+
+
+def inside(solid: Solid, points: Reals) -> NDArray[np.bool_]:
+    """Indicator of a solid at points [..., 3]."""
+    if isinstance(solid, Tube):
+        outer = Cylinder(solid.outer_radius, solid.height, 1.0, solid.centre)
+        inner = Cylinder(solid.inner_radius, solid.height, 1.0, solid.centre)
+        return (level(outer, points) <= 0) & (level(inner, points) > 0)
+    return level(solid, points) <= 0
+
+
+def chords(solid: Solid, start: Reals, ray: Reals, far: float) -> Reals:
+    """Lengths of rays start + t ray/|ray| [..., 3], |t| <= far, inside a solid: the least level by golden section, then
+    both crossings by bisection; no formula of a chord."""
+    if isinstance(solid, Tube):
+        outer = Cylinder(solid.outer_radius, solid.height, 1.0, solid.centre)
+        inner = Cylinder(solid.inner_radius, solid.height, 1.0, solid.centre)
+        return chords(outer, start, ray, far) - chords(inner, start, ray, far)
+    ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    # From the point nearest to the body's middle, so that digits are not lost on the way from a far source.
+    start = start + ray * ((np.array(solid.centre) - start) * ray).sum(-1, keepdims=True)
+
+    def at(t: Reals) -> Reals:
+        return level(solid, start + t[..., None] * ray)
+
+    golden = (math.sqrt(5) - 1) / 2
+    low, high = np.full(start.shape[:-1], -far), np.full(start.shape[:-1], far)
+    for _ in range(46):
+        a, b = high - golden * (high - low), low + golden * (high - low)
+        left = at(a) < at(b)
+        low, high = np.where(left, low, a), np.where(left, b, high)
+    best = (low + high) / 2
+
+    def crossing(outside: float) -> Reals:
+        within, without = best.copy(), np.full(best.shape, outside)
+        for _ in range(40):
+            middle = (within + without) / 2
+            is_in = at(middle) <= 0
+            within, without = np.where(is_in, middle, within), np.where(is_in, without, middle)
+        return within
+
+    return np.where(at(best) <= 0, crossing(far) - crossing(-far), 0.0)
+
+
+def rays(pose: Pose, detector: Detector) -> tuple[Reals, Reals]:
+    """Start and direction [row, col, 3] of each pixel's ray in the sample's axes, from the definitions in pose.py: the
+    laboratory point p is where the sample's point Rv Rb Ru Rz(angle) x + shift lies."""
+    starts, directions = [], []
+    for j, v in enumerate(detector.v()):
+        c, s = math.cos(pose.angle[j]), math.sin(pose.angle[j])
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])  # (x, y, z) -> (u, b, v)
+        about_u, about_b = (0.0, 0.0) if pose.tilt is None else pose.tilt[j]
+        lean = Rotation.from_rotvec([0, about_b, 0]) * Rotation.from_rotvec([about_u, 0, 0])
+        to_sample = (lean.as_matrix() @ turn).T
+        shift = np.zeros(3) if pose.shift is None else pose.shift[j]
+        u = detector.u()
+        pixel = np.stack([u, np.zeros_like(u), np.full_like(u, v)], axis=-1)
+        source = np.array([0, -detector.sod, 0]) if math.isfinite(detector.sod) else pixel - [0, 1, 0]
+        starts.append((np.broadcast_to(source, pixel.shape) - shift) @ to_sample.T)
+        directions.append((pixel - source) @ to_sample.T)
+    return np.array(starts), np.array(directions)
+
+
+def turned(solid: Solid, matrix: Reals) -> Solid:
+    """The solid after a rotation about the origin; not for cylinders and tubes."""
+    assert not isinstance(solid, Cylinder | Tube)
+    x, y, z, w = Rotation.from_matrix(matrix @ rotation(solid.quaternion)).as_quat()
+    centre = tuple((matrix @ np.array(solid.centre)).tolist())
+    return replace(solid, centre=centre, quaternion=(w, x, y, z))
