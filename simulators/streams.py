@@ -23,7 +23,7 @@ TAIL = 3.6541528853610088
 """Where the ziggurat's tail begins, for 256 layers (Marsaglia & Tsang 2000)."""
 
 
-def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Edges x (falling from the base's to 0) [257] and exp(-x²/2) [257] of layers of one area."""
     area = TAIL * math.exp(-(TAIL**2) / 2) + math.sqrt(math.pi / 2) * math.erfc(TAIL / math.sqrt(2))
     edges = [area * math.exp(TAIL**2 / 2), TAIL]
@@ -33,7 +33,7 @@ def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return x, np.exp(-(x**2) / 2)
 
 
-_X, _HEIGHT = _layers()
+_X, _HEIGHT = layers()
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import stats
 
-from simulators.streams import STEP, TAIL, begin, mix, normal, uniform
+from simulators.streams import STEP, TAIL, begin, layers, mix, normal, uniform
 from tests.simulators import chance
 
 N = 400_000
@@ -72,12 +72,32 @@ def test_normal_numbers_are_normal(normals: NDArray[np.float64]) -> None:
     chance.normal_like(normals)
 
 
-def test_the_ziggurat_s_tail_is_the_normal_s(normals: NDArray[np.float64]) -> None:
-    tail = normals[np.abs(normals) > TAIL]
-    expected = 2 * stats.norm.sf(TAIL) * normals.size
+@njit
+def _tail(state, n):  # type: ignore[no-untyped-def]
+    found = [0.0 for _ in range(0)]
+    for _ in range(n):
+        x, state = normal(state)
+        if abs(x) > TAIL:
+            found.append(x)
+    return np.array(found)
+
+
+def test_the_ziggurat_s_tail_is_the_normal_s() -> None:
+    n = 20_000_000
+    tail = _tail(np.uint64(11), n)
+    expected = 2 * stats.norm.sf(TAIL) * n
     assert abs(tail.size - expected) < chance.SIGMAS * math.sqrt(expected)
     even = stats.norm.sf(np.abs(tail)) / stats.norm.sf(TAIL)
     assert stats.kstest(even, "uniform").pvalue > chance.FALSE_ALARM
+    assert abs((tail > 0).mean() - 0.5) < chance.SIGMAS / 2 / math.sqrt(tail.size)
+
+
+def test_the_ziggurat_s_layers_are_of_one_area_and_close_at_the_top() -> None:
+    x, height = layers()
+    base = TAIL * math.exp(-(TAIL**2) / 2) + math.sqrt(2 * math.pi) * stats.norm.sf(TAIL)
+    np.testing.assert_allclose(x[1:256] * np.diff(height[1:]), base, rtol=1e-9)  # the uppermost one too
+    np.testing.assert_allclose(x[0] * height[1], base, rtol=1e-12)
+    assert (np.diff(x) < 0).all()
 
 
 def test_neighbours_rows_and_keys_have_no_part_in_each_other(normals: NDArray[np.float64]) -> None:
