@@ -18,6 +18,7 @@ def test_the_pattern_is_normal_and_neighbours_are_independent() -> None:
     chance.normal_like(n)
     chance.mean_is(n, 0.0, 1.0)
     chance.variance_is(n, 1.0)
+    assert np.unique(n).size == n.size  # no two streams meet
     chance.uncorrelated(n[1:], n[:-1])
     chance.uncorrelated(n[:, 1:], n[:, :-1])
     chance.uncorrelated(n[1:, 1:], n[:-1, :-1])
