@@ -50,6 +50,7 @@ def test_the_rest_is_drawn_for_each_frame_and_the_same_at_every_moment_of_it() -
     tilts = np.array([posed(effect, 0.3, frame=k).tilt for k in range(400)])
     assert (tilts == tilts[:, :1]).all()
     np.testing.assert_array_equal(posed(effect, 0.9, frame=5).tilt, tilts[5])
+    assert abs(np.corrcoef(tilts[:, 0].T)[0, 1]) < 5 / math.sqrt(400)
     # Mean and variance of 800 Gaussian draws; 5 standard errors fail once in 1.7 million.
     assert abs(tilts[:, 0].mean()) < 5 * 7e-6 / math.sqrt(800)
     assert tilts[:, 0].var() == pytest.approx(49e-12, rel=5 * math.sqrt(2 / 800))
