@@ -70,9 +70,13 @@ def _photons(scene: Scene, shot: Shot, watch: Watch) -> Image:
         angle = np.full(shot.detector.shape[0], shot.angle)
         return _seen(scene, shot, angle, np.zeros_like(angle), open_beam, watch)
     moments = scene.chain.moments(shot)
-    photons = np.zeros(shot.detector.shape)
-    for times, weight in zip(moments.times, moments.weights, strict=True):
-        photons += _seen(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
+    seen = (
+        _seen(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
+        for times, weight in zip(moments.times, moments.weights, strict=True)
+    )
+    photons = next(seen)
+    for more in seen:
+        photons += more
     return photons
 
 
