@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from beamline.xafs.local import local_parabolas
 
@@ -14,6 +15,7 @@ Mask = NDArray[np.bool_]
 
 NEARLY_BEST = 0.95
 WINDOW = 7  # energies
+ENOUGH = 50  # pixels to take a noise from
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +112,16 @@ def _level(frame: Reals, mask: Mask) -> tuple[float, float]:
 
     The noise is what is left of the image after a mask to which planes and products of lines are nothing (Immerkaer,
     Comput. Vis. Image Underst. 64, 300, 1996); its median over the pixels, for a normal distribution, so that edges
-    within the region count for little.
+    within the region count for little. The region's own rim is left out where enough pixels are within it.
     """
     curved = np.zeros_like(frame)
     inner = frame[1:-1, 1:-1]
     sides = frame[:-2, 1:-1] + frame[2:, 1:-1] + frame[1:-1, :-2] + frame[1:-1, 2:]
     corners = frame[:-2, :-2] + frame[:-2, 2:] + frame[2:, :-2] + frame[2:, 2:]
     curved[1:-1, 1:-1] = 4 * inner - 2 * sides + corners
-    core = mask.copy()
-    core[[0, -1]] = core[:, [0, -1]] = False
-    chosen = curved[core] if core.any() else np.zeros(1)
+    whole = binary_erosion(mask, np.ones((3, 3)))
+    if whole.sum() < ENOUGH:
+        whole = mask.copy()
+        whole[[0, -1]] = whole[:, [0, -1]] = False
+    chosen = curved[whole] if whole.any() else np.zeros(1)
     return float(frame[mask].mean()), float(np.median(np.abs(chosen)) / 0.6745 / 6)

@@ -1,0 +1,65 @@
+"""Contrast: levels and noise of known frames, and the best of a known curve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.xafs.contrast import Curve, Regions, curve_of, measured
+
+ROWS, COLS = np.mgrid[:80, :90].astype(np.float64)
+INSIDE = np.hypot(ROWS - 40, COLS - 45) < 20
+AROUND = np.hypot(ROWS - 40, COLS - 45) > 25
+
+
+def test_contrast_and_noise_of_a_disk_on_a_slope() -> None:
+    """The noise is that which was put in, whatever the structure: slopes, products of slopes, the disk's rim."""
+    rng = np.random.default_rng(1)
+    smooth = 0.3 + 1.5 * INSIDE + 0.002 * ROWS + 0.001 * COLS + 1e-5 * ROWS * COLS
+    frame = smooth + rng.normal(0, 0.03, ROWS.shape) * INSIDE + rng.normal(0, 0.01, ROWS.shape) * ~INSIDE
+    contrast, noise = measured(frame, Regions(INSIDE, AROUND))
+    assert contrast == pytest.approx(smooth[INSIDE].mean() - smooth[AROUND].mean(), abs=0.003)
+    assert noise == pytest.approx(np.hypot(0.03, 0.01), rel=0.1)
+    level, own = measured(frame, Regions(INSIDE))
+    assert (level, own) == (pytest.approx(frame[INSIDE].mean()), pytest.approx(0.03, rel=0.1))
+
+
+def test_a_frame_without_noise_has_none() -> None:
+    frame = 0.3 + 0.01 * ROWS
+    assert measured(frame, Regions(INSIDE, AROUND))[1] == pytest.approx(0.0, abs=1e-12)
+    curve = Curve(np.arange(9.0), np.arange(9.0), np.arange(9.0), np.zeros(9))
+    assert curve.contrast_to_noise is None and curve.best == 8
+
+
+def test_the_curve_is_in_the_order_of_energies_and_by_thickness() -> None:
+    regions = Regions(INSIDE, AROUND, thickness=0.02)
+    energies = np.array([8.2, 8.0, 8.1])
+    curve = curve_of(energies, [(0.4, 0.2), (0.1, 0.1), (0.2, 0.1)], regions)
+    np.testing.assert_array_equal(curve.energies, [8.0, 8.1, 8.2])
+    np.testing.assert_allclose(curve.absorption, [5.0, 10.0, 20.0])
+    assert curve.unit == "1/mm"
+    assert curve_of(energies, [(0.4, 0.2)] * 3, Regions(INSIDE)).unit == "line integral"
+
+
+def test_the_best_is_not_the_highest_where_that_is_noisy() -> None:
+    energies = np.arange(8.0, 8.5, 0.01)
+    contrast = 1 + np.exp(-((energies - 8.2) ** 2) / 0.002)
+    noise = np.where(energies < 8.15, 0.1, 0.4)
+    curve = Curve(energies, contrast, contrast, noise)
+    assert energies[curve.best] < 8.15
+    by = curve.contrast_to_noise
+    assert by is not None and by[0] == pytest.approx(10.0, rel=0.01)
+    first, last = Curve(energies, contrast, contrast, np.full(50, 0.1)).nearly_best
+    inside = energies[contrast >= 0.95 * contrast.max()]
+    assert (first, last) == (inside.min(), inside.max())
+
+
+def test_a_dark_material_stands_out_as_a_bright_one_does() -> None:
+    energies = np.arange(8.0, 8.1, 0.01)
+    contrast = -1 - (energies - 8.05) ** 2
+    assert Curve(energies, contrast, contrast, np.full(10, 0.1)).best in (0, 9)
+
+
+def test_an_empty_region_is_refused() -> None:
+    with pytest.raises(ValueError, match="the region around the material has no pixel"):
+        Regions(INSIDE, np.zeros_like(INSIDE))

@@ -1,0 +1,146 @@
+"""Measured: tables and HDF5 files of energies, their units, and what is no such file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.errors import ConfigError, DataError
+from beamline.xafs.contrast import Curve
+from beamline.xafs.measured import Asked, Radiographs, Table, open_measured, open_series
+from beamline.xafs.series import Series
+
+ENERGIES = np.linspace(8.3, 8.4, 11)
+TRUE = np.linspace(0.2, 1.2, 11)[:, None, None] * np.ones((11, 6, 8))
+
+
+def _hdf5(path: Path, **content: Any) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, values in content.items():
+            file[name] = values
+    return path
+
+
+def _counts() -> dict[str, Any]:
+    return {"energy": ENERGIES, "frames": 100 + 9000 * np.exp(-TRUE), "flats": np.full((11, 6, 8), 9100.0),
+            "darks": np.full((3, 6, 8), 100.0)}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "text", ["energy,mu\n8.30,1.5\n8.31,1.6\n", "# eV; mu\n8.30;1.5;9\n\n8.31; 1.6;9\n", "  8.30   1.5\n  8.31\t1.6"]
+)
+def test_tables_of_any_manner(tmp_path: Path, text: str) -> None:
+    (tmp_path / "mu.csv").write_text(text, encoding="utf-8")
+    with open_measured(tmp_path / "mu.csv", None, None) as table:
+        assert isinstance(table, Table)
+        assert (table.energies.tolist(), table.absorption.tolist()) == ([8.30, 8.31], [1.5, 1.6])
+
+
+def test_energies_in_ev_are_read_where_it_is_said(tmp_path: Path) -> None:
+    (tmp_path / "mu.csv").write_text("8300 1\n8310 2", encoding="utf-8")
+    with open_measured(tmp_path / "mu.csv", "eV", None) as table:
+        np.testing.assert_allclose(table.energies, [8.3, 8.31])
+    with (
+        pytest.raises(DataError, match="energies from 8300 to 8310 keV cannot be; where they are eV, say --unit eV"),
+        open_measured(tmp_path / "mu.csv", None, None),
+    ):
+        pass
+    path = _hdf5(tmp_path / "mu.h5", energy=ENERGIES * 1e3, mu=TRUE[:, 0, 0])
+    with h5py.File(path, "a") as file:
+        file["energy"].attrs["units"] = "eV"
+    with open_measured(path, None, None) as table:
+        np.testing.assert_allclose(table.energies, ENERGIES)
+
+
+@pytest.mark.parametrize("flat", ["each", "one"])
+def test_counts_become_line_integrals(tmp_path: Path, flat: str) -> None:
+    content = _counts() | ({"flats": np.full((6, 8), 9100.0)} if flat == "one" else {})
+    with open_measured(_hdf5(tmp_path / "scan.h5", **content), None, None) as found:
+        assert isinstance(found, Radiographs)
+        for i, (energy, frame) in enumerate(found.line_integrals(range(11))):
+            assert energy == ENERGIES[i]
+            np.testing.assert_allclose(frame, TRUE[i], rtol=1e-12)
+
+
+def test_line_integrals_are_taken_where_it_is_said(tmp_path: Path) -> None:
+    with open_measured(_hdf5(tmp_path / "scan.h5", energy=ENERGIES, frames=TRUE), None, "line_integrals") as found:
+        assert isinstance(found, Radiographs)
+        np.testing.assert_array_equal([frame for _, frame in found.line_integrals([4, 2])], TRUE[[4, 2]])
+
+
+def test_a_series_is_of_the_range_and_regions_asked_for(tmp_path: Path) -> None:
+    content = _counts()
+    back = {name: content[name][::-1] for name in ("energy", "frames")}
+    path = _hdf5(tmp_path / "scan.h5", **content | back)
+    with open_series(path, Asked(8.325, 8.365, region=(1, 4, 2, 6), around=(4, 6, 0, 8))) as series:
+        assert isinstance(series, Series)
+        assert (series.what, series.n) == ("scan.h5", 4)
+        np.testing.assert_allclose([energy for energy, _ in series.frames], [8.33, 8.34, 8.35, 8.36])
+        assert series.regions.inside.sum() == 12
+        assert series.regions.around is not None and series.regions.around.sum() == 16
+    with open_series(path, Asked()) as whole:
+        assert isinstance(whole, Series) and whole.regions.inside.all() and whole.regions.around is None
+
+
+def test_a_table_is_a_curve_already(tmp_path: Path) -> None:
+    (tmp_path / "mu.txt").write_text("8.32 3\n8.30 1\n8.31 2\n8.4 9", encoding="utf-8")
+    with open_series(tmp_path / "mu.txt", Asked(high=8.35)) as curve:
+        assert isinstance(curve, Curve)
+        assert (curve.energies.tolist(), curve.absorption.tolist()) == ([8.30, 8.31, 8.32], [1.0, 2.0, 3.0])
+    with (
+        pytest.raises(ConfigError, match="holds no frames"),
+        open_series(tmp_path / "mu.txt", Asked(region=(0, 1, 0, 1))),
+    ):
+        pass
+
+
+def _without(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    return lambda content: {key: value for key, value in content.items() if key != name}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (_without("energy"), "has no dataset energy"),
+        (_without("frames"), "has no dataset frames"),
+        (_without("flats"), "may be counts or line integrals. Add flats, or say --quantity line-integrals"),
+        (lambda c: c | {"frames": c["frames"][1:]}, r"they must be \[energy, row, col\] of 11"),
+        (lambda c: c | {"flats": c["flats"][1:]}, r"flats are \(10, 6, 8\); they must be \(11, 6, 8\) or \(6, 8\)"),
+        (lambda c: c | {"darks": np.zeros((6, 9))}, r"darks are \(6, 9\)"),
+        (lambda c: c | {"mu": np.ones(4)}, r"mu is \(4,\), but there are 11 energies"),
+        (lambda c: c | {"mu": np.full(11, np.nan)}, "mu is not a number at 11 energies"),
+        (lambda c: c | {"energy": np.full(11, np.inf)}, "energy is not a number at 11"),
+    ],
+)
+def test_what_is_no_such_file_is_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], dict[str, Any]], words: str
+) -> None:
+    path = _hdf5(tmp_path / "scan.h5", **change(_counts()))
+    with pytest.raises(DataError, match=words), open_measured(path, None, None):
+        pass
+
+
+def test_other_units_missing_files_and_text_are_refused(tmp_path: Path) -> None:
+    path = _hdf5(tmp_path / "scan.h5", **_counts())
+    with h5py.File(path, "a") as file:
+        file["energy"].attrs["units"] = "nm"
+    with pytest.raises(DataError, match="energies are in 'nm', which is neither"), open_measured(path, None, None):
+        pass
+    with pytest.raises(DataError, match="is not there"), open_measured(tmp_path / "none.h5", None, None):
+        pass
+    (tmp_path / "mu.csv").write_text("8.3 1\n8.4 one", encoding="utf-8")
+    with (
+        pytest.raises(DataError, match=r"line 2: '8.4 one' is not an energy and an absorption"),
+        open_measured(tmp_path / "mu.csv", None, None),
+    ):
+        pass
+    with (
+        pytest.raises(ConfigError, match="The region 0:7,0:8 is not in frames of 6 x 8 pixels"),
+        open_series(_hdf5(tmp_path / "good.h5", **_counts()), Asked(region=(0, 7, 0, 8))),
+    ):
+        pass
