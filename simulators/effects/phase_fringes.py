@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
-from numba import get_num_threads
+from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -20,6 +20,8 @@ HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""
 DARKEST = 1e-30
 """Transmission that stands for none, so that its depth is finite."""
+STEEPEST = math.pi / 2
+"""Radians between neighbouring pixels of the wave: its square has twice its band, and must not alias either."""
 
 
 @dataclass(frozen=True)
@@ -36,18 +38,25 @@ class PhaseFringes:
     (Fresnel scaling theorem, Paganin 2006, appendix B), which is that of the detector's pitch here. Fringes blurred by
     source and detector: name scintillator_blur too.
 
+    Edges of solids turn the phase by many radians a pixel, which a wave on the pixels cannot follow. Where the Fresnel
+    number of a pixel is 1 or more, so that fringes are finer than pixels, "transport" does in its place: the light that
+    the first order moves from pixel to pixel is moved, and no pixel gives more than it has.
+
     Attributes:
         delta_beta: ratio of delta to beta of the material at the energy.
         distance: mm from the sample to the detector; in a cone sdd - sod.
         energy: keV.
         oversampling: pixels of the wave per pixel and axis, 1 ... 8; the depth is drawn straight between pixels and the
-            intensity averaged over them. Work and memory grow as its square.
+            intensity averaged over each, which blurs by a variance of 1/4 pixel² as well. Work and memory grow as its
+            square. Of the wave alone.
+        method: "wave" or, near the sample, "transport".
     """
 
     delta_beta: float
     distance: float
     energy: float
     oversampling: int = 1
+    method: Literal["wave", "transport"] = "wave"
 
     name: ClassVar[str] = "phase_fringes"
     domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
@@ -58,6 +67,10 @@ class PhaseFringes:
             raise ValueError(f"delta_beta and distance (mm) must be >= 0 and energy (keV) positive, got {self}")
         if not 1 <= self.oversampling <= 8:
             raise ValueError(f"oversampling must lie in 1 ... 8, got {self.oversampling}")
+        if self.method not in ("wave", "transport"):
+            raise ValueError(f"method must be wave or transport, got {self.method!r}")
+        if self.method == "transport" and self.oversampling != 1:
+            raise ValueError(f"oversampling is of the wave; with transport leave it out, got {self.oversampling}")
 
     @property
     def wavelength(self) -> float:
@@ -65,22 +78,35 @@ class PhaseFringes:
         return HC / self.energy
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where the wave or the propagator would alias, with what would help."""
+        """Raises CannotExposeError where the method does not hold, with what would help."""
         z = self.distance / (1 + self.distance / shot.detector.sod)
-        self._check_propagator(z, shot.detector)
-        self._check_wave(image)
-        n = self.oversampling
-        depth = image
-        if n > 1:
-            depth = np.zeros((image.shape[0] * n, image.shape[1] * n))
-            add_enlarged(depth, image, 1.0)
-        intensity = _propagated(depth, self.delta_beta, self.wavelength * z / (shot.detector.pitch / n) ** 2)
-        if n > 1:
-            rows, cols = image.shape
-            intensity = intensity.reshape(rows, n, cols, n).mean(axis=(1, 3))
-        image[:] = np.maximum(intensity, DARKEST, out=intensity)
-        np.log(image, out=image)
+        area = self.wavelength * z / shot.detector.pitch**2
+        if self.method == "transport":
+            self._check_transport(area)
+            np.exp(np.negative(image, out=image), out=image)
+            image = _transported(image, area * self.delta_beta / (4 * math.pi))
+        else:
+            self._check_propagator(z, shot.detector)
+            self._check_wave(image, area)
+            image[:] = self._wave_intensity(image, area)
+        np.log(np.maximum(image, DARKEST, out=image), out=image)
         return np.negative(image, out=image)
+
+    def _wave_intensity(self, depth: Image, area: float) -> NDArray[np.float32]:
+        n = self.oversampling
+        if n == 1:
+            return _propagated(depth, self.delta_beta, area)
+        rows, cols = depth.shape
+        fine = np.zeros((rows * n, cols * n))
+        add_enlarged(fine, depth, 1.0)
+        return _propagated(fine, self.delta_beta, area * n**2).reshape(rows, n, cols, n).mean(axis=(1, 3))
+
+    def _check_transport(self, area: float) -> None:
+        if area > 1:
+            raise CannotExposeError(
+                f"phase_fringes: a pixel's Fresnel number is {1 / area:.2g} and transport holds from 1 on, where "
+                f"fringes are finer than pixels; give at most {self.distance / area:.3g} mm of distance or method wave"
+            )
 
     def _check_propagator(self, z: float, detector: Detector) -> None:
         """Critical sampling of N (finer) pixels p: wavelength z <= N p² (Voelz & Roggemann 2009, Appl. Opt. 48:6132).
@@ -97,17 +123,18 @@ class PhaseFringes:
                 f"{farthest:.3g} mm, larger pixels or a larger frame"
             )
 
-    def _check_wave(self, depth: Image) -> None:
-        """Between neighbours the phase may turn by pi at most."""
+    def _check_wave(self, depth: Image, area: float) -> None:
         seen = depth.astype(np.float32)
-        step = max((float(np.abs(np.diff(seen, axis=axis)).max(initial=0.0)) for axis in (0, 1)), default=0.0)
+        step = max(float(np.abs(np.diff(seen, axis=axis)).max(initial=0.0)) for axis in (0, 1))
         turn = step * self.delta_beta / 2
-        if turn > math.pi * self.oversampling:
+        if turn > STEEPEST * self.oversampling:
+            wanted = math.ceil(turn / STEEPEST)
+            advice = f"oversampling {wanted}, smaller pixels" if wanted <= 8 else "smaller pixels"
             raise CannotExposeError(
                 f"phase_fringes: the wave would alias: with delta_beta {self.delta_beta:g} its phase turns by "
                 f"{turn:.3g} rad from pixel to pixel, and oversampling {self.oversampling} follows "
-                f"{math.pi * self.oversampling:.3g}; give oversampling {math.ceil(turn / math.pi)}, smaller pixels or "
-                "a smaller delta_beta"
+                f"{STEEPEST * self.oversampling:.3g}; give {advice} or a smaller delta_beta"
+                + (", or method transport" if area <= 1 else "")
             )
 
 
@@ -129,3 +156,40 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
         seen = fft.idctn(np.ascontiguousarray(part), norm="ortho", overwrite_x=True, workers=threads)
         intensity += np.square(seen, out=seen)
     return intensity
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _transported(light: Image, share: float) -> Image:
+    """light - share x its Laplacian (in pixels, edges are mirrors), as light moved from each pixel to its brighter
+    neighbours; a pixel that would give more than it has gives all, each neighbour its part."""
+    rows, cols = light.shape
+    kept = np.empty_like(light)
+    for j in prange(rows):
+        above, below = light[max(j - 1, 0)], light[min(j + 1, rows - 1)]
+        for i in range(cols):
+            own = light[j, i]
+            left, right = light[j, max(i - 1, 0)], light[j, min(i + 1, cols - 1)]
+            given = share * (
+                max(above[i] - own, 0.0) + max(below[i] - own, 0.0) + max(left - own, 0.0) + max(right - own, 0.0)
+            )
+            kept[j, i] = own / given if given > own else 1.0
+    out = np.empty_like(light)
+    for j in prange(rows):
+        above, below = max(j - 1, 0), min(j + 1, rows - 1)
+        for i in range(cols):
+            left, right = max(i - 1, 0), min(i + 1, cols - 1)
+            gain = (
+                _gain(light, kept, j, i, above, i)
+                + _gain(light, kept, j, i, below, i)
+                + _gain(light, kept, j, i, j, left)
+                + _gain(light, kept, j, i, j, right)
+            )
+            out[j, i] = max(light[j, i] + share * gain, 0.0)  # rounding alone
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _gain(light: Image, kept: Image, j: int, i: int, k: int, m: int) -> float:
+    """What pixel (j, i) gets from its neighbour (k, m), or gives to it, for a share of 1."""
+    more = light[j, i] - light[k, m]
+    return more * (kept[k, m] if more > 0 else kept[j, i])

@@ -18,7 +18,7 @@ from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]
 MANY = FlatStructure(
-    specks=3000, radius_um=30.0, scratches=800, scratch_length_um=3000.0, scratch_width_um=12.0, seed=5
+    specks=1000, radius_um=30.0, scratches=800, scratch_length_um=3000.0, scratch_width_um=12.0, seed=5
 )
 
 
@@ -28,7 +28,7 @@ def _roi(row0: int, col0: int, rows: int, cols: int, binning: int = 1) -> Shot:
     return shots.shot(detector=detector, roi=(row0, col0, rows, cols), binning=binning)
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(row=st.integers(0, 60), col=st.integers(0, 60), binning=st.sampled_from([1, 2, 4]))
 def test_it_stays_on_the_sensor_in_any_roi_and_binning(row: int, col: int, binning: int) -> None:
     whole = MANY.transmission(_roi(200, 300, 320, 320))
@@ -67,7 +67,7 @@ def test_a_speck_is_round_and_a_gaussian() -> None:
 def test_scratches_take_the_light_of_lines() -> None:
     """A scratch of length L takes depth x (L sqrt(2 pi) w + 2 pi w²), whatever its angle, away from edges."""
     inside = 0
-    for seed in range(12):
+    for seed in range(8):
         scratch = FlatStructure(0, scratches=1, scratch_length_um=800.0, scratch_width_um=20.0, seed=seed)
         rng = np.random.default_rng(seed)
         row, col, angle, chance, deep = rng.random(5) * (2304, 4096, math.pi, 1, 0.1)
@@ -84,7 +84,7 @@ def test_scratches_take_the_light_of_lines() -> None:
             assert math.atan2(2 * moments[0, 1], moments[1, 1] - moments[0, 0]) / 2 % math.pi == pytest.approx(
                 angle % math.pi, abs=0.05
             )
-    assert inside >= 6
+    assert inside >= 4
 
 
 def test_a_flat_divides_it_out() -> None:
