@@ -45,7 +45,10 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
         kind = planned.kind.name.lower()
         angle = f" at {np.degrees(planned.shot.angle):.1f}°" if planned.kind is FrameKind.PROJECTION else ""
         axes.set_title(f"{number}: {kind}{angle}", fontsize=8)
-        for row, label in enumerate(scan.scene.chain.labels(planned.shot)):
+        labels = scan.scene.chain.labels(planned.shot)
+        kinds = list(dict.fromkeys(label.kind for label in labels))
+        for label in labels:
+            row = kinds.index(label.kind)
             top, bottom, left, right = (edge / step for edge in label.region)
             colour = _COLOURS[sum(label.kind.encode()) % len(_COLOURS)]
             corner, size = (left - 0.5, top - 0.5), (right - left, bottom - top)

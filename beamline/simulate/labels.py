@@ -16,7 +16,7 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Run:
-    """An anomaly in consecutive frames.
+    """An anomaly in consecutive frames; of several of its kind in a frame, one.
 
     Attributes:
         kind: the anomaly's name.
@@ -44,15 +44,16 @@ class LabelLog:
 
     def runs(self) -> tuple[Run, ...]:
         """In the order in which they begin."""
-        open_runs: dict[str, Run] = {}
+        open_runs: dict[tuple[str, int], Run] = {}
         done: list[Run] = []
         for frame, label in self._frames:
-            run = open_runs.get(label.kind)
+            body = label.kind, label.which
+            run = open_runs.get(body)
             if run is not None and run.last == frame - 1:
-                open_runs[label.kind] = Run(run.kind, run.first, (*run.regions, label.region))
+                open_runs[body] = Run(run.kind, run.first, (*run.regions, label.region))
                 continue
             done += [run] if run is not None else []
-            open_runs[label.kind] = Run(label.kind, frame, (label.region,))
+            open_runs[body] = Run(label.kind, frame, (label.region,))
         return tuple(sorted([*done, *open_runs.values()], key=lambda run: (run.first, run.kind)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -49,9 +50,9 @@ class BlackBand:
             image[:, : light.size] *= light
         return image
 
-    def label(self, shot: Shot) -> Label | None:
+    def labels(self, shot: Shot) -> Sequence[Label]:
         cols = self._light(shot).size if shot.beam and within(self.views, shot) else 0
-        return Label(self.name, (0, shot.detector.shape[0], 0, cols)) if cols else None
+        return [Label(self.name, (0, shot.detector.shape[0], 0, cols))] if cols else []
 
     def _light(self, shot: Shot) -> NDArray[np.float64]:
         """Share of the light in each column of the band."""

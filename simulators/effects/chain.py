@@ -58,16 +58,18 @@ class Label:
     Attributes:
         kind: the anomaly's name.
         region: (first row, row after the last, first column, column after the last) in pixels of the frame.
+        which: of several of one kind in a frame; it is the same in every frame.
     """
 
     kind: str
     region: tuple[int, int, int, int]
+    which: int = 0
 
 
 @runtime_checkable
 class Anomaly(Effect, Protocol):
-    def label(self, shot: Shot) -> Label | None:
-        """Where the anomaly shows in this frame; None where it does not."""
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        """Where the anomaly changes this frame, whatever other effects do to it; none where it does not."""
         ...
 
 
@@ -131,18 +133,20 @@ class Chain:
         return image
 
     def labels(self, shot: Shot) -> tuple[Label, ...]:
-        """The anomalies that show in a frame; one that turns with the sample, wherever it is while the frame looks."""
-        found: list[Label] = []
+        """The anomalies of a frame; one that turns with the sample, wherever it is while the frame looks."""
+        found: dict[tuple[str, int], Label] = {}
         for effect in self.effects:
             if isinstance(effect, Anomaly):
                 depth = effect.domain == Domain.OPTICAL_DEPTH and self.moves and shot.beam and shot.sample
                 looks = [shot.later(float(times[0])) for times in self.moments(shot).times] if depth else [shot]
-                labels = [label for look in looks if (label := effect.label(look))]
-                found += [_joined(labels)] if labels else []
-        return tuple(found)
+                for label in (label for look in looks for label in effect.labels(look)):
+                    key = label.kind, label.which
+                    found[key] = _around(found.get(key, label), label)
+        return tuple(found.values())
 
 
-def _joined(labels: Sequence[Label]) -> Label:
-    """One label around all of one kind."""
-    top, below, left, right = zip(*(label.region for label in labels), strict=True)
-    return Label(labels[0].kind, (min(top), max(below), min(left), max(right)))
+def _around(one: Label, other: Label) -> Label:
+    """One label around two of the same."""
+    (top, below, left, right), region = one.region, other.region
+    around = min(top, region[0]), max(below, region[1]), min(left, region[2]), max(right, region[3])
+    return Label(one.kind, around, one.which)

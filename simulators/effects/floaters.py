@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -26,12 +26,14 @@ class Crumb:
         row, col: of its middle.
         sigma: pixels.
         depth: optical depth through its middle.
+        which: of the scene's crumbs.
     """
 
     row: float
     col: float
     sigma: float
     depth: float
+    which: int
 
     def box(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
         """(first row, row after the last, first column, column after the last); empty where it is not in the frame."""
@@ -101,12 +103,10 @@ class Floaters:
             image[top:below, left:right] += crumb.depth * down[:, None] * across
         return image
 
-    def label(self, shot: Shot) -> Label | None:
-        boxes = [crumb.box(shot.detector.shape) for crumb in self.crumbs(shot)] if shot.beam and shot.sample else []
-        if not boxes:
-            return None
-        tops, belows, lefts, rights = zip(*boxes, strict=True)
-        return Label(self.name, (min(tops), max(belows), min(lefts), max(rights)))
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        if not (shot.beam and shot.sample):
+            return []
+        return [Label(self.name, crumb.box(shot.detector.shape), crumb.which) for crumb in self.crumbs(shot)]
 
     def crumbs(self, shot: Shot) -> Iterator[Crumb]:
         """Those that the frame shows."""
@@ -115,7 +115,7 @@ class Floaters:
             return
         rng = np.random.default_rng(self.seed)
         detector = shot.detector
-        for _ in range(self.count):
+        for which in range(self.count):
             distance, size, height = (rng.uniform(*ends) for ends in (self.distance, self.size, self.heights))
             depth, at, passing = self.depth * rng.uniform(0.5, 1.0), rng.uniform(0, 2 * math.pi), rng.uniform()
             u, b = distance * math.cos(shot.angle - at), -distance * math.sin(shot.angle - at)
@@ -131,6 +131,7 @@ class Floaters:
                 col=detector.axis_col + u * nearer / detector.pitch,
                 sigma=size * nearer / detector.pitch,
                 depth=depth,
+                which=which,
             )
             top, below, left, right = crumb.box(detector.shape)
             if top < below and left < right:

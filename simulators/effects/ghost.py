@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -54,12 +55,12 @@ class Ghost:
         image[:, first : first + change.size] *= 1 + change
         return image
 
-    def label(self, shot: Shot) -> Label | None:
+    def labels(self, shot: Shot) -> Sequence[Label]:
         first, change = self._change(shot)
         seen = np.flatnonzero(np.abs(change) >= SEEN)
         if not shot.beam or not seen.size:
-            return None
-        return Label(self.name, (0, shot.detector.shape[0], first + int(seen[0]), first + int(seen[-1]) + 1))
+            return []
+        return [Label(self.name, (0, shot.detector.shape[0], first + int(seen[0]), first + int(seen[-1]) + 1))]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
         """The first column that the hump covers, and by what share it changes the light there and further right."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -51,21 +52,21 @@ class Jump:
             return pose
         return pose.turned_by(math.radians(self.turn_deg)).shifted_by(self._shift(pose.angle))
 
-    def label(self, shot: Shot) -> Label | None:
+    def labels(self, shot: Shot) -> Sequence[Label]:
         """The columns that the sample sweeps; how high it is no shot says."""
         if not (shot.beam and shot.sample and shot.view >= self.view):
-            return None
+            return []
         detector = shot.detector
         u, _, v = self._shift(np.array([shot.angle]))[0]
         if math.isinf(detector.sod) and not self.turn_deg and math.hypot(u, v) < SEEN_PX * detector.pitch:
-            return None
+            return []
         radius = shot.radius + 1e-3 * math.hypot(*self.shift_um[:2])
         if not math.isinf(detector.sod):
             radius /= max(1 - radius / detector.sod, 0.05)
         rows, cols = detector.shape
         first = max(0, math.ceil(detector.axis_col - radius / detector.pitch))
         last = min(cols - 1, math.floor(detector.axis_col + radius / detector.pitch))
-        return Label(self.name, (0, rows, first, last + 1)) if first <= last else None
+        return [Label(self.name, (0, rows, first, last + 1))] if first <= last else []
 
     def _shift(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """mm along (u, b, v) at each angle, [row, 3]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -44,9 +45,9 @@ class LostBeam:
             image *= 1 - lost
         return image
 
-    def label(self, shot: Shot) -> Label | None:
+    def labels(self, shot: Shot) -> Sequence[Label]:
         rows, cols = shot.detector.shape
-        return Label(self.name, (0, rows, 0, cols)) if shot.beam and self._lost(shot) > 0 else None
+        return [Label(self.name, (0, rows, 0, cols))] if shot.beam and self._lost(shot) > 0 else []
 
     def _lost(self, shot: Shot) -> float:
         """Share of the frame's light that is lost."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +19,7 @@ from simulators.effects.shot import Image, Shot
 class NarrowField:
     """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
 
-    Flats are as narrow. The label goes around all that is not fully lit: the whole frame where both sides are cut.
+    Flats are as narrow. What is not fully lit has a label for each side: left, right, above and below.
 
     Attributes:
         width: mm of the rectangle across the beam, between the places where half of the light is there.
@@ -53,15 +54,15 @@ class NarrowField:
         image[last:] *= down[last:, None]
         return image
 
-    def label(self, shot: Shot) -> Label | None:
-        down, across = self._light(shot)
-        rows, cols = np.flatnonzero(down < 1), np.flatnonzero(across < 1)
-        if not shot.beam or not (rows.size or cols.size):
-            return None
-        height, width = shot.detector.shape
-        top, below = (0, height) if cols.size else (int(rows[0]), int(rows[-1]) + 1)
-        left, right = (0, width) if rows.size else (int(cols[0]), int(cols[-1]) + 1)
-        return Label(self.name, (top, below, left, right))
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        rows, cols = shot.detector.shape
+        (top, below), (left, right) = (_lit_fully(light) for light in self._light(shot))
+        strips = [(0, rows, 0, left), (0, rows, right, cols), (0, top, 0, cols), (below, rows, 0, cols)]
+        return [
+            Label(self.name, strip, which)
+            for which, strip in enumerate(strips)
+            if shot.beam and strip[0] < strip[1] and strip[2] < strip[3]
+        ]
 
     def _light(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Shares of the light in each row and in each column; a pixel has their product."""

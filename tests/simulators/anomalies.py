@@ -22,23 +22,23 @@ def change(effect: dict[str, Any], shot: Shot) -> NDArray[np.float64]:
     return changed / np.maximum(plain, 1) - 1
 
 
-def label(effect: dict[str, Any], shot: Shot) -> Label | None:
-    labels = shots.scene(effect).chain.labels(shot)
-    assert len(labels) <= 1
-    return labels[0] if labels else None
+def labels(effect: dict[str, Any], shot: Shot) -> tuple[Label, ...]:
+    return shots.scene(effect).chain.labels(shot)
 
 
-def check_region(effect: dict[str, Any], shot: Shot, loose: int = 1) -> bool:
-    """Whether the anomaly shows; its region holds every changed pixel and is at most `loose` pixels wider."""
-    seen, found = np.abs(change(effect, shot)) > SEEN, label(effect, shot)
-    if found is None:
-        assert not seen.any(), "it changes a frame that it does not label"
-        return False
-    assert seen.any(), "it labels a frame that it does not change"
-    rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    top, below, left, right = found.region
-    box = np.array([rows[0] - top, below - 1 - rows[-1], cols[0] - left, right - 1 - cols[-1]])
-    assert (box >= 0).all(), f"changed pixels lie beyond the region {found.region}"
-    assert (box <= loose).all(), f"the region {found.region} is wider than what changes by {box}"
-    assert found.kind == effect["kind"]
-    return True
+def check_regions(effect: dict[str, Any], shot: Shot, loose: int = 1) -> bool:
+    """Whether the anomaly shows; its regions hold every changed pixel, and each is at most `loose` pixels wider than
+    what changes in it."""
+    seen, found = np.abs(change(effect, shot)) > SEEN, labels(effect, shot)
+    beyond = seen.copy()
+    for label in found:
+        top, below, left, right = label.region
+        inside = seen[top:below, left:right]
+        assert inside.any(), f"{label} lies where nothing changes"
+        rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+        wider = np.array([rows[0], below - top - 1 - rows[-1], cols[0], right - left - 1 - cols[-1]])
+        assert (wider <= loose).all(), f"{label} is wider than what changes by {wider}"
+        assert label.kind == effect["kind"]
+        beyond[top:below, left:right] = False
+    assert not beyond.any(), f"pixels beyond the regions of {found} change"
+    return bool(found)

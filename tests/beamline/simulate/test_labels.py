@@ -25,6 +25,14 @@ def test_consecutive_frames_of_a_kind_are_one_run() -> None:
     assert [run.last for run in runs] == [2, 2, 4]
 
 
+def test_each_of_several_of_a_kind_has_a_run_of_its_own() -> None:
+    log = LabelLog()
+    log.add(0, [Label("floaters", A)])
+    log.add(1, [Label("floaters", B), Label("floaters", C, 1)])
+    log.add(2, [Label("floaters", A, 1)])
+    assert log.runs() == (Run("floaters", 0, (A, B)), Run("floaters", 1, (C, A)))
+
+
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     path = labels_path(tmp_path / "scan.h5")
     assert path.name == "scan.labels.json"

@@ -24,20 +24,20 @@ def test_the_light_falls_off_as_a_ramp_to_the_share_that_is_left() -> None:
 @given(width=st.floats(0.001, 1.5), penumbra=st.floats(0.0, 0.5), share=st.floats(0.0, 0.9))
 def test_the_region_is_what_it_darkens(width: float, penumbra: float, share: float) -> None:
     band = {"kind": "black_band", "width": width, "penumbra": penumbra, "share": share}
-    anomalies.check_region(band, shots.shot(sample=False))
+    anomalies.check_regions(band, shots.shot(sample=False))
 
 
 @pytest.mark.parametrize("view", range(8))
 def test_it_is_there_in_its_views_for_flats_and_projections_but_not_in_darks(view: int) -> None:
     for sample in (True, False):
-        assert anomalies.check_region(BAND, shots.shot(view=view, sample=sample)) == (3 <= view < 6)
-    assert anomalies.label(BAND, shots.shot(view=view, beam=False)) is None
+        assert anomalies.check_regions(BAND, shots.shot(view=view, sample=sample)) == (3 <= view < 6)
+    assert not anomalies.labels(BAND, shots.shot(view=view, beam=False))
 
 
 def test_it_is_there_always_without_views() -> None:
     band = BlackBand(0.05)
-    assert band.label(shots.shot(view=10_000)) == Label("black_band", (0, 60, 0, 5))
-    assert BlackBand(2.0).label(shots.shot()) == Label("black_band", (0, 60, 0, 80))
+    assert band.labels(shots.shot(view=10_000)) == [Label("black_band", (0, 60, 0, 5))]
+    assert BlackBand(2.0).labels(shots.shot()) == [Label("black_band", (0, 60, 0, 80))]
 
 
 @pytest.mark.parametrize("wrong", [{"width": 0.0}, {"width": 0.1, "penumbra": -1.0}, {"width": 0.1, "share": 1.0}])

@@ -16,7 +16,7 @@ def test_it_crosses_from_right_to_left_in_a_few_views() -> None:
     middles = {}
     for view in range(12):
         shot = shots.shot(view=view, sample=True)
-        if anomalies.check_region(GHOST, shot):
+        if anomalies.check_regions(GHOST, shot):
             gained = anomalies.change(GHOST, shot)[7]
             middles[view] = (gained * np.arange(80)).sum() / gained.sum()
     assert list(middles) == [4, 5, 6, 7]  # 80 + 40 px at 30 px a view
@@ -35,7 +35,7 @@ def test_it_is_a_smooth_hump_of_the_light_that_is_there() -> None:
 
 def test_flats_and_darks_do_not_have_it() -> None:
     for state in ({"sample": False}, {"beam": False}):
-        assert anomalies.label(GHOST, shots.shot(view=5, **state)) is None
+        assert not anomalies.labels(GHOST, shots.shot(view=5, **state))
     assert not anomalies.change(GHOST, shots.shot(view=5, sample=False)).any()
 
 

@@ -60,13 +60,13 @@ def test_the_region_holds_all_that_changes_and_is_no_wider_than_the_sample_and_i
 
 def test_a_slip_along_the_beam_shows_in_a_cone_only() -> None:
     jump = Jump(0, (0.0, 50.0, 0.0))
-    assert jump.label(shots.shot(angle=0.0)) is None
-    assert jump.label(shots.shot(angle=0.1)) is not None
+    assert not jump.labels(shots.shot(angle=0.0))
+    assert jump.labels(shots.shot(angle=0.1))
     cone = Detector.centred((60, 80), 0.01, sod=2.0)
     # A point at 0.35 mm from the axis is seen up to 0.35 / (1 - 0.35 / 2) = 0.4242 mm from it.
-    assert Jump(0, (0.0, 50.0, 0.0)).label(shots.shot(angle=0.0, detector=cone)) == Label("jump", (0, 60, 0, 80))
+    assert Jump(0, (0.0, 50.0, 0.0)).labels(shots.shot(angle=0.0, detector=cone)) == [Label("jump", (0, 60, 0, 80))]
     narrow = Detector.centred((60, 120), 0.01, sod=2.0)
-    assert jump.label(shots.shot(angle=0.0, detector=narrow)) == Label("jump", (0, 60, 18, 102))
+    assert jump.labels(shots.shot(angle=0.0, detector=narrow)) == [Label("jump", (0, 60, 18, 102))]
 
 
 @pytest.mark.parametrize("wrong", [{"view": 3}, {"view": -1, "turn_deg": 1.0}])

@@ -18,9 +18,9 @@ def test_its_views_lose_their_light(view: int) -> None:
     lost = {"kind": "lost_beam", "views": [3, 6], "share": 0.02}
     for sample in (True, False):
         shot = shots.shot(view=view, sample=sample)
-        assert anomalies.check_region(lost, shot, loose=0) == (3 <= view < 6)
+        assert anomalies.check_regions(lost, shot, loose=0) == (3 <= view < 6)
         np.testing.assert_allclose(anomalies.change(lost, shot), -0.98 if 3 <= view < 6 else 0.0, atol=2e-4)
-    assert anomalies.label(lost, shots.shot(view=view, beam=False)) is None
+    assert not anomalies.labels(lost, shots.shot(view=view, beam=False))
 
 
 @given(begin=st.floats(49.9, 50.1), lasts=st.floats(1e-4, 0.1))
@@ -31,7 +31,7 @@ def test_by_the_clock_a_frame_loses_the_part_of_its_exposure(begin: float, lasts
     off = np.mean((moments >= begin) & (moments < begin + lasts))
     image = effect.apply(np.ones((60, 80)), shots.shot())
     np.testing.assert_allclose(image, 1 - 0.8 * off, atol=2e-4)
-    assert (effect.label(shots.shot()) is None) == bool((image == 1).all())
+    assert (not effect.labels(shots.shot())) == bool((image == 1).all())
 
 
 @pytest.mark.parametrize(

@@ -41,14 +41,14 @@ def test_the_region_goes_around_all_that_is_not_fully_lit(
     width: float, height: float | None, across: float, penumbra: float
 ) -> None:
     field = {"kind": "narrow_field", "width": width, "height": height, "centre": [across, 0.0], "penumbra": penumbra}
-    anomalies.check_region(field, shots.shot(sample=False))
+    anomalies.check_regions(field, shots.shot(sample=False))
 
 
 def test_projections_are_as_narrow_and_darks_show_nothing() -> None:
     field = {"kind": "narrow_field", "width": 0.3}
-    assert anomalies.check_region(field, shots.shot())
-    assert anomalies.label(field, shots.shot(beam=False)) is None
-    assert anomalies.label({"kind": "narrow_field", "width": 2.0}, shots.shot()) is None
+    assert anomalies.check_regions(field, shots.shot())
+    assert not anomalies.labels(field, shots.shot(beam=False))
+    assert not anomalies.labels({"kind": "narrow_field", "width": 2.0}, shots.shot())
 
 
 @pytest.mark.parametrize("wrong", [{"width": 0.0}, {"width": 0.1, "height": 0.0}, {"width": 0.1, "penumbra": -1.0}])
