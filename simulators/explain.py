@@ -23,6 +23,7 @@ from simulators.scene import Scene
 Seconds = Callable[[], float]
 
 STEPS = {
+    "ideal": "rays, exp(-depth) and whole counts in one go",
     "line_integrals": "rays through the sample",
     "beer_lambert": "photons x exp(-depth)",
     "digitise": "electrons to whole counts",
@@ -77,7 +78,7 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explain
     seconds, sizes = _steps(growing[0], shot, now, repeats)
     whole = _whole(growing, shot, now, repeats)
     peaks = [_peak(each, shot) for each in growing]
-    costs = [_cost(name, seconds[name], sizes[name]) for name in ("line_integrals",) if name in seconds]
+    costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
     for n, effect in enumerate(motion):
         more = statistics.median(run[n + 1] - run[n] for run in whole)
         costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))

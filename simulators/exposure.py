@@ -24,12 +24,13 @@ def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.u
 
     Args:
         shot: the circumstances; the same shot makes the same frame again.
-        watch: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects'.
-            A frame that is not watched and has no effects may be made in one go, with the same counts.
+        watch: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
+            or "ideal", where there are no effects and the sample can make a frame in one go, with the same counts.
     """
     chain = scene.chain
-    if watch is nullcontext and not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):
-        return _ideal(scene, scene.sample, shot)
+    if not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):
+        with watch("ideal"):
+            return _ideal(scene, scene.sample, shot)
     if shot.beam:
         photons = _photons(scene, shot, watch)
         electrons = chain.apply(Domain.PHOTONS, photons, shot, watch)
@@ -50,7 +51,7 @@ def _ideal(scene: Scene, sample: Counted, shot: Shot) -> NDArray[np.uint16]:
     def rule(depth: Image) -> NDArray[np.uint16]:
         photons = _transmitted(depth, open_beam)
         photons /= shot.conversion
-        return digitise(photons)
+        return digitise(photons, largest_count(shot.readout, shot.binning))
 
     return sample.counts(shot.angle, shot.detector, open_beam / shot.conversion, rule)
 

@@ -62,4 +62,4 @@ def test_what_is_not_called_for_is_said() -> None:
     assert {name for name, _ in found.not_called_for} == set(CATALOGUE) - {"offset"}
     assert dict(found.not_called_for)["photon_noise"] == CATALOGUE["photon_noise"].says
     bare = explain(_scene(), shot(), _Ticks(), repeats=1)
-    assert [cost.name for cost in bare.costs] == ["line_integrals", "beer_lambert", "digitise"]
+    assert [cost.name for cost in bare.costs] == ["ideal"]
