@@ -15,10 +15,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from simulators.bands import share_rows
-from simulators.streams import begin, normal, uniform
+from simulators.streams import STEP, begin, mix, normal
 
 LEAST = 2.0
 """Least expectation for the expansion; below, a uniform number is looked up in the distribution from 0 up."""
+EASY = 8
+"""Numbers up to this one are compared all at once; of small expectations, 2 in 10 000 are larger."""
 LARGEST = 1e9
 """Largest expectation: rounding of the expansion is far below its error up to there."""
 
@@ -89,25 +91,42 @@ def searched(u, mean):  # type: ignore[no-untyped-def]
 def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pragma: no cover
     """image[row, col] becomes Poisson around itself for the rows of a band."""
     cols = image.shape[1]
-    w, k = np.empty(cols), np.empty(cols)
+    w, u, k = np.empty(cols), np.empty(cols), np.empty(cols)
     for row in range(first, end):
         mean = image[row]
-        state = begin(key, row)
+        state, few = begin(key, row), False
         for col in range(cols):
+            few |= mean[col] < LEAST
             w[col], state = normal(state)
         for col in range(cols):  # in lanes: no branch, no call
-            m, z = mean[col], w[col]
-            x, error = expansion(z, m, math.sqrt(m))
+            m = mean[col]
+            x, error = expansion(w[col], m, math.sqrt(m))
             low = math.floor(x - error)
             k[col] = low if low == math.floor(x + error) else -1.0
+        if few:
+            _small(state, mean, u, k)
         for col in range(cols):
             if k[col] < 0.0:
-                if mean[col] >= LEAST:
-                    k[col] = summed(w[col], mean[col])
-                else:
-                    u, state = uniform(state)
-                    k[col] = searched(u, mean[col])
+                k[col] = summed(w[col], mean[col]) if mean[col] >= LEAST else searched(u[col], mean[col])
             mean[col] = k[col]
+
+
+@njit(cache=True, nogil=True)
+def _small(state, mean, u, k):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The quantile of uniform numbers u [col], which are drawn here, for the small expectations of a row; -1 where it
+    is more than EASY. The others' k [col] stay."""
+    share = np.empty(mean.size)
+    for col in range(mean.size):
+        share[col] = math.exp(-mean[col])
+    for col in range(mean.size):  # in lanes
+        u[col] = (mix(state + np.uint64(col + 1) * STEP) >> np.uint64(11)) * 2.0**-53
+        m, part, total, n = mean[col], share[col], share[col], 0.0
+        for j in range(1, EASY + 1):
+            n += 1.0 if u[col] >= total else 0.0
+            part *= m * (1.0 / j)
+            total += part
+        n = -1.0 if u[col] >= total else n
+        k[col] = n if m < LEAST else k[col]
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ from simulators.effects.shot import Image, Shot, draws
 from simulators.noise import poisson
 from simulators.sensor import DARK_CURRENT
 
-FEW = 2.0
+FEW = 1.0
 """Electrons a pixel below which it is less work to scatter electrons than to ask every pixel."""
 
 
