@@ -22,20 +22,28 @@ Triple = tuple[float, float, float]
 Span = tuple[int, int]
 
 EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an axis
-_FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
+# Without reference counts: arrays come from outside, and to count who holds each slice takes longer than a short chord.
+_FAST = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 @njit(**_FAST)
 def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: Reals, facets: Reals) -> None:
     """What all rows share that see the sample alike: `place` float64 [7] of a body, `facets` float64 [face, 4] of all.
 
-    place: the middle (u, b, v); for an ellipsoid in a parallel beam also su, suv / su, sv - suv² / su and 2 attenuation
-    / |D|, where the shadow is su u² + 2 suv u v + sv v² <= 1 (Schur complement of the ray's direction). facets, in a
-    parallel beam: t = f0 - f1 v + f2 u on the face, and in f3 whether rays enter (-1), leave (1) or run along it (0).
+    place: the middle (u, b, v); of a polyhedron also how far it reaches from there, least and greatest u, then b; of an
+    ellipsoid in a parallel beam su, suv / su, sv - suv² / su and 2 attenuation / |D|, where the shadow is su u² + 2 suv
+    u v + sv v² <= 1 (Schur complement of the ray's direction). facets, in a parallel beam: t = f0 - f1 v + f2 u on the
+    face, and in f3 whether rays enter (-1), leave (1) or run along it (0).
     """
     x, y, z = p.centre[b, 0] - origin[0], p.centre[b, 1] - origin[1], p.centre[b, 2] - origin[2]
     for k in range(3):
         place[k] = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
+    if p.kind[b] == POLYHEDRON:
+        place[3], place[4], place[5], place[6] = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(p.first_vertex[b], p.first_vertex[b + 1]):
+            across, deep, _ = _seen(p.vertices[i], axes)
+            place[3], place[4] = min(place[3], across), max(place[4], across)
+            place[5], place[6] = min(place[5], deep), max(place[6], deep)
     if not parallel:
         return
     if p.kind[b] == ELLIPSOID:
@@ -46,7 +54,7 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
         place[6] = 2.0 * p.attenuation[b] / math.sqrt(dd)
     elif p.kind[b] == POLYHEDRON:
         for f in range(p.first_face[b], p.first_face[b + 1]):
-            nu, nb, nv = _normal(p.faces[f], axes)
+            nu, nb, nv = _seen(p.faces[f], axes)
             if abs(nb) < EDGE_ON:
                 facets[f, 0], facets[f, 1], facets[f, 2], facets[f, 3] = p.faces[f, 3], nv, nu, 0.0
             else:
@@ -75,7 +83,14 @@ def ellipsoid(row: Reals, u: Reals, pitch: float, v: float, place: Reals) -> Spa
     su, middle, scale = place[3], place[0] - place[4] * dv, place[6]
     reach = math.sqrt(rest / su)
     first, stop = _columns(u, pitch, middle - reach, middle + reach)
-    part, at = row[first:stop], u[first:stop]
+    # Eights as far as there are pixels: beyond the shadow nothing is added, and eight roots take no longer than one.
+    eights = min((stop - first + 7) // 8, (row.size - first) // 8)
+    for k in range(eights):
+        part, at = row[first + 8 * k : first + 8 * k + 8], u[first + 8 * k : first + 8 * k + 8]
+        for i in range(8):
+            d = at[i] - middle
+            part[i] += scale * math.sqrt(max(rest - su * d * d, 0.0))
+    part, at = row[first + 8 * eights : stop], u[first + 8 * eights : stop]
     for i in range(part.size):
         d = at[i] - middle
         part[i] += scale * math.sqrt(max(rest - su * d * d, 0.0))
@@ -88,7 +103,7 @@ def polyhedron(
 ) -> Span:
     """Parallel rays; `lines` float64 [4, faces] is room to work in."""
     dv = v - place[2]
-    left, right, high, low = -np.inf, np.inf, 0, 0
+    left, right, high, low = place[3], place[4], 0, 0
     for f in range(p.first_face[b], p.first_face[b + 1]):
         a, slope = facets[f, 0] - facets[f, 1] * dv, facets[f, 2]
         if facets[f, 3] > 0:
@@ -108,9 +123,12 @@ def cone_polyhedron(
 ) -> Span:
     """A cone's rays. With s = 1/t a face is n · (u, sod, v) <= s x (the source's distance from it), linear in u."""
     middle = place[0] * sod / (sod + place[1])
-    left, right, high, low = -np.inf, np.inf, 0, 0
+    front, back = sod / (sod + place[1] + place[5]), sod / (sod + place[1] + place[6])
+    left, right = place[0] + place[3], place[0] + place[4]
+    left, right = min(left * front, left * back) - middle, max(right * front, right * back) - middle
+    high = low = 0
     for f in range(p.first_face[b], p.first_face[b + 1]):
-        nu, nb, nv = _normal(p.faces[f], axes)
+        nu, nb, nv = _seen(p.faces[f], axes)
         inside = p.faces[f, 3] + nu * place[0] + nb * (sod + place[1]) + nv * place[2]
         at_middle = nu * middle + nb * sod + nv * v
         if abs(inside) < EDGE_ON * sod:
@@ -203,38 +221,45 @@ def _between(
     left: float, right: float, cone: bool,
 ) -> Span:  # fmt: skip
     """Add the gap between the lowest of the `high` lines [0:2] and the highest of the `low` lines [2:4], each value +
-    slope (u - middle): walk from kink to kink. In a cone the lines are of 1/t, and the gap is that of t."""
-    for k in range(high):
-        for m in range(low):  # each pair of faces bounds u
-            left, right = _bounded(left, right, lines[3, m] - lines[1, k], lines[0, k] - lines[2, m])
-    first, stop = _columns(u, pitch, middle + left, middle + right)
-    if not (left < right and first < stop and high > 0 and low > 0):
-        return 0, 0
-    k, m = 0, 0
-    for i in range(1, high):
-        gap = lines[0, i] + lines[1, i] * left - lines[0, k] - lines[1, k] * left
-        if gap < 0.0 or (gap == 0.0 and lines[1, i] < lines[1, k]):
-            k = i
-    for i in range(1, low):
-        gap = lines[2, i] + lines[3, i] * left - lines[2, m] - lines[3, m] * left
-        if gap > 0.0 or (gap == 0.0 and lines[3, i] > lines[3, m]):
-            m = i
+    slope (u - middle), in left..right: walk from kink to kink. In a cone the lines are of 1/t, the gap that of t.
+    """
+    k = m = -1
+    at = left
+    for _ in range(high + low):  # Newton's steps to where the gap opens: it is concave, so they never go too far
+        above, below, last_k, last_m = np.inf, -np.inf, k, m
+        for i in range(high):
+            height = lines[0, i] + lines[1, i] * at
+            if height < above or (height == above and lines[1, i] < lines[1, k]):
+                above, k = height, i
+        for i in range(low):
+            height = lines[2, i] + lines[3, i] * at
+            if height > below or (height == below and lines[3, i] > lines[3, m]):
+                below, m = height, i
+        if above >= below or (k == last_k and m == last_m):
+            break
+        opens = lines[1, k] - lines[3, m]
+        if opens <= 0.0:
+            return 0, 0
+        at = max(at, (lines[2, m] - lines[0, k]) / opens)
+        if at >= right:
+            return 0, 0
+    first = _columns(u, pitch, middle + at, np.inf)[0]
     begin = first
-    while begin < stop:
-        kink, next_k, next_m = right, k, m
+    while begin < u.size:
+        next_k, next_m, kink = k, m, right
+        if lines[1, k] < lines[3, m]:  # the gap closes
+            kink = min(kink, (lines[0, k] - lines[2, m]) / (lines[3, m] - lines[1, k]))
         for i in range(high):
             if lines[1, i] < lines[1, k]:
-                at = (lines[0, i] - lines[0, k]) / (lines[1, k] - lines[1, i])
-                if at < kink:
-                    kink, next_k, next_m = at, i, m
+                meets = (lines[0, i] - lines[0, k]) / (lines[1, k] - lines[1, i])
+                if meets < kink:
+                    kink, next_k, next_m = meets, i, m
         for i in range(low):
             if lines[3, i] > lines[3, m]:
-                at = (lines[2, m] - lines[2, i]) / (lines[3, i] - lines[3, m])
-                if at < kink:
-                    kink, next_k, next_m = at, k, i
-        end = stop
-        if next_k != k or next_m != m:
-            end = min(stop, max(begin, _columns(u, pitch, -np.inf, middle + kink)[1]))
+                meets = (lines[2, m] - lines[2, i]) / (lines[3, i] - lines[3, m])
+                if meets < kink:
+                    kink, next_k, next_m = meets, k, i
+        end = max(begin, _columns(u, pitch, -np.inf, middle + kink)[1])
         part, where = row[begin:end], u[begin:end]
         if cone:
             a, b, c, d = lines[0, k], lines[1, k], lines[2, m], lines[3, m]
@@ -245,8 +270,11 @@ def _between(
             a, b = attenuation * (lines[0, k] - lines[2, m]), attenuation * (lines[1, k] - lines[3, m])
             for i in range(part.size):
                 part[i] += a + b * (where[i] - middle)
-        begin, k, m = end, next_k, next_m
-    return first, stop
+        begin = end
+        if next_k == k and next_m == m:
+            break
+        k, m = next_k, next_m
+    return first, begin
 
 
 @njit(**_FAST)
@@ -280,12 +308,12 @@ def _times(matrix: Reals, axes: Reals, k: int) -> Triple:
 
 
 @njit(**_FAST)
-def _normal(face: Reals, axes: Reals) -> Triple:
-    """A face's normal along (u, b, v)."""
+def _seen(q: Reals, axes: Reals) -> Triple:
+    """The first three numbers of q, a vector in the sample's axes, along (u, b, v)."""
     return (
-        face[0] * axes[0, 0] + face[1] * axes[1, 0] + face[2] * axes[2, 0],
-        face[0] * axes[0, 1] + face[1] * axes[1, 1] + face[2] * axes[2, 1],
-        face[0] * axes[0, 2] + face[1] * axes[1, 2] + face[2] * axes[2, 2],
+        q[0] * axes[0, 0] + q[1] * axes[1, 0] + q[2] * axes[2, 0],
+        q[0] * axes[0, 1] + q[1] * axes[1, 1] + q[2] * axes[2, 1],
+        q[0] * axes[0, 2] + q[1] * axes[1, 2] + q[2] * axes[2, 2],
     )
 
 

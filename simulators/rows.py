@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -46,13 +47,16 @@ _FAR = 1000.0  # binary orders of magnitude: beyond, there is no light, or too m
 _TOP = 65535.0
 _DOUBT = 1e-7  # counts from the middle between two: 70 times the error of all steps here at full range
 
-_FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
+# Without reference counts, see chords.
+_FAST = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def depths(p: Packed, view: View) -> Reals:
     """Line integrals, float64 [row, col]."""
     out = np.empty((view.v.size, view.u.size))
-    _shared(lambda first, step: _depth_rows(p, view, np.arange(first, view.v.size, step), out), out.size)
+    _shared(
+        lambda first, step: _depth_rows(p, view, _room(p, view), np.arange(first, view.v.size, step), out), out.size
+    )
     return out
 
 
@@ -68,11 +72,13 @@ def counts(p: Packed, view: View, open_beam: float, rule: Callable[[Reals], Coun
     """
     out, doubtful = np.empty((view.v.size, view.u.size), np.uint16), np.zeros(view.v.size, np.bool_)
     air = int(rule(np.zeros((1, 1)))[0, 0])
-    _shared(lambda first, step: _count_rows(p, view, first, step, open_beam, air, out, doubtful), out.size)
+    _shared(
+        lambda first, step: _count_rows(p, view, _room(p, view), first, step, open_beam, air, out, doubtful), out.size
+    )
     rows = np.flatnonzero(doubtful)
     if rows.size:
         again = np.empty((rows.size, view.u.size))
-        _depth_rows(p, view, rows, again)
+        _depth_rows(p, view, _room(p, view), rows, again)
         out[rows] = rule(again)
     return out
 
@@ -94,9 +100,9 @@ def _shared(work: Callable[[int, int], None], pixels: int) -> None:
 
 
 @njit(**_FAST)
-def _depth_rows(p: Packed, view: View, rows: NDArray[np.int64], out: Reals) -> None:
+def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out: Reals) -> None:
     """Line integrals of some rows into the rows of `out`, or into its row of the same number where it has them all."""
-    place, facets, lines, spans, base = _room(p, view)
+    place, facets, lines, spans, base = room.place, room.facets, room.lines, room.spans, room.base
     _look_once(p, view, place, facets)
     whole = out.shape[0] == view.v.size
     known = -1
@@ -104,29 +110,29 @@ def _depth_rows(p: Packed, view: View, rows: NDArray[np.int64], out: Reals) -> N
         j = rows[r]
         row = out[j] if whole else out[r]
         known = _base(p, view, j, known, place, base)[0]
-        row[:] = base
+        _copy(base, row)
         _add_bodies(p, view, j, row, place, facets, lines, spans)
 
 
 @njit(**_FAST)
 def _count_rows(
-    p: Packed, view: View, start: int, step: int, open_beam: float, air: int, out: Counts, doubtful: NDArray[np.bool_]
-) -> None:
+    p: Packed, view: View, room: Room, start: int, step: int, open_beam: float, air: int, out: Counts,
+    doubtful: NDArray[np.bool_],
+) -> None:  # fmt: skip
     """Every step-th row of counts; marks the rows in which one is in doubt."""
-    place, facets, lines, spans, base = _room(p, view)
+    place, facets, lines, spans, row, base, of_base = room
     _look_once(p, view, place, facets)
-    row, of_base = base.copy(), np.full(base.size, air, np.uint16)
     known, left, right, base_in_doubt = -1, 0, 0, False
     for j in range(start, view.v.size, step):
         before = known
         known, first, stop = _base(p, view, j, known, place, base)
         if known == j or before < 0:
-            row[:] = base
-            of_base[:] = air
+            _copy(base, row)
+            _fill(of_base, air)
             base_in_doubt = _to_counts(base[first:stop], open_beam, of_base[first:stop])
         else:
-            row[left:right] = base[left:right]
-        out[j, :] = of_base
+            _copy(base[left:right], row[left:right])
+        _copy(of_base, out[j])
         doubt = base_in_doubt
         n = _add_bodies(p, view, j, row, place, facets, lines, spans)
         left, right = row.size, 0
@@ -143,21 +149,40 @@ def _count_rows(
         doubtful[j] = doubt
 
 
-@njit(**_FAST)
-def _room(p: Packed, view: View) -> tuple[Reals, Reals, Reals, NDArray[np.int64], Reals]:
-    """Arrays to work in: place, facets, lines, spans and the base row."""
-    faces = most = 0
-    for b in range(p.kind.size):
-        faces = max(faces, p.first_face[b + 1] - p.first_face[b])
-    for j in range(view.v.size):
-        most = max(most, view.first[j + 1] - view.first[j])
-    return (
+class Room(NamedTuple):
+    """Arrays to work in, one set a thread: kernels here make none of their own."""
+
+    place: Reals
+    facets: Reals
+    lines: Reals
+    spans: NDArray[np.int64]
+    row: Reals
+    base: Reals
+    of_base: Counts
+
+
+def _room(p: Packed, view: View) -> Room:
+    return Room(
         np.zeros((p.kind.size, 7)),
         np.zeros((p.faces.shape[0], 4)),
-        np.empty((4, faces)),
-        np.empty((most, 2), np.int64),
+        np.empty((4, int(np.diff(p.first_face).max(initial=0)))),
+        np.empty((int(np.diff(view.first).max(initial=0)), 2), np.int64),
         np.zeros(view.u.size),
+        np.zeros(view.u.size),
+        np.zeros(view.u.size, np.uint16),
     )
+
+
+@njit(**_FAST)
+def _copy(source: NDArray[Any], out: NDArray[Any]) -> None:
+    for i in range(out.size):
+        out[i] = source[i]
+
+
+@njit(**_FAST)
+def _fill(out: NDArray[Any], value: float) -> None:
+    for i in range(out.size):
+        out[i] = value
 
 
 @njit(**_FAST)
@@ -183,7 +208,7 @@ def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) 
             k += 1
     if alike:
         return known, 0, 0
-    base[:] = 0.0
+    _fill(base, 0.0)
     left, right = base.size, 0
     for k in range(start, stop):
         b = view.round[k]
