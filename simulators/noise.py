@@ -3,7 +3,7 @@
 A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution: no
 rejection, so that a row is done in lanes. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
 "Algorithm 955") unless that lies closer to a whole number than its error, a case in thousands: then the
-distribution itself is summed and decides.
+distribution itself is summed and decides. Expectations below 2 look up a uniform number in the distribution.
 """
 
 from __future__ import annotations
