@@ -85,7 +85,9 @@ def test_each_keeps_its_number_from_view_to_view() -> None:
     assert isinstance(effect, Floaters)
     places = {which: [] for which in range(3)}
     for view in range(VIEWS):
-        for crumb in effect.crumbs(_view(view)):
+        shown = list(effect.crumbs(_view(view)))
+        assert [label.which for label in effect.labels(_view(view))] == [crumb.which for crumb in shown]
+        for crumb in shown:
             places[crumb.which].append((view, crumb.col, crumb.sigma))
     for path in places.values():
         views, cols, sigmas = np.array(path).T
