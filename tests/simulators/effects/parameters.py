@@ -20,7 +20,7 @@ PARAMETERS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "afterglow": {"shares": [0.2], "decay_times": [1.0]},
         "jump": {"view": 1, "shift_um": [30.0, 0.0, 10.0]},
         "floaters": {"distance": [0.3, 0.3], "count": 2},
-        "phase_fringes": {"delta_beta": 10.0, "distance": 2000.0, "energy": 20.0},
+        "phase_fringes": {"delta_beta": 3.0, "distance": 5000.0, "energy": 20.0},
         "harmonics": {"share": 0.1},
         "beam_hardening": {"weights": [1.0, 1.0], "ratios": [1.0, 2.0]},
         "beam_profile": {"sigma": [1.0, 1.0]},
