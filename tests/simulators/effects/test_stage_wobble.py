@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from simulators.effects.stage_wobble import StageWobble
+from tests.simulators import shots
 from tests.simulators.poses import posed, seen
 
 POINT = (0.2, -0.1, 0.3)
@@ -35,6 +36,17 @@ def test_no_wave_is_an_axis_that_leans_always_to_the_same_side() -> None:
     np.testing.assert_allclose(about_u, [[0.0, -0.4e-3, 0.4]] * 3, atol=1e-6)
     about_b = seen(posed(StageWobble(((0, 1000.0, -90.0),)), np.array([0.0, 1.0, 2.0])), high)
     np.testing.assert_allclose(about_b, [[0.4e-3, 0.0, 0.4]] * 3, atol=1e-6)
+
+
+def test_a_ball_high_on_a_leaning_axis_is_seen_beside_it() -> None:
+    """0.2 mm up, on an axis that leans by 0.05 rad to the side."""
+    ball = {"kind": "ellipsoid", "semi_axes": [0.06, 0.06, 0.06], "attenuation": 5.0, "centre": [0.0, 0.0, 0.2]}
+    wobble = {"kind": "stage_wobble", "harmonics": [[0, 50_000.0, -90.0]]}
+    scene = shots.scene(wobble, phantom={"kind": "solids", "solids": [ball]})
+    lost = -np.log(shots.frame(scene) / shots.frame(scene).max())
+    detector = shots.shot().detector
+    u, v = (lost.sum(axis=0) @ detector.u()) / lost.sum(), (lost.sum(axis=1) @ detector.v()) / lost.sum()
+    assert (u, v) == pytest.approx((0.2 * math.sin(0.05), 0.2 * math.cos(0.05)), abs=1e-4)
 
 
 def test_two_waves_lean_at_the_turned_angle() -> None:
