@@ -16,6 +16,7 @@ from recon.volume import Grid
 from simulators.beam import Beam
 from simulators.detector import Detector
 from simulators.materials import Material
+from simulators.palette import Palette
 from simulators.phantom import Phantom
 from simulators.pose import Pose
 from simulators.sample import Sample
@@ -118,11 +119,11 @@ class Mixture:
         return replace(self, spectrum=spectrum)
 
 
-def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation]) -> Sample:
+def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation] = Palette().filters) -> Sample:
     """The parts as they are seen in the beam: of one energy a plain phantom, of more a mixture.
 
     Args:
-        filters: the attenuation of a material by its name, for a tube.
+        filters: the attenuation of a material by its name, for a tube; those known by name unless given.
 
     Raises:
         ValueError: a material, but a beam that does not say its energies or says some that are not tabulated.

@@ -41,7 +41,7 @@ def test_a_slab_in_two_energies_is_the_closed_form() -> None:
     t = np.geomspace(1e-6, 1e3, 50).reshape(1, 5, 10)
     got = effective_depth(t, mu, spectrum.weights)
     expected = -np.logaddexp(np.log(0.75) - 4 * t[0], np.log(0.25) - t[0])
-    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-13)  # of the open beam
     assert got[0, 0] / t[0, 0, 0] == pytest.approx(0.75 * 4 + 0.25 * 1, rel=1e-5)
     assert got[-1, -1] - 1.0 * t[0, -1, -1] == pytest.approx(-math.log(0.25))
 
@@ -94,29 +94,32 @@ def test_a_table_is_taken_as_it_is_less_what_has_no_weight() -> None:
     assert (spectrum.energies.tolist(), spectrum.weights.tolist()) == ([20.0, 30.0], [0.25, 0.75])
 
 
-@pytest.mark.parametrize(("material", "most"), [(_smooth, 5), (_step, 129)])
+@pytest.mark.parametrize(("material", "most"), [(_smooth, 5), (_step, 5)])
 def test_a_pink_beam_has_the_nodes_that_its_sample_needs(material: Attenuation, most: int) -> None:
-    """Against a sum over 200 001 energies; a smooth material needs few nodes, an edge in the line many."""
+    """Against a sum over 200 001 energies; a smooth material needs few, a step in the line two and the thin limit."""
     beam = Beam(1.0, energy_kev=10.0, bandwidth=0.02)
     spectrum = _light(beam, material)
     sigma = 10.0 * 0.02 / math.sqrt(8 * math.log(2))
     fine = 10.0 + sigma * np.linspace(-6, 6, 200_001)
     exact = Spectrum.of(fine, np.exp(-((fine - 10.0) ** 2) / (2 * sigma**2)))
     t = np.array([0.01, 0.1, 0.5, 1.0])
-    worst = 1e-5 if material is _smooth else 1e-2  # half a node's weight
+    worst = 2e-5 if material is _smooth else 4e-3  # half a node's weight
     np.testing.assert_allclose(spectrum.transmission(material, t), exact.transmission(material, t), atol=worst)
     assert spectrum.energies.size <= most
-    assert spectrum.weights @ spectrum.energies == pytest.approx(10.0, rel=1e-6)
 
 
-def test_the_width_is_full_at_half_maximum() -> None:
-    spectrum = _light(Beam(1.0, energy_kev=10.0, bandwidth=0.02), _step)
-    spread = math.sqrt(spectrum.weights @ (spectrum.energies - 10.0) ** 2)
-    assert spread * math.sqrt(8 * math.log(2)) == pytest.approx(0.2, rel=1e-4)
+def test_a_long_table_is_kept_to_what_its_sample_needs() -> None:
+    energies = np.linspace(10, 60, 400)
+    table = tuple(zip(energies.tolist(), (1 + np.sin(energies / 7)).tolist(), strict=True))
+    spectrum = _light(Beam(1.0, spectrum=table), thickness=5.0)
+    t = np.geomspace(1e-3, 5, 30)
+    exact = Spectrum.of(energies, 1 + np.sin(energies / 7)).transmission(_smooth, t)
+    np.testing.assert_allclose(spectrum.transmission(_smooth, t), exact, atol=1e-5)
+    assert spectrum.energies.size < 15
 
 
 def test_a_tube_is_kramers_behind_its_filter() -> None:
-    """Against a sum over 1/E - 1/kV, filtered, on 100 000 energies; the mean energy rises with the filter."""
+    """Against a sum over 1/E - 1/kV, filtered, on 100 000 energies; a filter hardens."""
     means = []
     for mm in (0.5, 2.0):
         beam = Beam(1.0, tube=Tube(60.0, {"it": mm}))
@@ -125,10 +128,10 @@ def test_a_tube_is_kramers_behind_its_filter() -> None:
         exact = Spectrum.of(fine, (1 / fine - 1 / 60.0) * np.exp(-mm * _smooth(fine)))
         t = np.geomspace(0.01, 5, 8)
         np.testing.assert_allclose(spectrum.transmission(_smooth, t), exact.transmission(_smooth, t), atol=2e-5)
-        assert spectrum.energies.size < 40
+        assert spectrum.energies.size < 15
         assert spectrum.energies.max() < 60.0
-        means.append(float(spectrum.weights @ spectrum.energies))
-    assert means[1] > means[0] > 20
+        means.append(spectrum.mean(_smooth))
+    assert means[1] < means[0]
 
 
 def test_light_that_is_not_there_is_refused() -> None:

@@ -1,0 +1,55 @@
+"""Fewer energies: a spectrum on a few of its own energies that lets through the same light, whatever the sample holds.
+
+exp(-mu(E) t) of different energies are nearly dependent on one another, so that a sum over many of them is a sum over a
+few to any practical accuracy. Which, and with what weights, is found by non-negative least squares (Lawson & Hanson,
+Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and all of them.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+Reals = NDArray[np.float64]
+
+STEPS = 40
+"""Rays are taken from the full thickness down to a 8000th of it."""
+
+
+def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float) -> tuple[NDArray[np.intp], Reals]:
+    """Positions of the energies that are kept, and their weights, of sum 1.
+
+    Args:
+        attenuation: 1/mm, float64 [energy, material].
+        weights: float64 [energy], of sum 1.
+        thickness: mm, the longest way through matter.
+        tolerance: share of the open beam to which the light stays the same.
+    """
+    n_materials = attenuation.shape[1]
+    ways = [np.eye(n_materials)]
+    ways += [(np.eye(n_materials)[list(pair)].mean(axis=0))[None] for pair in combinations(range(n_materials), 2)]
+    ways.append(np.full((1, n_materials), 1 / n_materials))
+    lengths = np.append(thickness * 2.0 ** (-np.arange(STEPS) / 3), 0.0)
+    rays = (lengths[:, None, None] * np.concatenate(ways)).reshape(-1, n_materials)
+    through = np.exp(-rays @ attenuation.T)
+    light = through @ weights
+    chosen: list[int] = []
+    found = np.zeros(0)
+    missing = light
+    while len(chosen) < weights.size:
+        pull = through.T @ missing
+        pull[chosen] = -np.inf
+        chosen.append(int(np.argmax(pull)))
+        found, _ = nnls(through[:, chosen], light)
+        found /= found.sum()
+        missing = light - through[:, chosen] @ found
+        if np.abs(missing).max() <= tolerance:
+            break
+    else:
+        return np.arange(weights.size), weights
+    kept = np.array(chosen, dtype=np.intp)[found > 0]
+    order = np.argsort(kept)
+    return kept[order], found[found > 0][order]
