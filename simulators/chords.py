@@ -3,8 +3,8 @@
 In the laboratory's axes (u, b, v) a parallel ray is (u, 0, v) + t (0, 1, 0) and a cone's (0, -sod, 0) + t (u, sod, v),
 t = 1 being the plane of the rotation axis; `axes` [3, 3] has these axes as columns, in the sample's (x, y, z). Each
 function adds attenuation x length in t to the pixels in the body's shadow and tells which these are: from the first to
-the one after the last. In a cone the caller multiplies by the length of (u, sod, v). All is reckoned from the body's
-middle, so that no digits cancel where the source is far.
+the one after the last. `u` has the columns in mm, `per_mm` of them a mm. In a cone the caller multiplies by the length
+of (u, sod, v). All is reckoned from the body's middle, so that no digits cancel where the source is far.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
 
 
 @njit(**_FAST)
-def upright_cylinder(row: Reals, u: Reals, pitch: float, middle: float, radius: float, attenuation: float) -> Span:
+def upright_cylinder(row: Reals, u: Reals, per_mm: float, middle: float, radius: float, attenuation: float) -> Span:
     """Parallel rays across an upright cylinder between its ends."""
-    first, stop = _columns(u, pitch, middle - radius, middle + radius)
+    first, stop = _columns(u, per_mm, middle - radius, middle + radius)
     part, at = row[first:stop], u[first:stop]
     for i in range(part.size):
         d = at[i] - middle
@@ -74,7 +74,7 @@ def upright_cylinder(row: Reals, u: Reals, pitch: float, middle: float, radius: 
 
 
 @njit(**_FAST)
-def ellipsoid(row: Reals, u: Reals, pitch: float, v: float, place: Reals) -> Span:
+def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Span:
     """Parallel rays; `place` as `look` left it."""
     dv = v - place[2]
     rest = 1.0 - place[5] * dv * dv
@@ -82,15 +82,8 @@ def ellipsoid(row: Reals, u: Reals, pitch: float, v: float, place: Reals) -> Spa
         return 0, 0
     su, middle, scale = place[3], place[0] - place[4] * dv, place[6]
     reach = math.sqrt(rest / su)
-    first, stop = _columns(u, pitch, middle - reach, middle + reach)
-    # Eights as far as there are pixels: beyond the shadow nothing is added, and eight roots take no longer than one.
-    eights = min((stop - first + 7) // 8, (row.size - first) // 8)
-    for k in range(eights):
-        part, at = row[first + 8 * k : first + 8 * k + 8], u[first + 8 * k : first + 8 * k + 8]
-        for i in range(8):
-            d = at[i] - middle
-            part[i] += scale * math.sqrt(max(rest - su * d * d, 0.0))
-    part, at = row[first + 8 * eights : stop], u[first + 8 * eights : stop]
+    first, stop = _columns(u, per_mm, middle - reach, middle + reach)
+    part, at = row[first:stop], u[first:stop]
     for i in range(part.size):
         d = at[i] - middle
         part[i] += scale * math.sqrt(max(rest - su * d * d, 0.0))
@@ -99,7 +92,7 @@ def ellipsoid(row: Reals, u: Reals, pitch: float, v: float, place: Reals) -> Spa
 
 @njit(**_FAST)
 def polyhedron(
-    row: Reals, u: Reals, pitch: float, v: float, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals
+    row: Reals, u: Reals, per_mm: float, v: float, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals
 ) -> Span:
     """Parallel rays; `lines` float64 [4, faces] is room to work in."""
     dv = v - place[2]
@@ -114,12 +107,21 @@ def polyhedron(
             low += 1
         else:  # n · (u, v) <= distance, whatever t
             left, right = _bounded(left, right, slope, a)
-    return _between(row, u, pitch, place[0], p.attenuation[b], lines, high, low, left, right, False)
+    return _between(row, u, per_mm, place[0], p.attenuation[b], lines, high, low, left, right, False)
 
 
 @njit(**_FAST)
 def cone_polyhedron(
-    row: Reals, u: Reals, pitch: float, v: float, sod: float, p: Packed, b: int, axes: Reals, place: Reals, lines: Reals
+    row: Reals,
+    u: Reals,
+    per_mm: float,
+    v: float,
+    sod: float,
+    p: Packed,
+    b: int,
+    axes: Reals,
+    place: Reals,
+    lines: Reals,
 ) -> Span:
     """A cone's rays. With s = 1/t a face is n · (u, sod, v) <= s x (the source's distance from it), linear in u."""
     middle = place[0] * sod / (sod + place[1])
@@ -139,12 +141,12 @@ def cone_polyhedron(
         else:
             lines[2, low], lines[3, low] = at_middle / inside, nu / inside
             low += 1
-    return _between(row, u, pitch, middle, p.attenuation[b], lines, high, low, left, right, True)
+    return _between(row, u, per_mm, middle, p.attenuation[b], lines, high, low, left, right, True)
 
 
 @njit(**_FAST)
 def cone_ellipsoid(
-    row: Reals, u: Reals, pitch: float, v: float, sod: float, matrix: Reals, attenuation: float, axes: Reals,
+    row: Reals, u: Reals, per_mm: float, v: float, sod: float, matrix: Reals, attenuation: float, axes: Reals,
     place: Reals,
 ) -> Span:  # fmt: skip
     """A cone's rays, in the space where the ellipsoid is the unit ball: half a chord squared is |D|² - |R x D|² over
@@ -159,7 +161,7 @@ def cone_ellipsoid(
     if root <= 0.0 or c2 >= 0.0:
         return 0, 0
     top, reach = -c1 / (2.0 * c2), math.sqrt(root) / (-2.0 * c2)
-    first, stop = _columns(u, pitch, middle + top - reach, middle + top + reach)
+    first, stop = _columns(u, per_mm, middle + top - reach, middle + top + reach)
     part, at = row[first:stop], u[first:stop]
     d0, d1, d2 = _dot(M, M), 2.0 * _dot(M, U), _dot(U, U)
     for i in range(part.size):
@@ -170,7 +172,7 @@ def cone_ellipsoid(
 
 @njit(**_FAST)
 def leaning_cylinder(
-    row: Reals, u: Reals, pitch: float, v: float, sod: float, radius: float, half: float, attenuation: float,
+    row: Reals, u: Reals, per_mm: float, v: float, sod: float, radius: float, half: float, attenuation: float,
     axes: Reals, place: Reals,
 ) -> Span:  # fmt: skip
     """Any rays (sod is infinite in a parallel beam): inside the round wall and between the ends."""
@@ -189,7 +191,7 @@ def leaning_cylinder(
         D0 = _sum(sod, B, v, V, middle, U)
     w = near * v - place[2]
     R0 = _sum(w, V, 0.0, V, 0.0, V)
-    first, stop = _columns(u, pitch, low, high)
+    first, stop = _columns(u, per_mm, low, high)
     part, at = row[first:stop], u[first:stop]
     for i in range(part.size):
         d = at[i] - middle
@@ -217,7 +219,7 @@ def leaning_cylinder(
 
 @njit(**_FAST)
 def _between(
-    row: Reals, u: Reals, pitch: float, middle: float, attenuation: float, lines: Reals, high: int, low: int,
+    row: Reals, u: Reals, per_mm: float, middle: float, attenuation: float, lines: Reals, high: int, low: int,
     left: float, right: float, cone: bool,
 ) -> Span:  # fmt: skip
     """Add the gap between the lowest of the `high` lines [0:2] and the highest of the `low` lines [2:4], each value +
@@ -229,12 +231,12 @@ def _between(
         above, below, last_k, last_m = np.inf, -np.inf, k, m
         for i in range(high):
             height = lines[0, i] + lines[1, i] * at
-            if height < above or (height == above and lines[1, i] < lines[1, k]):
-                above, k = height, i
+            k = i if height < above else k
+            above = min(above, height)
         for i in range(low):
             height = lines[2, i] + lines[3, i] * at
-            if height > below or (height == below and lines[3, i] > lines[3, m]):
-                below, m = height, i
+            m = i if height > below else m
+            below = max(below, height)
         if above >= below or (k == last_k and m == last_m):
             break
         opens = lines[1, k] - lines[3, m]
@@ -243,23 +245,23 @@ def _between(
         at = max(at, (lines[2, m] - lines[0, k]) / opens)
         if at >= right:
             return 0, 0
-    first = _columns(u, pitch, middle + at, np.inf)[0]
+    first = _columns(u, per_mm, middle + at, np.inf)[0]
     begin = first
     while begin < u.size:
         next_k, next_m, kink = k, m, right
         if lines[1, k] < lines[3, m]:  # the gap closes
             kink = min(kink, (lines[0, k] - lines[2, m]) / (lines[3, m] - lines[1, k]))
         for i in range(high):
-            if lines[1, i] < lines[1, k]:
-                meets = (lines[0, i] - lines[0, k]) / (lines[1, k] - lines[1, i])
-                if meets < kink:
-                    kink, next_k, next_m = meets, i, m
+            closing = lines[1, k] - lines[1, i]
+            meets = (lines[0, i] - lines[0, k]) / closing if closing > 0.0 else np.inf
+            next_k = i if meets < kink else next_k
+            kink = min(kink, meets)
         for i in range(low):
-            if lines[3, i] > lines[3, m]:
-                meets = (lines[2, m] - lines[2, i]) / (lines[3, i] - lines[3, m])
-                if meets < kink:
-                    kink, next_k, next_m = meets, k, i
-        end = max(begin, _columns(u, pitch, -np.inf, middle + kink)[1])
+            closing = lines[3, i] - lines[3, m]
+            meets = (lines[2, m] - lines[2, i]) / closing if closing > 0.0 else np.inf
+            next_m, next_k = (i, k) if meets < kink else (next_m, next_k)
+            kink = min(kink, meets)
+        end = max(begin, _columns(u, per_mm, -np.inf, middle + kink)[1])
         part, where = row[begin:end], u[begin:end]
         if cone:
             a, b, c, d = lines[0, k], lines[1, k], lines[2, m], lines[3, m]
@@ -288,11 +290,11 @@ def _bounded(left: float, right: float, slope: float, limit: float) -> tuple[flo
 
 
 @njit(**_FAST)
-def _columns(u: Reals, pitch: float, low: float, high: float) -> Span:
+def _columns(u: Reals, per_mm: float, low: float, high: float) -> Span:
     """First column whose centre lies in low..high, and the one after the last."""
     cols = float(u.size)
-    first = math.ceil(min(max((low - u[0]) / pitch, 0.0), cols))
-    stop = math.floor(min(max((high - u[0]) / pitch, -1.0), cols - 1.0)) + 1
+    first = math.ceil(min(max((low - u[0]) * per_mm, 0.0), cols))
+    stop = math.floor(min(max((high - u[0]) * per_mm, -1.0), cols - 1.0)) + 1
     return first, max(first, stop)
 
 

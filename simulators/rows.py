@@ -32,6 +32,7 @@ from simulators.view import View
 Reals = NDArray[np.float64]
 Counts = NDArray[np.uint16]
 
+TILE = 64  # columns: a row's bodies touch some, and only these are looked at
 SMALL = 2**16  # pixels: a thread takes longer to start than so many to compute
 
 # 2^x on [-1/2, 1/2] by Chebyshev's points, of degree 9: relative error 2e-14.
@@ -44,7 +45,7 @@ _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = _EXP2
 _LOG2E = math.log2(math.e)
 _ROUND = 1.5 * 2.0**52  # added, it leaves the nearest whole number in the last bits
 _FAR = 1000.0  # binary orders of magnitude: beyond, there is no light, or too much
-_TOP = 65535.0
+_BRIGHT = 600.0  # e to this is more than any converter takes, and less than float64 does
 _DOUBT = 1e-7  # counts from the middle between two: 70 times the error of all steps here at full range
 
 # Without reference counts, see chords.
@@ -71,9 +72,10 @@ def counts(p: Packed, view: View, open_beam: float, rule: Callable[[Reals], Coun
         rule: counts of line integrals [row, col], which it may write over.
     """
     out, doubtful = np.empty((view.v.size, view.u.size), np.uint16), np.zeros(view.v.size, np.bool_)
-    air = int(rule(np.zeros((1, 1)))[0, 0])
+    air, top = (int(rule(np.full((1, 1), depth))[0, 0]) for depth in (0.0, -_BRIGHT))
     _shared(
-        lambda first, step: _count_rows(p, view, _room(p, view), first, step, open_beam, air, out, doubtful), out.size
+        lambda first, step: _count_rows(p, view, _room(p, view), first, step, open_beam, air, top, out, doubtful),
+        out.size,
     )
     rows = np.flatnonzero(doubtful)
     if rows.size:
@@ -102,7 +104,7 @@ def _shared(work: Callable[[int, int], None], pixels: int) -> None:
 @njit(**_FAST)
 def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out: Reals) -> None:
     """Line integrals of some rows into the rows of `out`, or into its row of the same number where it has them all."""
-    place, facets, lines, spans, base = room.place, room.facets, room.lines, room.spans, room.base
+    place, facets, lines, touched, base = room.place, room.facets, room.lines, room.touched, room.base
     _look_once(p, view, place, facets)
     whole = out.shape[0] == view.v.size
     known = -1
@@ -111,41 +113,39 @@ def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out:
         row = out[j] if whole else out[r]
         known = _base(p, view, j, known, place, base)[0]
         _copy(base, row)
-        _add_bodies(p, view, j, row, place, facets, lines, spans)
+        _add_bodies(p, view, j, row, place, facets, lines, touched)
 
 
 @njit(**_FAST)
 def _count_rows(
-    p: Packed, view: View, room: Room, start: int, step: int, open_beam: float, air: int, out: Counts,
+    p: Packed, view: View, room: Room, start: int, step: int, open_beam: float, air: int, top: float, out: Counts,
     doubtful: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Every step-th row of counts; marks the rows in which one is in doubt."""
-    place, facets, lines, spans, row, base, of_base = room
+    place, facets, lines, touched, row, base, of_base = room
     _look_once(p, view, place, facets)
-    known, left, right, base_in_doubt = -1, 0, 0, False
+    known, base_in_doubt = -1, False
     for j in range(start, view.v.size, step):
         before = known
         known, first, stop = _base(p, view, j, known, place, base)
         if known == j or before < 0:
             _copy(base, row)
             _fill(of_base, air)
-            base_in_doubt = _to_counts(base[first:stop], open_beam, of_base[first:stop])
-        else:
-            _copy(base[left:right], row[left:right])
+            base_in_doubt = _to_counts(base[first:stop], open_beam, top, of_base[first:stop])
         _copy(of_base, out[j])
         doubt = base_in_doubt
-        n = _add_bodies(p, view, j, row, place, facets, lines, spans)
-        left, right = row.size, 0
+        _fill(touched, False)
+        _add_bodies(p, view, j, row, place, facets, lines, touched)
         k = 0
-        while k < n:
-            begin, end = spans[k, 0], spans[k, 1]
-            while k + 1 < n and spans[k + 1, 0] <= end:
-                k += 1
-                end = max(end, spans[k, 1])
-            doubt = _to_counts(row[begin:end], open_beam, out[j, begin:end]) or doubt
-            left, right = min(left, begin), max(right, end)
+        while k < touched.size:
+            if touched[k]:
+                begin = k * TILE
+                while k < touched.size and touched[k]:
+                    k += 1
+                end = min(k * TILE, row.size)
+                doubt = _to_counts(row[begin:end], open_beam, top, out[j, begin:end]) or doubt
+                _copy(base[begin:end], row[begin:end])
             k += 1
-        right = max(left, right)
         doubtful[j] = doubt
 
 
@@ -155,7 +155,7 @@ class Room(NamedTuple):
     place: Reals
     facets: Reals
     lines: Reals
-    spans: NDArray[np.int64]
+    touched: NDArray[np.bool_]
     row: Reals
     base: Reals
     of_base: Counts
@@ -166,7 +166,7 @@ def _room(p: Packed, view: View) -> Room:
         np.zeros((p.kind.size, 7)),
         np.zeros((p.faces.shape[0], 4)),
         np.empty((4, int(np.diff(p.first_face).max(initial=0)))),
-        np.empty((int(np.diff(view.first).max(initial=0)), 2), np.int64),
+        np.zeros(view.u.size // TILE + 1, np.bool_),
         np.zeros(view.u.size),
         np.zeros(view.u.size),
         np.zeros(view.u.size, np.uint16),
@@ -215,50 +215,44 @@ def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) 
         if view.axes.shape[0] > 1:
             look(p, b, view.axes[j], view.origin[j], True, place[b], place[:0])
         if abs(view.v[j] - place[b, 2]) <= p.size[b, 1] + 1e-9 * view.pitch:
-            first, end = upright_cylinder(base, view.u, view.pitch, place[b, 0], p.size[b, 0], p.attenuation[b])
+            first, end = upright_cylinder(base, view.u, 1.0 / view.pitch, place[b, 0], p.size[b, 0], p.attenuation[b])
             left, right = min(left, first), max(right, end)
     return j, left, max(left, right)
 
 
 @njit(**_FAST)
 def _add_bodies(
-    p: Packed, view: View, j: int, row: Reals, place: Reals, facets: Reals, lines: Reals, spans: NDArray[np.int64]
-) -> int:
-    """Add all bodies but upright cylinders to a row. How many `spans`, sorted, hold what they shadow."""
-    n, v, u, pitch, sod = 0, view.v[j], view.u, view.pitch, view.sod
-    one = view.axes.shape[0] == 1
+    p: Packed, view: View, j: int, row: Reals, place: Reals, facets: Reals, lines: Reals, touched: NDArray[np.bool_]
+) -> None:
+    """Add all bodies but upright cylinders to a row; marks the tiles of columns that they shadow."""
+    v, u, per_mm, sod = view.v[j], view.u, 1.0 / view.pitch, view.sod
+    one, parallel = view.axes.shape[0] == 1, view.sod == np.inf
     axes, origin = view.axes[0 if one else j], view.origin[0 if one else j]
+    left, right = row.size, 0
     for k in range(view.first[j], view.first[j + 1]):
         b = view.bodies[k]
         kind, a = p.kind[b], p.attenuation[b]
         if not one:
-            look(p, b, axes, origin, sod == np.inf, place[b], facets)
+            look(p, b, axes, origin, parallel, place[b], facets)
         if kind == CYLINDER:
-            first, stop = leaning_cylinder(row, u, pitch, v, sod, p.size[b, 0], p.size[b, 1], a, axes, place[b])
-        elif kind == ELLIPSOID and sod == np.inf:
-            first, stop = ellipsoid(row, u, pitch, v, place[b])
+            first, stop = leaning_cylinder(row, u, per_mm, v, sod, p.size[b, 0], p.size[b, 1], a, axes, place[b])
+        elif kind == ELLIPSOID and parallel:
+            first, stop = ellipsoid(row, u, per_mm, v, place[b])
         elif kind == ELLIPSOID:
-            first, stop = cone_ellipsoid(row, u, pitch, v, sod, p.matrix[b], a, axes, place[b])
-        elif sod == np.inf:
-            first, stop = polyhedron(row, u, pitch, v, p, b, place[b], facets, lines)
+            first, stop = cone_ellipsoid(row, u, per_mm, v, sod, p.matrix[b], a, axes, place[b])
+        elif parallel:
+            first, stop = polyhedron(row, u, per_mm, v, p, b, place[b], facets, lines)
         else:
-            first, stop = cone_polyhedron(row, u, pitch, v, sod, p, b, axes, place[b], lines)
+            first, stop = cone_polyhedron(row, u, per_mm, v, sod, p, b, axes, place[b], lines)
         if stop > first:
-            m = n
-            while m > 0 and spans[m - 1, 0] > first:
-                spans[m, 0], spans[m, 1] = spans[m - 1, 0], spans[m - 1, 1]
-                m -= 1
-            spans[m, 0], spans[m, 1] = first, stop
-            n += 1
-    if sod < np.inf and n > 0:  # from t to length
-        left, right = spans[0, 0], 0
-        for k in range(n):
-            right = max(right, spans[k, 1])
+            left, right = min(left, first), max(right, stop)
+            for tile in range(first // TILE, (stop - 1) // TILE + 1):
+                touched[tile] = True
+    if not parallel and left < right:  # from t to length
         part, at = row[left:right], u[left:right]
         square = sod * sod + v * v
         for i in range(part.size):
             part[i] *= math.sqrt(square + at[i] * at[i])
-    return n
 
 
 @intrinsic
@@ -274,7 +268,7 @@ def _real(context, x):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath={"contract"}, **_FAST)
-def _to_counts(depth: Reals, open_beam: float, out: Counts) -> bool:
+def _to_counts(depth: Reals, open_beam: float, top: float, out: Counts) -> bool:
     """Counts of line integrals; whether one of them lies so close to the middle of two that it is in doubt."""
     doubts = 0
     for i in range(depth.size):
@@ -287,7 +281,7 @@ def _to_counts(depth: Reals, open_beam: float, out: Counts) -> bool:
         low = (_C0 + _C1 * f) + (_C2 + _C3 * f) * f2
         high = (_C4 + _C5 * f) + (_C6 + _C7 * f) * f2
         y = low + (high + (_C8 + _C9 * f) * f4) * f4
-        count = min(open_beam * _real(_bits(y) + (_bits(whole) << 52)), _TOP)
+        count = min(open_beam * _real(_bits(y) + (_bits(whole) << 52)), top)
         nearest = count + _ROUND
         doubts += abs(abs(count - (nearest - _ROUND)) - 0.5) < _DOUBT
         out[i] = np.uint16(_bits(nearest))

@@ -92,7 +92,7 @@ def test_the_polynomial_is_numpy_s_exponential_to_1e_13() -> None:
     counts = np.empty(depth.size, np.uint16)
     worst = 0.0
     for light in np.random.default_rng(0).uniform(6e4, 6.5e4, 50):
-        rows._to_counts(depth, light, counts)
+        rows._to_counts(depth, light, 65535.0, counts)
         exact = light * np.exp(-depth)
         # A count that is not the nearest is one whose exact value lies next to a half.
         wrong = counts != np.rint(exact)
