@@ -68,6 +68,8 @@ def test_air_is_exactly_nothing_and_no_matter_is_too_deep() -> None:
     thickness[0, 1] = 1e6
     depth = effective_depth(thickness, np.array([[5.0], [4.0]]), np.array([0.3, 0.7]))
     assert (depth[0] == 0).all() and np.isfinite(depth[1]).all()
+    gap = np.array([[[1.0, 0.0, 1.0]]])  # between matter, where weights sum up to 1 only to rounding
+    assert effective_depth(gap, np.ones((10, 1)), np.full(10, 0.1))[0, 1] == 0.0
 
 
 def test_many_rows_are_shared_out_and_come_out_the_same() -> None:
