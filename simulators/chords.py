@@ -22,11 +22,13 @@ Triple = tuple[float, float, float]
 Span = tuple[int, int]
 
 EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an axis
-# Without reference counts: arrays come from outside, and to count who holds each slice takes longer than a short chord.
-_FAST = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+"""Options of these kernels. Without reference counts (_nrt): arrays come from outside; counting who holds each slice
+takes longer than a short chord. Numba keeps a kernel for as long as its own file is unchanged: whoever changes one that
+others call must touch theirs."""
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: Reals, facets: Reals) -> None:
     """What all rows share that see the sample alike: `place` float64 [7] of a body, `facets` float64 [face, 4] of all.
 
@@ -41,7 +43,7 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
     if p.kind[b] == POLYHEDRON:
         place[3], place[4], place[5], place[6] = np.inf, -np.inf, np.inf, -np.inf
         for i in range(p.first_vertex[b], p.first_vertex[b + 1]):
-            across, deep, _ = _seen(p.vertices[i], axes)
+            across, deep, _ = seen(p.vertices[i], axes)
             place[3], place[4] = min(place[3], across), max(place[4], across)
             place[5], place[6] = min(place[5], deep), max(place[6], deep)
     if not parallel:
@@ -54,7 +56,7 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
         place[6] = 2.0 * p.attenuation[b] / math.sqrt(dd)
     elif p.kind[b] == POLYHEDRON:
         for f in range(p.first_face[b], p.first_face[b + 1]):
-            nu, nb, nv = _seen(p.faces[f], axes)
+            nu, nb, nv = seen(p.faces[f], axes)
             if abs(nb) < EDGE_ON:
                 facets[f, 0], facets[f, 1], facets[f, 2], facets[f, 3] = p.faces[f, 3], nv, nu, 0.0
             else:
@@ -62,10 +64,10 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
                 facets[f, 3] = 1.0 if nb > 0 else -1.0
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def upright_cylinder(row: Reals, u: Reals, per_mm: float, middle: float, radius: float, attenuation: float) -> Span:
     """Parallel rays across an upright cylinder between its ends."""
-    first, stop = _columns(u, per_mm, middle - radius, middle + radius)
+    first, stop = columns(u, per_mm, middle - radius, middle + radius)
     part, at = row[first:stop], u[first:stop]
     for i in range(part.size):
         d = at[i] - middle
@@ -73,7 +75,7 @@ def upright_cylinder(row: Reals, u: Reals, per_mm: float, middle: float, radius:
     return first, stop
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Span:
     """Parallel rays; `place` as `look` left it."""
     dv = v - place[2]
@@ -82,7 +84,7 @@ def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Sp
         return 0, 0
     su, middle, scale = place[3], place[0] - place[4] * dv, place[6]
     reach = math.sqrt(rest / su)
-    first, stop = _columns(u, per_mm, middle - reach, middle + reach)
+    first, stop = columns(u, per_mm, middle - reach, middle + reach)
     part, at = row[first:stop], u[first:stop]
     for i in range(part.size):
         d = at[i] - middle
@@ -90,61 +92,7 @@ def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Sp
     return first, stop
 
 
-@njit(**_FAST)
-def polyhedron(
-    row: Reals, u: Reals, per_mm: float, v: float, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals
-) -> Span:
-    """Parallel rays; `lines` float64 [4, faces] is room to work in."""
-    dv = v - place[2]
-    left, right, high, low = place[3], place[4], 0, 0
-    for f in range(p.first_face[b], p.first_face[b + 1]):
-        a, slope = facets[f, 0] - facets[f, 1] * dv, facets[f, 2]
-        if facets[f, 3] > 0:
-            lines[0, high], lines[1, high] = a, slope
-            high += 1
-        elif facets[f, 3] < 0:
-            lines[2, low], lines[3, low] = a, slope
-            low += 1
-        else:  # n · (u, v) <= distance, whatever t
-            left, right = _bounded(left, right, slope, a)
-    return _between(row, u, per_mm, place[0], p.attenuation[b], lines, high, low, left, right, False)
-
-
-@njit(**_FAST)
-def cone_polyhedron(
-    row: Reals,
-    u: Reals,
-    per_mm: float,
-    v: float,
-    sod: float,
-    p: Packed,
-    b: int,
-    axes: Reals,
-    place: Reals,
-    lines: Reals,
-) -> Span:
-    """A cone's rays. With s = 1/t a face is n · (u, sod, v) <= s x (the source's distance from it), linear in u."""
-    middle = place[0] * sod / (sod + place[1])
-    front, back = sod / (sod + place[1] + place[5]), sod / (sod + place[1] + place[6])
-    left, right = place[0] + place[3], place[0] + place[4]
-    left, right = min(left * front, left * back) - middle, max(right * front, right * back) - middle
-    high = low = 0
-    for f in range(p.first_face[b], p.first_face[b + 1]):
-        nu, nb, nv = _seen(p.faces[f], axes)
-        inside = p.faces[f, 3] + nu * place[0] + nb * (sod + place[1]) + nv * place[2]
-        at_middle = nu * middle + nb * sod + nv * v
-        if abs(inside) < EDGE_ON * sod:
-            left, right = _bounded(left, right, nu, -at_middle)
-        elif inside < 0:
-            lines[0, high], lines[1, high] = at_middle / inside, nu / inside
-            high += 1
-        else:
-            lines[2, low], lines[3, low] = at_middle / inside, nu / inside
-            low += 1
-    return _between(row, u, per_mm, middle, p.attenuation[b], lines, high, low, left, right, True)
-
-
-@njit(**_FAST)
+@njit(**KERNEL)
 def cone_ellipsoid(
     row: Reals, u: Reals, per_mm: float, v: float, sod: float, matrix: Reals, attenuation: float, axes: Reals,
     place: Reals,
@@ -161,7 +109,7 @@ def cone_ellipsoid(
     if root <= 0.0 or c2 >= 0.0:
         return 0, 0
     top, reach = -c1 / (2.0 * c2), math.sqrt(root) / (-2.0 * c2)
-    first, stop = _columns(u, per_mm, middle + top - reach, middle + top + reach)
+    first, stop = columns(u, per_mm, middle + top - reach, middle + top + reach)
     part, at = row[first:stop], u[first:stop]
     d0, d1, d2 = _dot(M, M), 2.0 * _dot(M, U), _dot(U, U)
     for i in range(part.size):
@@ -170,7 +118,7 @@ def cone_ellipsoid(
     return first, stop
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def leaning_cylinder(
     row: Reals, u: Reals, per_mm: float, v: float, sod: float, radius: float, half: float, attenuation: float,
     axes: Reals, place: Reals,
@@ -191,7 +139,7 @@ def leaning_cylinder(
         D0 = _sum(sod, B, v, V, middle, U)
     w = near * v - place[2]
     R0 = _sum(w, V, 0.0, V, 0.0, V)
-    first, stop = _columns(u, per_mm, low, high)
+    first, stop = columns(u, per_mm, low, high)
     part, at = row[first:stop], u[first:stop]
     for i in range(part.size):
         d = at[i] - middle
@@ -217,80 +165,8 @@ def leaning_cylinder(
     return first, stop
 
 
-@njit(**_FAST)
-def _between(
-    row: Reals, u: Reals, per_mm: float, middle: float, attenuation: float, lines: Reals, high: int, low: int,
-    left: float, right: float, cone: bool,
-) -> Span:  # fmt: skip
-    """Add the gap between the lowest of the `high` lines [0:2] and the highest of the `low` lines [2:4], each value +
-    slope (u - middle), in left..right: walk from kink to kink. In a cone the lines are of 1/t, the gap that of t.
-    """
-    k = m = -1
-    at = left
-    for _ in range(high + low):  # Newton's steps to where the gap opens: it is concave, so they never go too far
-        above, below, last_k, last_m = np.inf, -np.inf, k, m
-        for i in range(high):
-            height = lines[0, i] + lines[1, i] * at
-            k = i if height < above else k
-            above = min(above, height)
-        for i in range(low):
-            height = lines[2, i] + lines[3, i] * at
-            m = i if height > below else m
-            below = max(below, height)
-        if above >= below or (k == last_k and m == last_m):
-            break
-        opens = lines[1, k] - lines[3, m]
-        if opens <= 0.0:
-            return 0, 0
-        at = max(at, (lines[2, m] - lines[0, k]) / opens)
-        if at >= right:
-            return 0, 0
-    first = _columns(u, per_mm, middle + at, np.inf)[0]
-    begin = first
-    while begin < u.size:
-        next_k, next_m, kink = k, m, right
-        if lines[1, k] < lines[3, m]:  # the gap closes
-            kink = min(kink, (lines[0, k] - lines[2, m]) / (lines[3, m] - lines[1, k]))
-        for i in range(high):
-            closing = lines[1, k] - lines[1, i]
-            meets = (lines[0, i] - lines[0, k]) / closing if closing > 0.0 else np.inf
-            next_k = i if meets < kink else next_k
-            kink = min(kink, meets)
-        for i in range(low):
-            closing = lines[3, i] - lines[3, m]
-            meets = (lines[2, m] - lines[2, i]) / closing if closing > 0.0 else np.inf
-            next_m, next_k = (i, k) if meets < kink else (next_m, next_k)
-            kink = min(kink, meets)
-        end = max(begin, _columns(u, per_mm, -np.inf, middle + kink)[1])
-        part, where = row[begin:end], u[begin:end]
-        if cone:
-            a, b, c, d = lines[0, k], lines[1, k], lines[2, m], lines[3, m]
-            for i in range(part.size):
-                s, z = a + b * (where[i] - middle), c + d * (where[i] - middle)
-                part[i] += attenuation * max(s - z, 0.0) / (s * z)
-        else:
-            a, b = attenuation * (lines[0, k] - lines[2, m]), attenuation * (lines[1, k] - lines[3, m])
-            for i in range(part.size):
-                part[i] += a + b * (where[i] - middle)
-        begin = end
-        if next_k == k and next_m == m:
-            break
-        k, m = next_k, next_m
-    return first, begin
-
-
-@njit(**_FAST)
-def _bounded(left: float, right: float, slope: float, limit: float) -> tuple[float, float]:
-    """left..right where slope x (u - middle) <= limit."""
-    if slope > 0.0:
-        return left, min(right, limit / slope)
-    if slope < 0.0:
-        return max(left, limit / slope), right
-    return left, right if limit >= 0.0 else -np.inf
-
-
-@njit(**_FAST)
-def _columns(u: Reals, per_mm: float, low: float, high: float) -> Span:
+@njit(**KERNEL)
+def columns(u: Reals, per_mm: float, low: float, high: float) -> Span:
     """First column whose centre lies in low..high, and the one after the last."""
     cols = float(u.size)
     first = math.ceil(min(max((low - u[0]) * per_mm, 0.0), cols))
@@ -298,7 +174,7 @@ def _columns(u: Reals, per_mm: float, low: float, high: float) -> Span:
     return first, max(first, stop)
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _times(matrix: Reals, axes: Reals, k: int) -> Triple:
     """The laboratory's k-th axis, multiplied by a matrix [3, 3]."""
     x, y, z = axes[0, k], axes[1, k], axes[2, k]
@@ -309,8 +185,8 @@ def _times(matrix: Reals, axes: Reals, k: int) -> Triple:
     )
 
 
-@njit(**_FAST)
-def _seen(q: Reals, axes: Reals) -> Triple:
+@njit(**KERNEL)
+def seen(q: Reals, axes: Reals) -> Triple:
     """The first three numbers of q, a vector in the sample's axes, along (u, b, v)."""
     return (
         q[0] * axes[0, 0] + q[1] * axes[1, 0] + q[2] * axes[2, 0],
@@ -319,17 +195,17 @@ def _seen(q: Reals, axes: Reals) -> Triple:
     )
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _dot(x: Triple, y: Triple) -> float:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _cross(x: Triple, y: Triple) -> Triple:
     return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _sum(a: float, x: Triple, b: float, y: Triple, c: float, z: Triple) -> Triple:
     """a x + b y + c z."""
     return a * x[0] + b * y[0] + c * z[0], a * x[1] + b * y[1] + c * z[1], a * x[2] + b * y[2] + c * z[2]

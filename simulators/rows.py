@@ -17,15 +17,8 @@ from numba import config, njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from simulators.chords import (
-    cone_ellipsoid,
-    cone_polyhedron,
-    ellipsoid,
-    leaning_cylinder,
-    look,
-    polyhedron,
-    upright_cylinder,
-)
+from simulators.chords import KERNEL, cone_ellipsoid, ellipsoid, leaning_cylinder, look, upright_cylinder
+from simulators.facets import cone_polyhedron, polyhedron
 from simulators.packing import CYLINDER, ELLIPSOID, Packed
 from simulators.view import View
 
@@ -47,9 +40,6 @@ _ROUND = 1.5 * 2.0**52  # added, it leaves the nearest whole number in the last 
 _FAR = 1000.0  # binary orders of magnitude: beyond, there is no light, or too much
 _BRIGHT = 600.0  # e to this is more than any converter takes, and less than float64 does
 _DOUBT = 1e-7  # counts from the middle between two: 70 times the error of all steps here at full range
-
-# Without reference counts, see chords.
-_FAST = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
 
 
 def depths(p: Packed, view: View) -> Reals:
@@ -101,7 +91,7 @@ def _shared(work: Callable[[int, int], None], pixels: int) -> None:
             other.result()
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out: Reals) -> None:
     """Line integrals of some rows into the rows of `out`, or into its row of the same number where it has them all."""
     place, facets, lines, touched, base = room.place, room.facets, room.lines, room.touched, room.base
@@ -116,7 +106,7 @@ def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out:
         _add_bodies(p, view, j, row, place, facets, lines, touched)
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _count_rows(
     p: Packed, view: View, room: Room, start: int, step: int, open_beam: float, air: int, top: float, out: Counts,
     doubtful: NDArray[np.bool_],
@@ -165,7 +155,7 @@ def _room(p: Packed, view: View) -> Room:
     return Room(
         np.zeros((p.kind.size, 7)),
         np.zeros((p.faces.shape[0], 4)),
-        np.empty((4, int(np.diff(p.first_face).max(initial=0)))),
+        np.empty((4, max(8, int(np.diff(p.first_face).max(initial=0))))),
         np.zeros(view.u.size // TILE + 1, np.bool_),
         np.zeros(view.u.size),
         np.zeros(view.u.size),
@@ -173,19 +163,19 @@ def _room(p: Packed, view: View) -> Room:
     )
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _copy(source: NDArray[Any], out: NDArray[Any]) -> None:
     for i in range(out.size):
         out[i] = source[i]
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _fill(out: NDArray[Any], value: float) -> None:
     for i in range(out.size):
         out[i] = value
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _look_once(p: Packed, view: View, place: Reals, facets: Reals) -> None:
     """Look at all bodies where all rows see them alike."""
     if view.axes.shape[0] == 1:
@@ -193,7 +183,7 @@ def _look_once(p: Packed, view: View, place: Reals, facets: Reals) -> None:
             look(p, b, view.axes[0], view.origin[0], view.sod == np.inf, place[b], facets)
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) -> tuple[int, int, int]:
     """What upright cylinders add to row j; kept where row `known` has the same. The row it is known from, and where it
     is not air (of a new one)."""
@@ -220,7 +210,7 @@ def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) 
     return j, left, max(left, right)
 
 
-@njit(**_FAST)
+@njit(**KERNEL)
 def _add_bodies(
     p: Packed, view: View, j: int, row: Reals, place: Reals, facets: Reals, lines: Reals, touched: NDArray[np.bool_]
 ) -> None:
@@ -267,7 +257,7 @@ def _real(context, x):  # type: ignore[no-untyped-def]
     return types.float64(types.int64), lambda _, builder, __, args: builder.bitcast(args[0], ir.DoubleType())
 
 
-@njit(fastmath={"contract"}, **_FAST)
+@njit(fastmath={"contract"}, **KERNEL)
 def _to_counts(depth: Reals, open_beam: float, top: float, out: Counts) -> bool:
     """Counts of line integrals; whether one of them lies so close to the middle of two that it is in doubt."""
     doubts = 0

@@ -38,6 +38,10 @@ WEDGE = (
     (0, 3, 0, 0.2),
     (0.1, -1, 0, 0.12),
 )  # normals of any length
+SPIRAL = [(k * 2.4, (2 * k - 23) / 24) for k in range(24)]  # points all over a ball, no four in a plane
+GEM = tuple(
+    (0.3 * math.cos(a) * math.sqrt(1 - z * z), 0.25 * math.sin(a) * math.sqrt(1 - z * z), 0.2 * z) for a, z in SPIRAL
+)
 SOLIDS: dict[str, Solid] = {
     "cylinder": Cylinder(0.3, 0.5, 2.0, CENTRE),
     "tube": Tube(0.3, 0.22, 0.5, 2.0, CENTRE),
@@ -50,6 +54,7 @@ SOLIDS: dict[str, Solid] = {
     "upright plate": Plate(0.5, 0.15, 1.3, CENTRE),
     "truncated octahedron": TruncatedOctahedron((0.3, 0.25, 0.35), 1.2, 0.7, CENTRE, QUATERNION),
     "corners": Polyhedron(1.4, vertices=CORNERS, centre=CENTRE, quaternion=QUATERNION),
+    "gem": Polyhedron(1.4, vertices=GEM, centre=CENTRE, quaternion=QUATERNION),
     "wedge": Polyhedron(1.4, faces=WEDGE, centre=CENTRE, quaternion=QUATERNION),
 }
 CONVEX = [name for name in SOLIDS if name != "tube"]
