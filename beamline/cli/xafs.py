@@ -54,7 +54,12 @@ def box(ctx: click.Context, param: click.Parameter, value: str | None) -> Box | 
 @click.option("--to", "high", type=POSITIVE, metavar="KEV", help="Last energy; a scene needs it.")
 @click.option("--step", type=POSITIVE, metavar="KEV", help="Between a scene's energies; 0.001 unless given.")
 @click.option("--material", metavar="NAME", help="Of the scene; the one with a state of charge unless given.")
-@click.option("--angle", type=FiniteRange(min=-360, max=360), metavar="DEG", help="At which the scene's stage stands; 0 unless given.")
+@click.option(
+    "--angle",
+    type=FiniteRange(min=-360, max=360),
+    metavar="DEG",
+    help="At which the scene's stage stands; 0 unless given.",
+)
 @click.option("--seed", type=SEED, help="Of all random numbers of a scene; 0 unless given.")
 @click.option("--region", callback=box, metavar=_BOX, help="The material in a file's frames; all of them unless given.")
 @click.option("--around", callback=box, metavar=_BOX, help="What it is compared with; nothing unless given.")
