@@ -53,6 +53,7 @@ class LostBeam:
         """Share of the frame's light that is lost."""
         if self.seconds is None:
             return 1 - self.share if within(self.views, shot) else 0.0
-        begin, end = self.seconds
-        off = min(end, shot.elapsed + shot.exposure) - max(begin, shot.elapsed)
+        # In seconds of this exposure, so that rounding takes no more light than there is.
+        begin, end = (at - shot.elapsed for at in self.seconds)
+        off = min(end, shot.exposure) - max(begin, 0.0)
         return (1 - self.share) * max(off, 0.0) / shot.exposure

@@ -34,6 +34,13 @@ def test_by_the_clock_a_frame_loses_the_part_of_its_exposure(begin: float, lasts
     assert (not effect.labels(shots.shot())) == bool((image == 1).all())
 
 
+@given(elapsed=st.floats(0.0, 1e6), exposure=st.floats(7.2e-6, 10.0))
+def test_a_frame_within_the_loss_is_dark_to_the_last_photon(elapsed: float, exposure: float) -> None:
+    """Not darker: photons cannot be fewer than none."""
+    shot = shots.shot(elapsed=elapsed, exposure=exposure)
+    assert not LostBeam(seconds=(-1.0, 2e6)).apply(np.ones((60, 80)), shot).any()
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
