@@ -73,7 +73,8 @@ class NarrowField:
         return self._between(detector.v() - self.centre[1], self.height), across
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-        return lit(width / 2 - place, self.penumbra) * lit(width / 2 + place, self.penumbra)
+        # What both edges leave of the source: they cover it from opposite ends.
+        return np.maximum(lit(width / 2 - place, self.penumbra) + lit(width / 2 + place, self.penumbra) - 1, 0.0)
 
 
 def _lit_fully(light: NDArray[np.float64]) -> tuple[int, int]:

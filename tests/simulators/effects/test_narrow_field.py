@@ -31,6 +31,15 @@ def test_it_is_the_same_on_both_sides_of_the_axis_wherever_that_is() -> None:
     assert light[5].sum() == pytest.approx(35, abs=0.01)  # all light of 0.35 mm, in pixels of 0.01 mm
 
 
+@pytest.mark.parametrize("penumbra", [0.05, 0.1, 0.25, 0.6])
+def test_a_slit_narrower_than_its_penumbra_shows_a_part_of_the_source(penumbra: float) -> None:
+    """The share of an evenly bright source that is seen through a slit of 0.1 mm, counted point by point."""
+    light = NarrowField(0.1, penumbra=penumbra).apply(np.ones((60, 80)), shots.shot())[30]
+    source = penumbra * (np.arange(20_000) + 0.5) / 20_000 - penumbra / 2
+    expected = [np.mean(np.abs(u + source) < 0.05) for u in shots.shot().detector.u()]
+    np.testing.assert_allclose(light, expected, atol=2e-4)
+
+
 @given(
     width=st.floats(0.01, 1.2),
     height=st.none() | st.floats(0.01, 1.0),
