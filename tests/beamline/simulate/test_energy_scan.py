@@ -11,6 +11,9 @@ import yaml
 
 from beamline.errors import ConfigError
 from beamline.simulate.energy_scan import open_energy_scan
+from beamline.xafs.edge import find_edge
+from beamline.xafs.series import take
+from drivers.clock import SystemClock
 from simulators.palette import palette
 
 SCENE: dict[str, Any] = {
@@ -70,6 +73,20 @@ def test_regions_are_the_material_and_what_is_next_to_it(tmp_path: Path) -> None
     turned = open_energy_scan(_scene(tmp_path), ENERGIES, angle=np.pi / 2).regions
     assert turned.thickness == pytest.approx(0.03)
     assert turned.inside.sum() == 12 * 4
+
+
+def test_a_series_of_charges_moves_the_edge_as_the_radiographs_show_it(tmp_path: Path) -> None:
+    """By 2 eV from the discharged to the charged state, as simulators.edge has it."""
+    energies = np.arange(8.320, 8.375, 0.001)
+    found = []
+    for charge in (0.0, 0.5, 1.0):
+        phantom = SCENE["phantom"] | {"materials": {"NMC811": {"state_of_charge": charge}}}
+        series = open_energy_scan(_scene(tmp_path, phantom=phantom), energies).series()
+        curve = take(series, lambda event: None, SystemClock(), lambda: False).curve
+        found.append(find_edge(curve.energies, curve.absorption))
+    lines, edges = np.array([(edge.white_line, edge.energy) for edge in found]).T
+    np.testing.assert_allclose(lines, [8.3465, 8.3475, 8.3485], atol=2.5e-4)
+    np.testing.assert_allclose(np.diff(edges), 1e-3, atol=2e-4)
 
 
 def test_noise_is_the_seed_s(tmp_path: Path) -> None:
