@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from recon.volume import Grid
 from simulators.beam import Beam
 from simulators.detector import Detector
+from simulators.effective_depth import effective_depth
 from simulators.materials import Material
 from simulators.palette import Palette
 from simulators.phantom import Phantom
 from simulators.pose import Pose
 from simulators.sample import Sample
 from simulators.solids import Solid, kind_of
-from simulators.spectrum import Attenuation, Spectrum, effective_depth, light
+from simulators.spectrum import Attenuation, Spectrum, light
 
 Reals = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ class Mixture:
         return np.stack([c.chords.line_integrals(angle, detector) for c in self.constituents])
 
     def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
-        """The effective depth; see simulators.spectrum and Sample.line_integrals."""
+        """The effective depth; see simulators.effective_depth and Sample.line_integrals."""
         attenuation = np.stack([c.attenuation(self.spectrum.energies) for c in self.constituents], axis=1)
         return effective_depth(self.thickness(angle, detector), attenuation, self.spectrum.weights)
 
