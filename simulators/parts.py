@@ -120,11 +120,11 @@ class Mixture:
         return replace(self, spectrum=spectrum)
 
 
-def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation] = Palette().filters) -> Sample:
+def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation] | None = None) -> Sample:
     """The parts as they are seen in the beam: of one energy a plain phantom, of more a mixture.
 
     Args:
-        filters: the attenuation of a material by its name, for a tube; those known by name unless given.
+        filters: the attenuation of a material by its name, for a tube; None: of those known by name.
 
     Raises:
         ValueError: a material, but a beam that does not say its energies or says some that are not tabulated.
@@ -139,7 +139,7 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
     )
     reach = 2 * Phantom.of([part.solid for part in parts]).radius
     matter = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
-    spectrum = light(beam, [material.attenuation for material in matter], reach, filters)
+    spectrum = light(beam, [material.attenuation for material in matter], reach, filters or Palette().filters)
     thin = {kind: spectrum.mean(group.attenuation) for kind, group in zip(kinds, groups, strict=True)}
     solids = [
         replace(part.solid, attenuation=part.solid.attenuation * thin[part.material, part.instead_of]) for part in parts

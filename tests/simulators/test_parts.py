@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.volume import Grid
 from simulators.beam import Beam
+from simulators.beam import Tube as XrayTube
 from simulators.detector import Detector
 from simulators.materials import of_formula
 from simulators.parts import Mixture, Part, sample_of
@@ -106,6 +107,13 @@ def test_the_truth_is_the_thin_limit_and_depths_never_exceed_it() -> None:
     sample = _seen(thin, **light)
     assert isinstance(sample, Mixture)
     np.testing.assert_allclose(_depth(sample), _depth(sample.whole), rtol=2e-4)
+
+
+def test_a_tube_s_filters_are_known_by_name() -> None:
+    from_list = sample_of(PARTS, Beam(1.0, tube=XrayTube(40.0, {"Al": 1.0})))
+    thicker = sample_of(PARTS, Beam(1.0, tube=XrayTube(40.0, {"Al": 4.0})))
+    assert isinstance(from_list, Mixture) and isinstance(thicker, Mixture)
+    assert _depth(thicker).max() < 0.8 * _depth(from_list).max()
 
 
 def test_labels_and_radius_are_those_of_the_parts() -> None:
