@@ -5,15 +5,13 @@ Only the pixels that a frame shows are computed, and they are the same whatever 
 
 from __future__ import annotations
 
-import zlib
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
 from simulators.bands import share_rows
-from simulators.effects.shot import Image, Shot
+from simulators.effects.shot import Image, Shot, lasting
 from simulators.streams import STEP, begin, mix, normal
 
 
@@ -28,7 +26,7 @@ def _normal_rows(key, first, end, row0, col0, out):  # type: ignore[no-untyped-d
 def normals(effect: str, seed: int, shot: Shot) -> Image:
     """A normal number (mean 0, variance 1) of each sensor pixel of the ROI, float64 [row, col], unbinned."""
     row0, col0, rows, cols = shot.roi
-    key, out = _generator(effect, seed).integers(2**64, dtype=np.uint64), np.empty((rows, cols))
+    key, out = lasting(effect, seed).integers(2**64, dtype=np.uint64), np.empty((rows, cols))
     share_rows(lambda first, end: _normal_rows(key, first, end, row0, col0, out), out.shape)
     return out
 
@@ -50,7 +48,7 @@ def places(
         Their (rows, columns) in the frame, and a number of each that is even in 0 ... 1. A binned pixel comes as often
         as there are such pixels in it.
     """
-    rng = _generator(effect, seed)
+    rng = lasting(effect, seed)
     n = round(fraction * SENSOR_SHAPE[0] * SENSOR_SHAPE[1])
     drawn, first = np.unique(rng.integers(SENSOR_SHAPE[0] * SENSOR_SHAPE[1], size=n), return_index=True)
     value = rng.random(n)[first]
@@ -58,7 +56,3 @@ def places(
     row0, col0, height, width = shot.roi
     seen = (rows >= row0) & (rows < row0 + height) & (cols >= col0) & (cols < col0 + width)
     return ((rows[seen] - row0) // shot.binning, (cols[seen] - col0) // shot.binning), value[seen]
-
-
-def _generator(effect: str, seed: int) -> np.random.Generator:
-    return np.random.default_rng([seed, zlib.crc32(effect.encode())])

@@ -11,7 +11,7 @@ import numpy as np
 
 from simulators.effects.chain import Label
 from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.effects.shot import Image, Shot, lasting
 from simulators.effects.views import Views, check, within
 
 SEEN = 1e-3
@@ -113,7 +113,7 @@ class Floaters:
         loose = self.motion == "loose"
         if not (loose or within(self.views, shot)):
             return
-        rng = np.random.default_rng(self.seed)
+        rng = lasting(self.name, self.seed)
         detector = shot.detector
         for which in range(self.count):
             distance, size, height = (rng.uniform(*ends) for ends in (self.distance, self.size, self.heights))

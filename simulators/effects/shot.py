@@ -90,3 +90,11 @@ def draws(effect: str, shot: Shot) -> np.random.Generator:
     """The generator of (seed, effect, frame): any frame can be made again alone, and an effect that is added changes
     no other's draw."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
+
+
+def lasting(effect: str, seed: int) -> np.random.Generator:
+    """The generator of (effect, its own seed): of what stays from frame to frame.
+
+    It is a branch of its own: without one, numpy takes (seed, effect) for (seed, effect, frame 0), as zeros at the end
+    say nothing to it."""
+    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(effect.encode())], spawn_key=(0,)))

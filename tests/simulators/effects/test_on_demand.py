@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -17,7 +18,7 @@ import pytest
 
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.domain import Domain
-from simulators.effects.shot import Shot, draws
+from simulators.effects.shot import Shot, draws, lasting
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import PARAMETERS
 
@@ -71,6 +72,25 @@ def test_an_effect_draws_the_same_numbers_whatever_else_is_named(monkeypatch: py
         on_demand.frames(on_demand.scene([name]), range(4))
         assert states == {name: drawn}
         assert len(set(drawn.values())) == len(drawn) >= 2
+
+
+def test_no_two_of_effects_seeds_and_frames_share_random_numbers() -> None:
+    """Nor with a phantom of the same seed, nor where a seed needs more than 32 bits."""
+    seeds = (0, 1, 2, 2**32, 2**32 + 1)
+    shots_of = [replace(on_demand.shot(0), seed=seed, frame=frame) for seed in seeds for frame in range(4)]
+    generators = [np.random.default_rng(seed) for seed in seeds]
+    for name in CATALOGUE:
+        generators += [draws(name, shot) for shot in shots_of]
+        generators += [lasting(name, seed) for seed in seeds]
+    first = [int(rng.integers(2**64, dtype=np.uint64)) for rng in generators]
+    assert len(set(first)) == len(first) == 5 + 25 * len(CATALOGUE)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_what_stays_is_drawn_for_the_effect_and_its_own_seed_alone(name: str) -> None:
+    """Whoever asks numpy for a generator of his own has its numbers in common with others of that seed."""
+    source = Path(sys.modules[load_effect(name).__module__].__file__ or "").read_text(encoding="utf-8")
+    assert "default_rng" not in source
 
 
 @pytest.mark.parametrize(("first", "second"), list(combinations(ADDITIVE, 2)))
