@@ -22,10 +22,9 @@ Triple = tuple[float, float, float]
 Span = tuple[int, int]
 
 EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an axis
-KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+KERNEL = {"nogil": True, "error_model": "numpy", "_nrt": False}
 """Options of these kernels. Without reference counts (_nrt): arrays come from outside; counting who holds each slice
-takes longer than a short chord. Numba keeps a kernel for as long as its own file is unchanged: whoever changes one that
-others call must touch theirs."""
+takes longer than a short chord. They are kept on disk as parts of those that are called from Python (see rows)."""
 
 
 @njit(**KERNEL)

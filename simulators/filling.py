@@ -8,14 +8,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from simulators.chords import KERNEL
 from simulators.packing import CYLINDER, ELLIPSOID, Packed
 
 Reals = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
+_KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}  # as in chords
 
-@njit(**KERNEL)
+
+@njit(**_KERNEL)
 def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, out: Reals) -> None:
     """Add attenuation x filled share to `out`, float64 [z, y, x].
 
@@ -43,7 +44,7 @@ def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, 
                         out[k, j, i] += p.attenuation[b] * share
 
 
-@njit(**KERNEL)
+@njit(**_KERNEL)
 def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Triple, out: NDArray[np.uint8]) -> None:
     """Write label[solid] where a voxel's centre lies in a solid, later ones over earlier; a tube's bore is not tube.
 
@@ -70,7 +71,7 @@ def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Tripl
                     out[k, j, i] = value
 
 
-@njit(**KERNEL)
+@njit(**_KERNEL)
 def _line(p: Packed, b: int, y: float, z: float, limit: float, left: float, edge: float, n: int) -> tuple[int, int]:
     """Voxels first to stop of a line along x whose centres have a level <= limit: bodies are convex, so they are
     neighbours. In closed form, and then by the level itself at both ends."""
@@ -114,7 +115,7 @@ def _line(p: Packed, b: int, y: float, z: float, limit: float, left: float, edge
     return first, max(first, stop)
 
 
-@njit(**KERNEL)
+@njit(**_KERNEL)
 def _level(p: Packed, b: int, x: float, y: float, z: float) -> float:
     """Negative inside, positive outside; changes by at most 1 mm per mm, so it bounds the distance to the surface."""
     if p.kind[b] == CYLINDER:
@@ -132,7 +133,7 @@ def _level(p: Packed, b: int, x: float, y: float, z: float) -> float:
     return level
 
 
-@njit(**KERNEL)
+@njit(**_KERNEL)
 def _filled(p: Packed, b: int, x: float, y: float, z: float, edges: Triple, n: int) -> float:
     """Share of n³ points, spread evenly over the voxel around (x, y, z), that lie inside."""
     inside = 0
@@ -145,7 +146,7 @@ def _filled(p: Packed, b: int, x: float, y: float, z: float, edges: Triple, n: i
     return inside / n**3
 
 
-@njit(**KERNEL)
+@njit(**_KERNEL)
 def _box(p: Packed, b: int, corner: Triple, edges: Triple, shape: tuple[int, int, int]) -> tuple[int, int, int, int]:
     """Ranges of voxels along z and y that touch the box around the body."""
     k0, k1 = _voxels(corner[0] - p.centre[b, 2], edges[0], p.extent[b, 2], shape[0])
@@ -153,7 +154,7 @@ def _box(p: Packed, b: int, corner: Triple, edges: Triple, shape: tuple[int, int
     return k0, k1, j0, j1
 
 
-@njit(**KERNEL)
+@njit(**_KERNEL)
 def _voxels(first: float, edge: float, reach: float, n: int) -> tuple[int, int]:
     """Range of voxels that touch -reach..reach, the first voxel's centre being at `first`."""
     low = max(0, math.floor((-reach - first) / edge + 0.5))

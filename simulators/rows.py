@@ -7,47 +7,63 @@ Upright cylinders (in a parallel beam) come first: what they add is kept from ro
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import config, njit, types
-from numba.extending import intrinsic
+from numba import config, njit
 from numpy.typing import NDArray
 
+from simulators import chords, counting, facets, packing
+from simulators import view as views
 from simulators.chords import KERNEL, cone_ellipsoid, ellipsoid, leaning_cylinder, look, upright_cylinder
+from simulators.counting import Counts, to_counts
 from simulators.facets import cone_polyhedron, polyhedron
 from simulators.packing import CYLINDER, ELLIPSOID, Packed
 from simulators.view import View
 
 Reals = NDArray[np.float64]
-Counts = NDArray[np.uint16]
 
 TILE = 64  # columns: a row's bodies touch some, and only these are looked at
 SMALL = 2**16  # pixels: a thread takes longer to start than so many to compute
-
-# 2^x on [-1/2, 1/2] by Chebyshev's points, of degree 9: relative error 2e-14.
-_EXP2 = (
-    1.000000000000014, 0.6931471805599526, 0.24022650695631514, 0.05550410866428854, 0.009618129195951041,
-    0.001333355825801874, 0.00015403432339553542, 1.5252640059770786e-05, 1.3259945262689143e-06,
-    1.0212097549811005e-07,
-)  # fmt: skip
-_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = _EXP2
-_LOG2E = math.log2(math.e)
-_ROUND = 1.5 * 2.0**52  # added, it leaves the nearest whole number in the last bits
-_FAR = 1000.0  # binary orders of magnitude: beyond, there is no light, or too much
 _BRIGHT = 600.0  # e to this is more than any converter takes, and less than float64 does
-_DOUBT = 1e-7  # counts from the middle between two: 70 times the error of all steps here at full range
+
+Kernel = Callable[..., None]
+
+
+def _entries(version: int) -> tuple[Kernel, Kernel]:
+    """What is called from Python, kept on disk with all that it calls.
+
+    Numba keeps a kernel until its own file changes, whatever becomes of the files of those it calls. It does look at
+    the values that a kernel takes from around it: here the version of all the files.
+    """
+
+    @njit(cache=True, **KERNEL)
+    def depth_rows(p, view, room, rows, out):  # type: ignore[no-untyped-def]
+        if version != 0:
+            _depth_rows(p, view, room, rows, out)
+
+    @njit(cache=True, **KERNEL)
+    def count_rows(p, view, room, start, step, open_beam, air, top, out, doubtful):  # type: ignore[no-untyped-def]
+        if version != 0:
+            _count_rows(p, view, room, start, step, open_beam, air, top, out, doubtful)
+
+    return depth_rows, count_rows
+
+
+def _version() -> int:
+    """Of the files that the kernels are made of; not 0."""
+    files = [__file__, *(str(module.__file__) for module in (chords, counting, facets, packing, views))]
+    return zlib.crc32(b"".join(Path(file).read_bytes() for file in files)) or 1
 
 
 def depths(p: Packed, view: View) -> Reals:
     """Line integrals, float64 [row, col]."""
     out = np.empty((view.v.size, view.u.size))
-    _shared(
-        lambda first, step: _depth_rows(p, view, _room(p, view), np.arange(first, view.v.size, step), out), out.size
-    )
+    _shared(lambda first, step: depth_rows(p, view, _room(p, view), np.arange(first, view.v.size, step), out), out.size)
     return out
 
 
@@ -64,13 +80,13 @@ def counts(p: Packed, view: View, open_beam: float, rule: Callable[[Reals], Coun
     out, doubtful = np.empty((view.v.size, view.u.size), np.uint16), np.zeros(view.v.size, np.bool_)
     air, top = (int(rule(np.full((1, 1), depth))[0, 0]) for depth in (0.0, -_BRIGHT))
     _shared(
-        lambda first, step: _count_rows(p, view, _room(p, view), first, step, open_beam, air, top, out, doubtful),
+        lambda first, step: count_rows(p, view, _room(p, view), first, step, open_beam, air, top, out, doubtful),
         out.size,
     )
     rows = np.flatnonzero(doubtful)
     if rows.size:
         again = np.empty((rows.size, view.u.size))
-        _depth_rows(p, view, _room(p, view), rows, again)
+        depth_rows(p, view, _room(p, view), rows, again)
         out[rows] = rule(again)
     return out
 
@@ -121,7 +137,7 @@ def _count_rows(
         if known == j or before < 0:
             _copy(base, row)
             _fill(of_base, air)
-            base_in_doubt = _to_counts(base[first:stop], open_beam, top, of_base[first:stop])
+            base_in_doubt = to_counts(base[first:stop], open_beam, top, of_base[first:stop])
         _copy(of_base, out[j])
         doubt = base_in_doubt
         _fill(touched, False)
@@ -133,7 +149,7 @@ def _count_rows(
                 while k < touched.size and touched[k]:
                     k += 1
                 end = min(k * TILE, row.size)
-                doubt = _to_counts(row[begin:end], open_beam, top, out[j, begin:end]) or doubt
+                doubt = to_counts(row[begin:end], open_beam, top, out[j, begin:end]) or doubt
                 _copy(base[begin:end], row[begin:end])
             k += 1
         doubtful[j] = doubt
@@ -245,34 +261,4 @@ def _add_bodies(
             part[i] *= math.sqrt(square + at[i] * at[i])
 
 
-@intrinsic
-def _bits(context, x):  # type: ignore[no-untyped-def]
-    """The bits of a float64 as an int64."""
-    return types.int64(types.float64), lambda _, builder, __, args: builder.bitcast(args[0], ir.IntType(64))
-
-
-@intrinsic
-def _real(context, x):  # type: ignore[no-untyped-def]
-    """The float64 of these bits."""
-    return types.float64(types.int64), lambda _, builder, __, args: builder.bitcast(args[0], ir.DoubleType())
-
-
-@njit(fastmath={"contract"}, **KERNEL)
-def _to_counts(depth: Reals, open_beam: float, top: float, out: Counts) -> bool:
-    """Counts of line integrals; whether one of them lies so close to the middle of two that it is in doubt."""
-    doubts = 0
-    for i in range(depth.size):
-        x = min(max(depth[i] * -_LOG2E, -_FAR), _FAR)
-        whole = x + _ROUND
-        f = x - (whole - _ROUND)
-        # Estrin's scheme: the processor has several multiply-adds under way at once
-        f2 = f * f
-        f4 = f2 * f2
-        low = (_C0 + _C1 * f) + (_C2 + _C3 * f) * f2
-        high = (_C4 + _C5 * f) + (_C6 + _C7 * f) * f2
-        y = low + (high + (_C8 + _C9 * f) * f4) * f4
-        count = min(open_beam * _real(_bits(y) + (_bits(whole) << 52)), top)
-        nearest = count + _ROUND
-        doubts += abs(abs(count - (nearest - _ROUND)) - 0.5) < _DOUBT
-        out[i] = np.uint16(_bits(nearest))
-    return doubts > 0
+depth_rows, count_rows = _entries(_version())

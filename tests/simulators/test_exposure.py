@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators import rows
 from simulators.battery import battery
 from simulators.beam import Beam
 from simulators.detector import Detector
@@ -83,21 +82,6 @@ def test_deep_shadow_and_amplified_light() -> None:
         solids: list[Solid] = [Ellipsoid((0.3, 0.2, 0.25), attenuation), Cylinder(0.35, 0.3, attenuation)]
         at_once, steps = _both(_scene(Phantom.of(solids)), angle=0.3)
         np.testing.assert_array_equal(at_once, steps)
-
-
-def test_the_polynomial_is_numpy_s_exponential_to_1e_13() -> None:
-    """Read off its counts at full range, where a count is 1.5e-5, in steps of the light that would tell 1e-13 apart:
-    where both round alike at a boundary that moves by so little, they are as close as that."""
-    depth = np.linspace(0, 10, 40_001)
-    counts = np.empty(depth.size, np.uint16)
-    worst = 0.0
-    for light in np.random.default_rng(0).uniform(6e4, 6.5e4, 50):
-        rows._to_counts(depth, light, 65535.0, counts)
-        exact = light * np.exp(-depth)
-        # A count that is not the nearest is one whose exact value lies next to a half.
-        wrong = counts != np.rint(exact)
-        worst = max(worst, float((0.5 - np.abs(exact - np.rint(exact)))[wrong].max(initial=0.0)))
-    assert worst < 0.1 * rows._DOUBT
 
 
 def test_the_steps_that_were_taken_are_told() -> None:
