@@ -20,6 +20,8 @@ Image = NDArray[np.float64]
 Transfer = Callable[[Image], Image]
 COARSE = 4
 """Pixels of the smaller image in the width of a blur, at least; more are finer and slower."""
+FAR = 1e6
+"""Frames in the width of a blur, at most: the light is even then."""
 
 
 def gaussian(s: Image) -> Image:
@@ -49,7 +51,8 @@ def broad_blur(image: Image, width: float, transfer: Transfer) -> Image:
     """
     rows, cols = image.shape
     shared = math.gcd(rows, cols)
-    factor = max((f for f in range(1, int(width / COARSE) + 1) if shared % f == 0), default=1)
+    width = min(width, FAR * max(rows, cols))
+    factor = max((f for f in range(1, min(int(width / COARSE), shared) + 1) if shared % f == 0), default=1)
     small = np.empty((rows // factor, cols // factor))
     _shrink(image, small)
     laplacian = _symbol(small.shape[0])[:, None] + _symbol(small.shape[1])

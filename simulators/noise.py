@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from simulators.bands import share_rows
+from simulators.effects.shot import CannotExposeError
 from simulators.streams import STEP, begin, mix, normal
 
 LEAST = 2.0
@@ -146,11 +147,14 @@ def poisson(image: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.
         rng: one number of it is the key of all rows' streams.
 
     Raises:
-        ValueError: an expectation is negative, not a number or beyond LARGEST; the image is as it was.
+        CannotExposeError: an expectation is negative, not a number or beyond LARGEST; the image is as it was.
     """
     low, high = image.min(initial=0.0), image.max(initial=0.0)
     if not (low >= 0 and high <= LARGEST):
-        raise ValueError(f"expectations must lie in 0 ... {LARGEST:g}, got {low:g} ... {high:g}")
+        raise CannotExposeError(
+            f"Poisson noise: expectations must lie in 0 ... {LARGEST:g}, got {low:g} ... {high:g} photons or electrons "
+            f"a pixel; give less light or a shorter exposure"
+        )
     key = rng.integers(2**64, dtype=np.uint64)
     share_rows(lambda first, end: _poisson_rows(key, first, end, image), image.shape)
     return image

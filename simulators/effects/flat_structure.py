@@ -112,7 +112,8 @@ def _draw_scratch(left: Reals, row: float, col: float, angle: float, length: flo
     # Across a line at an angle, a width w is w / cos as seen along the axis: at most √2 w.
     reach = int(np.ceil(REACH * width * np.sqrt(2)))
     middle = np.rint(col + (steps - row) * beside / along).astype(np.int64)
-    at = middle[:, None] + np.arange(-reach, reach + 1)
+    whole = 2 * reach >= left.shape[1]  # wider than the frame: then each of its columns, and no more
+    at = np.arange(left.shape[1]) + 0 * middle[:, None] if whole else middle[:, None] + np.arange(-reach, reach + 1)
     dy, dx = (steps - row)[:, None], at - col
     t, s = dy * along + dx * beside, dx * along - dy * beside  # pixels along the line and across
     beyond = np.maximum(np.abs(t) - length / 2, 0.0)

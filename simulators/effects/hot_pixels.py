@@ -31,8 +31,10 @@ class HotPixels:
     final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if not (0 <= self.fraction <= 0.1 and self.rate >= 0 and self.seed >= 0):
-            raise ValueError(f"fraction must lie in 0 ... 0.1 and rate (electrons/s) and seed be >= 0, got {self}")
+        if not (0 <= self.fraction <= 0.1 and 0 <= self.rate <= 1e9 and self.seed >= 0):
+            raise ValueError(
+                f"fraction must lie in 0 ... 0.1, rate (electrons/s) in 0 ... 1e9 and seed be >= 0, got {self}"
+            )
 
     def apply(self, image: Image, shot: Shot) -> Image:
         at, even = places(self.name, self.seed, self.fraction, shot)

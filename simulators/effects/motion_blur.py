@@ -56,7 +56,7 @@ class MotionBlur:
         """How many moments a frame is the mean of; 0 where the stage stands while the first row is exposed."""
         angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
         turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
-        return min(math.ceil(turned * _rim(shot) / self.tolerance_px), self.max_samples)
+        return math.ceil(min(turned * _rim(shot) / self.tolerance_px, self.max_samples))
 
 
 def _rim(shot: Shot) -> float:

@@ -8,10 +8,12 @@ from typing import ClassVar
 import numpy as np
 
 from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot, draws
+from simulators.effects.shot import CannotExposeError, Image, Shot, draws
 
 DROPS = 200
 """Parts of a charge that spreads."""
+MOST = 100_000
+"""Zingers in a frame; the work grows with them."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,15 @@ class Zingers:
             raise ValueError(f"tracks must lie in 0 ... 1, length be positive and radius >= 0, got {self}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
+        """Raises CannotExposeError where a frame has more than MOST: a slip of units."""
         rng = draws(self.name, shot)
-        n = int(rng.poisson(self.rate * shot.exposure))
+        expected = self.rate * shot.exposure
+        if expected > MOST:
+            raise CannotExposeError(
+                f"zingers: {self.rate:g} a second are {expected:.3g} in a frame of {shot.exposure:g} s, more than the "
+                f"{MOST} that are worked out; a rate counts the zingers of the whole frame"
+            )
+        n = int(rng.poisson(expected))
         where = np.array(np.unravel_index(rng.integers(image.size, size=n), image.shape), dtype=np.float64)
         charge = rng.exponential(self.charge, n)
         if self.tracks > 0 or self.radius > 0:

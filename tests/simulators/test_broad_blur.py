@@ -85,6 +85,13 @@ def test_light_is_kept_and_none_is_negative(
     assert seen.min() >= 0
 
 
+@pytest.mark.parametrize("transfer", KERNELS)
+@pytest.mark.parametrize("width", [1e5, 1e12, 1e200])
+def test_a_width_far_beyond_the_frame_spreads_evenly_and_at_once(transfer: Transfer, width: float) -> None:
+    image = np.random.default_rng(1).random((24, 36))
+    np.testing.assert_allclose(_blurred(image, width, transfer), image.mean(), rtol=1e-6)
+
+
 def test_an_even_image_stays_and_a_tiny_width_changes_nothing() -> None:
     np.testing.assert_allclose(_blurred(np.full((24, 36), 7.0), 20.0, exponential), 7.0, rtol=1e-12)
     image = np.random.default_rng(1).random((24, 36))

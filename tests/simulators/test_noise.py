@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from simulators import bands
+from simulators.effects.shot import CannotExposeError
 from simulators.noise import LEAST, add_normal, expansion, poisson, searched, summed
 from tests.simulators import chance
 
@@ -136,7 +137,7 @@ def test_what_is_no_expectation_is_refused_and_nothing_is_written(bad: float) ->
     image = np.full((4, 5), 3.0)
     image[2, 2] = bad
     before = image.copy()
-    with pytest.raises(ValueError, match=r"expectations must lie in 0 ... 1e\+09, got"):
+    with pytest.raises(CannotExposeError, match=r"expectations must lie in 0 ... 1e\+09, got"):
         poisson(image, np.random.default_rng(0))
     np.testing.assert_array_equal(image, before)
 

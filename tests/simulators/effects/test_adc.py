@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from simulators.effects.adc import Adc
+from simulators.effects.shot import CannotExposeError
 from simulators.sensor import digitise
 from tests.simulators import chance, shots
 
@@ -45,6 +46,16 @@ def test_it_ends_the_counts() -> None:
     frame = shots.frame(shots.scene("photon_noise", "read_noise", "offset", {"kind": "adc", "bits": 12}))
     assert not (frame % 16).any()
     assert frame.max() > 30_000
+
+
+@pytest.mark.parametrize("adc", [{"bits": 12}, {"bits": 8}, {"nonlinearity": 0.01}])
+def test_photon_numbers_are_not_resolved_with_a_lesser_converter(adc: dict[str, float]) -> None:
+    """8 bits would show none of 40 photons: their steps are 256 counts."""
+    shot = shots.shot(readout="photon_number")
+    with pytest.raises(CannotExposeError, match="photon numbers need a straight converter of 16 bits"):
+        shots.frame(shots.scene("photon_noise", {"kind": "adc", **adc}), shot)
+    straight, plain = (shots.frame(shots.scene("photon_noise", *also, flux=4e3), shot) for also in (["adc"], []))
+    np.testing.assert_array_equal(straight, plain)
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,21 @@ def test_scratches_take_the_light_of_lines() -> None:
     assert inside >= 4
 
 
+@pytest.mark.parametrize("width_um", [1e3, 1e6, 1e9])
+def test_a_scratch_wider_than_the_frame_costs_no_more_than_the_frame(width_um: float) -> None:
+    """Across and at its ends it is a Gaussian at every pixel."""
+    rng = lasting("flat_structure", 3)
+    row, col, angle, chance, deep = rng.random(5) * (2304, 4096, math.pi, 1, 0.1)
+    scratch = FlatStructure(0, scratches=1, scratch_length_um=800.0, scratch_width_um=width_um, seed=3)
+    seen = scratch.transmission(_roi(1000, 2000, 120, 200))
+    dy, dx = np.arange(120)[:, None] + 1000 - row, np.arange(200) + 2000 - col
+    along = np.abs(dy * math.sin(angle) + dx * math.cos(angle)) + math.log1p(-chance) * 40
+    across = dx * math.sin(angle) - dy * math.cos(angle)
+    beside = (np.maximum(along, 0) ** 2 + across**2) / (width_um / 10) ** 2
+    near = beside < 16
+    np.testing.assert_allclose(seen[near], (1 - deep * np.exp(-beside / 2))[near], atol=1e-12)
+
+
 def test_a_flat_divides_it_out() -> None:
     effect = {"kind": "flat_structure", "specks": 15_000, "radius_um": 60.0, "scratches": 200, "seed": 3}
     scene = shots.scene(effect)

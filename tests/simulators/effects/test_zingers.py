@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from simulators.effects.shot import CannotExposeError
 from simulators.effects.zingers import Zingers
 from tests.simulators import chance, shots
 
@@ -66,6 +67,12 @@ def test_charge_spreads_by_the_radius_and_is_kept() -> None:
     # Each of n numbers is a variance of 200 drops: 2² and rounding's 1/12, times 199/200.
     expected = (4 + 1 / 12) * 199 / 200
     assert np.mean(spreads) == pytest.approx(expected, abs=chance.SIGMAS * expected * np.sqrt(2 / 200 / len(spreads)))
+
+
+def test_more_zingers_than_a_frame_can_hold_are_refused() -> None:
+    """They would fill the memory."""
+    with pytest.raises(CannotExposeError, match=r"1e\+12 a second are 1e\+10 in a frame of 0.01 s"):
+        _frame(Zingers(1e12), 0)
 
 
 @pytest.mark.parametrize(
