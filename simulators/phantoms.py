@@ -73,4 +73,48 @@ def _volume(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> 
         raise SceneError(f"{where}: {error}") from None
 
 
-_BUILDERS: Mapping[str, Builder] = {"battery": _battery, "solids": _solids}
+def _cathode(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
+    from simulators.cathode import Cathode
+
+    return _pieces(Cathode, where, mapping, beam)
+
+
+def _foam(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
+    from simulators.foam import Foam
+
+    return _pieces(Foam, where, mapping, beam)
+
+
+def _resolution(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
+    from simulators.resolution import Resolution
+
+    return _pieces(Resolution, where, mapping, beam)
+
+
+def _pieces(kind: Any, where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
+    """A phantom of parts that are materials in a beam with energies, unless it says how its parts attenuate."""
+    from simulators.pieces import grey, of_materials
+
+    settings = build(kind, where, {key: value for key, value in mapping.items() if key != "materials"})
+    try:
+        pieces = settings.pieces()
+        if beam.has_energy and not settings.attenuation:
+            return of_materials(where, pieces, settings.materials, mapping.get("materials"), beam)
+        if settings.made_of or "materials" in mapping:
+            raise SceneError(
+                f"{where}: materials need a beam with energies (energy_kev), and no attenuation beside them"
+            )
+        return grey(pieces, settings.greys)
+    except SceneError:
+        raise
+    except ValueError as error:
+        raise SceneError(f"{where}: {error}") from None
+
+
+_BUILDERS: Mapping[str, Builder] = {
+    "battery": _battery,
+    "solids": _solids,
+    "cathode": _cathode,
+    "foam": _foam,
+    "resolution": _resolution,
+}
