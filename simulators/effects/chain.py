@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.domain import Domain
+from simulators.effects.order import problem
 from simulators.effects.shot import Image, Moments, Shot
 from simulators.pose import Pose
 
@@ -21,7 +22,8 @@ Watch: TypeAlias = Callable[[str], AbstractContextManager[object]]
 class Effect(Protocol):
     """An effect is a frozen dataclass of its parameters.
 
-    `name` is that of its module; `final` marks what ends its domain: photon noise, after which the photons are counted.
+    `name` is that of its module; `final` marks what ends its domain: photon noise, after which the photons are counted,
+    read noise, with which the charge is read, and the converter.
     """
 
     name: ClassVar[str]
@@ -84,7 +86,8 @@ class Chain:
 
     @classmethod
     def of(cls, effects: Sequence[AnyEffect]) -> Chain:
-        """Check the order: motion, optical depth, photons (noise last), electrons, counts; each effect once.
+        """Check the order: motion, optical depth, photons (noise last), electrons (the readout's noise last), counts,
+        and what order.py says of a domain's own; each effect once.
 
         Raises:
             ValueError: in a sentence that names the two effects.
@@ -104,6 +107,8 @@ class Chain:
                         f"effect {effect.name!r} must come before {earlier.name!r}, which ends the "
                         f"{effect.domain.words}"
                     )
+                if wrong := problem(earlier.name, effect.name):
+                    raise ValueError(wrong)
         return cls(tuple(effects))
 
     @property

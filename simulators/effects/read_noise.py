@@ -30,7 +30,7 @@ class ReadNoise:
 
     name: ClassVar[str] = "read_noise"
     domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = False
+    final: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.rms is not None and not self.rms >= 0:
