@@ -12,9 +12,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
+
+from simulators.bands import share_rows
 
 Image = NDArray[np.float64]
 Transfer = Callable[[Image], Image]
@@ -54,9 +56,9 @@ def broad_blur(image: Image, width: float, transfer: Transfer) -> Image:
     width = min(width, FAR * max(rows, cols))
     factor = max((f for f in range(1, min(int(width / COARSE), shared) + 1) if shared % f == 0), default=1)
     small = np.empty((rows // factor, cols // factor))
-    _shrink(image, small)
+    share_rows(lambda first, end: _shrink(first, end, image, small), small.shape)
     laplacian = _symbol(small.shape[0])[:, None] + _symbol(small.shape[1])
-    threads = get_num_threads()
+    threads = config.NUMBA_NUM_THREADS
     spectrum = fft.dctn(small, overwrite_x=True, workers=threads)
     spectrum *= transfer(laplacian * (width / factor) ** 2)
     blurred = fft.idctn(spectrum, overwrite_x=True, workers=threads)
@@ -67,11 +69,11 @@ def _symbol(n: int) -> NDArray[np.float64]:
     return 2 - 2 * np.cos(np.pi * np.arange(n) / n)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _shrink(image: Image, small: Image) -> None:
-    """Means over the blocks of `image` that `small` has pixels for."""
+@njit(cache=True, nogil=True)
+def _shrink(begin: int, end: int, image: Image, small: Image) -> None:
+    """Means over the blocks of `image` that rows begin ... end of `small` have pixels for."""
     factor = image.shape[0] // small.shape[0]
-    for j in prange(small.shape[0]):
+    for j in range(begin, end):
         line = np.zeros(image.shape[1])
         for k in range(j * factor, (j + 1) * factor):
             for i in range(line.size):
@@ -80,15 +82,20 @@ def _shrink(image: Image, small: Image) -> None:
             small[j, i] = line[i * factor : (i + 1) * factor].sum() / factor**2
 
 
-@njit(cache=True, nogil=True, parallel=True)
 def add_enlarged(image: Image, small: Image, share: float) -> None:
     """image += share x small, drawn straight from centre to centre of its pixels and level at the edges.
 
     The sum grows by share x sum of small x pixels in one of its blocks, to rounding: straight lines keep the mean.
     """
+    share_rows(lambda first, end: _add_enlarged(first, end, image, small, share), image.shape)
+
+
+@njit(cache=True, nogil=True)
+def _add_enlarged(begin: int, end: int, image: Image, small: Image, share: float) -> None:
+    """The rows begin ... end of it."""
     factor = image.shape[0] // small.shape[0]
     rows, cols = small.shape
-    for j in prange(image.shape[0]):
+    for j in range(begin, end):
         y = (j + 0.5) / factor - 0.5
         first = math.floor(y)
         above, below = share * (first + 1 - y), share * (y - first)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
 
+from simulators.bands import share_rows
 from simulators.broad_blur import add_enlarged
 from simulators.detector import Detector
 from simulators.effects.domain import Domain
@@ -145,7 +146,7 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
     phase = (2 * math.pi * turns).astype(np.float32)
     amplitude = np.exp(-0.5 * depth.astype(np.float32))
     rows, cols = (np.exp(-0.25j * np.pi * area * (np.arange(n) / n) ** 2).astype(np.complex64) for n in depth.shape)
-    threads = get_num_threads()
+    threads = config.NUMBA_NUM_THREADS
     wave = np.empty(depth.shape, np.complex64)
     for part, wanted in ((wave.real, np.cos), (wave.imag, np.sin)):
         part[:] = fft.dctn(amplitude * wanted(phase), norm="ortho", overwrite_x=True, workers=threads)
@@ -158,13 +159,20 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
     return intensity
 
 
-@njit(cache=True, nogil=True, parallel=True)
 def _transported(light: Image, share: float) -> Image:
     """light - share x its Laplacian (in pixels, edges are mirrors), as light moved from each pixel to its brighter
     neighbours; a pixel that would give more than it has gives all, each neighbour its part."""
+    kept, out = np.empty_like(light), np.empty_like(light)
+    share_rows(lambda first, end: _keep(first, end, light, share, kept), light.shape)
+    share_rows(lambda first, end: _give(first, end, light, share, kept, out), light.shape)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _keep(begin: int, end: int, light: Image, share: float, kept: Image) -> None:
+    """What part of the light that the pixels of rows begin ... end would give they have."""
     rows, cols = light.shape
-    kept = np.empty_like(light)
-    for j in prange(rows):
+    for j in range(begin, end):
         above, below = light[max(j - 1, 0)], light[min(j + 1, rows - 1)]
         for i in range(cols):
             own = light[j, i]
@@ -173,8 +181,13 @@ def _transported(light: Image, share: float) -> Image:
                 max(above[i] - own, 0.0) + max(below[i] - own, 0.0) + max(left - own, 0.0) + max(right - own, 0.0)
             )
             kept[j, i] = own / given if given > own else 1.0
-    out = np.empty_like(light)
-    for j in prange(rows):
+
+
+@njit(cache=True, nogil=True)
+def _give(begin: int, end: int, light: Image, share: float, kept: Image, out: Image) -> None:
+    """The light of the pixels of rows begin ... end once all have given and got."""
+    rows, cols = light.shape
+    for j in range(begin, end):
         above, below = max(j - 1, 0), min(j + 1, rows - 1)
         for i in range(cols):
             left, right = max(i - 1, 0), min(i + 1, cols - 1)
@@ -185,7 +198,6 @@ def _transported(light: Image, share: float) -> Image:
                 + _gain(light, kept, j, i, j, right)
             )
             out[j, i] = max(light[j, i] + share * gain, 0.0)  # rounding alone
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -8,10 +8,11 @@ from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from simulators.bands import share_rows
 from simulators.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
 from simulators.effects.domain import Domain
 from simulators.effects.shot import CannotExposeError, Image, Shot
@@ -64,7 +65,8 @@ class ScintillatorBlur:
                 f"{pixel_um:g} um, more than the {MAX_CORE:g} that are worked out; give a wide blur as the tail"
             )
         blurred = np.empty_like(image)
-        _blur(image, discrete_gaussian(sigma**2), 1 - self.tail_share, blurred)
+        taps = discrete_gaussian(sigma**2)
+        share_rows(lambda first, end: _blur(first, end, image, taps, 1 - self.tail_share, blurred), image.shape)
         if self.tail_share > 0:
             add_enlarged(blurred, broad_blur(image, self.tail_um / pixel_um, TAILS[self.tail]), self.tail_share)
         return blurred
@@ -89,12 +91,13 @@ def discrete_gaussian(variance: float) -> NDArray[np.float64]:
     return kept / (2 * kept.sum() - kept[0])
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _blur(image: Image, taps: NDArray[np.float64], weight: float, out: Image) -> None:
-    """out = weight x image convolved with the symmetric taps along rows and columns; the edges are mirrors."""
+@njit(cache=True, nogil=True)
+def _blur(begin: int, end: int, image: Image, taps: NDArray[np.float64], weight: float, out: Image) -> None:
+    """out = weight x image convolved with the symmetric taps along rows and columns, in rows begin ... end; the edges
+    are mirrors."""
     rows, cols = image.shape
     reach = taps.size - 1
-    for j in prange(rows):
+    for j in range(begin, end):
         line = np.zeros(cols + 2 * reach)
         middle = line[reach : reach + cols]
         for k in range(-reach, reach + 1):
