@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import config
 
-from simulators import bands
 from simulators.detector import Detector
 from simulators.effects.catalogue import CATALOGUE
 from simulators.effects.shot import Shot
@@ -62,7 +62,7 @@ def large() -> Shot:
 def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     frames = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(bands.config, "NUMBA_NUM_THREADS", threads)
+        monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
         frames.append(expose(with_all(method), large()))
     assert np.unique(frames[0]).size > 20
     np.testing.assert_array_equal(frames[0], frames[1])
