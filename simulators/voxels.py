@@ -99,9 +99,30 @@ class Voxels:
         return z, y, x
 
     def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> NDArray[np.float64]:
-        """See Sample.line_integrals."""
+        """See Sample.line_integrals.
+
+        Raises:
+            ValueError: a pose of another number of rows, or a cone's source that is not outside of the volume.
+        """
         pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
+        if pose.angle.size != detector.shape[0]:
+            raise ValueError(f"the pose has {pose.angle.size} angles and the detector {detector.shape[0]} rows")
+        if math.isfinite(detector.sod):
+            self._check_ahead(pose, detector.sod)
         return project(self.padded, np.array(self.spacing[::-1]), np.array(self.first[::-1]), pose, detector)
+
+    def _check_ahead(self, pose: Pose, sod: float) -> None:
+        """Raises ValueError where a corner of the volume is not in front of the source."""
+        ends = [(first - step, -(first - step)) for first, step in zip(self.first, self.spacing, strict=True)]
+        corners = np.array([(x, y, z) for z in ends[0] for y in ends[1] for x in ends[2]])
+        axes, origin = pose.frames()
+        along = axes[:, :, 1]
+        nearest = float((along @ corners.T - np.einsum("ri,ri->r", along, origin)[:, None]).min())
+        if not nearest > -sod:
+            raise ValueError(
+                f"the volume begins {-nearest:.3g} mm before the rotation axis, the source stands {sod:g} mm before it; "
+                "it must lie wholly in front of the source: raise sod, or make voxel_mm smaller. No frame was computed"
+            )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
         """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume, where voxels are larger than its own

@@ -196,6 +196,18 @@ def test_the_radius_holds_all_matter() -> None:
     assert Voxels.of(np.zeros((2, 2, 2)), 0.1).radius == 0
 
 
+def test_a_source_in_the_volume_is_refused(random: Voxels) -> None:
+    """The volume with its rim is 10 x 12 voxels of 0.04 and 0.03 mm about the axis: its corner is 0.27 mm out."""
+    detector = Detector.centred((3, 4), 0.05, sod=0.28)
+    random.line_integrals(0.7, detector)
+    for moved in (Pose.turned(0.7, 3).shifted_by([0.0, -0.03, 0.0]), Pose.turned(math.atan2(0.2, 0.18), 3)):
+        close = Detector.centred((3, 4), 0.05, sod=0.265 if moved.shift is None else 0.28)
+        with pytest.raises(ValueError, match="in front of the source: raise sod"):
+            random.line_integrals(moved, close)
+    with pytest.raises(ValueError, match="2 angles and the detector 3 rows"):
+        random.line_integrals(Pose.turned(0.0, 2), detector)
+
+
 def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch) -> None:
     detector = Detector.centred((30, 20), 0.02)
     pose = Pose.turned(0.4, 30)
