@@ -120,7 +120,7 @@ class Voxels:
         nearest = float((along @ corners.T - np.einsum("ri,ri->r", along, origin)[:, None]).min())
         if not nearest > -sod:
             raise ValueError(
-                f"the volume begins {-nearest:.3g} mm before the rotation axis, the source stands {sod:g} mm before it; "
+                f"the volume begins {-nearest:.3g} mm before the rotation axis, the source {sod:g} mm before it; "
                 "it must lie wholly in front of the source: raise sod, or make voxel_mm smaller. No frame was computed"
             )
 
