@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from simulators.detector import Detector
+from simulators.effects.shot import CannotExposeError
 from simulators.packing import CYLINDER, ELLIPSOID, Packed
 from simulators.pose import Pose
 
@@ -53,7 +54,8 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
         names: what each solid is called, for messages.
 
     Raises:
-        ValueError: a pose that is not one a row, or a body at or behind the source of a cone.
+        ValueError: a pose that is not one a row.
+        CannotExposeError: a body at or behind the source of a cone.
     """
     rows = detector.shape[0]
     if pose.angle.shape != (rows,):
@@ -104,7 +106,7 @@ def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]
 
 
 def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, sod: float, doubtful: Wholes) -> None:
-    """Raises ValueError where one of the doubtful bodies, seen exactly, does not lie wholly in front of the source."""
+    """Raises CannotExposeError where one of the doubtful bodies, seen exactly, is not wholly in front of the source."""
     for i in doubtful:
         axis = axes[:, :, 1]
         if p.kind[i] == CYLINDER:
@@ -116,7 +118,7 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
             reach = -(axis @ corners.T).min(axis=1)
         gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
         if not gap > 1e-9 * sod:
-            raise ValueError(
+            raise CannotExposeError(
                 f"solid {p.owner[i]} ({names[p.owner[i]]}) reaches {-gap:.3g} mm behind the source, which stands "
                 f"{sod:g} mm before the rotation axis; it must lie wholly in front: move it, or raise sod. "
                 f"No frame was computed"

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 
 from recon.volume import Grid
 from simulators.detector import Detector
+from simulators.effects.shot import CannotExposeError
 from simulators.pose import Pose
 from simulators.voxel_projector import padded, project
 
@@ -102,7 +103,8 @@ class Voxels:
         """See Sample.line_integrals.
 
         Raises:
-            ValueError: a pose of another number of rows, or a cone's source that is not outside of the volume.
+            ValueError: a pose of another number of rows.
+            CannotExposeError: a cone's source that is not outside of the volume.
         """
         pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
         if pose.angle.size != detector.shape[0]:
@@ -112,14 +114,14 @@ class Voxels:
         return project(self.padded, np.array(self.spacing[::-1]), np.array(self.first[::-1]), pose, detector)
 
     def _check_ahead(self, pose: Pose, sod: float) -> None:
-        """Raises ValueError where a corner of the volume is not in front of the source."""
+        """Raises CannotExposeError where a corner of the volume is not in front of the source."""
         ends = [(first - step, -(first - step)) for first, step in zip(self.first, self.spacing, strict=True)]
         corners = np.array([(x, y, z) for z in ends[0] for y in ends[1] for x in ends[2]])
         axes, origin = pose.frames()
         along = axes[:, :, 1]
         nearest = float((along @ corners.T - np.einsum("ri,ri->r", along, origin)[:, None]).min())
         if not nearest > -sod:
-            raise ValueError(
+            raise CannotExposeError(
                 f"the volume begins {-nearest:.3g} mm before the rotation axis, the source {sod:g} mm before it; "
                 "it must lie wholly in front of the source: raise sod, or make voxel_mm smaller. No frame was computed"
             )
