@@ -74,9 +74,10 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
     shape = grid.shape
     if truth.shape != shape:
         if tuple(t // binning for t in truth.shape) != shape:
+            coarser = [n for n in range(2, max(shape) + 1) if tuple(s // n for s in shape) == truth.shape]
+            advice = f"Give --bin {coarser[0] * binning}" if coarser else "Choose its slices with FILE:first:end"
             raise ConfigError(
-                f"--truth has shape {truth.shape}, the volume {shape} [z, y, x] with --bin {binning}. Choose its "
-                "slices with FILE:first:end."
+                f"--truth has shape {truth.shape}, the volume {shape} [z, y, x] with --bin {binning}. {advice}."
             )
         z, y, x = shape
         n = binning

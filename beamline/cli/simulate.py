@@ -11,26 +11,28 @@ from typing import Any
 
 import click
 
-from beamline.cli.scan import stop_signals
-from beamline.cli.told import told_as_json
+from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
 from beamline.errors import ConfigError, ScanStopped
 from beamline.events import Event, Sink, fan_out
+from beamline.free_memory import free_memory
 from beamline.machine import machine, machine_line
+from beamline.plan_checks import size
 from beamline.simulate.explained import explained, table
 from beamline.simulate.figure import sheet
-from beamline.simulate.scene_file import Scan, SceneFile, begun, open_scene, shown
-from beamline.simulate.truth import binning_of, truth_of, write_truth
-from beamline.simulate.write import Simulated, write_scan
-from beamline.stop import StopRequest
+from beamline.simulate.labels import labels_path
+from beamline.simulate.scene_file import Scan, SceneFile, begun, open_scene, shipped_scenes, shown
+from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
+from beamline.simulate.write import Simulated, refuse, write_scan
 from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
 from beamline.terminal import Terminal
 from drivers.clock import Clock, SystemClock
 
 _OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."
+_SEED = click.IntRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
-@click.command()
+@click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")
 @click.argument("scene", metavar="SCENE")
 @click.option("--explain", "explains", is_flag=True, help="What a frame computes, in order, and what each step costs.")
 @click.option(
@@ -39,10 +41,12 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--out", type=_FILE, help="Write the scan to this HDF5 file, and its labels beside it.")
 @click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")
 @click.option(
-    "--truth-bin", type=click.IntRange(min=1), help="Pixels a voxel's side; by default as many as leave 256 across."
+    "--truth-bin",
+    type=click.IntRange(min=1),
+    help="Pixels a voxel's side, the --bin of a reconstruction to compare; by default as many as leave 256 across.",
 )
 @click.option("--picture", type=_FILE, help="Write a PNG with some of the frames; beside --out unless given.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all random numbers.")
+@click.option("--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Of all random numbers.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def simulate(
@@ -60,19 +64,22 @@ def simulate(
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
     Only the effects that it names are computed. The file is like one of the instrument: `beamline recon` reads it.
-    The first Ctrl-C ends the scan with a readable file and its labels.
+    The first Ctrl-C ends the scan after its frame, with a readable file and its labels; the second at once.
 
-    Exit code: 0 done, 2 a wrong scene, 4 stopped, 5 disk.
+    Exit code: 0 done, 2 a wrong scene, 4 stopped, 5 disk, 130 interrupted.
     """
-    if not (explains or out or truth or picture):
-        raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
     clock = SystemClock()
-    with told_as_json(as_json) as sinks, shown(scene):
+    with terminated_like_interrupted(), told_as_json(as_json) as sinks, shown(scene):
+        if not (explains or out or truth or picture):
+            raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
+        if truth_bin and not truth:
+            raise ConfigError("--truth-bin is of --truth's voxels: give --truth FILE too. Nothing was simulated.")
+        picture = out.with_suffix(".png") if out and not picture else picture
+        _refuse_outputs(out, truth, picture)
         opened = open_scene(scene, overrides)
         scan = begun(opened, seed, views, clock.now())
-        picture = out.with_suffix(".png") if out and not picture else picture
-        for path in filter(None, (truth, picture)):
-            refuse_existing(path)
+        if out:
+            refuse(scan, out)
         tell = _Teller(fan_out(*sinks), clock, plain=not as_json)
         if explains:
             _explain(scan, tell)
@@ -95,6 +102,19 @@ def simulate(
         tell.event("done", made)
 
 
+def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
+    """All files, before any is begun. Raises ConfigError: two are the same; DataError: one is in the way."""
+    named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
+    seen: dict[Path, str] = {}
+    for what, path in named.items():
+        if path is None:
+            continue
+        other = seen.setdefault(path.resolve(), what)
+        if other is not what:
+            raise ConfigError(f"{path} would be both {other} and {what}; name another. Nothing was simulated.")
+        refuse_existing(path)
+
+
 class _Teller:
     """Tells people in lines, programs in events."""
 
@@ -114,25 +134,33 @@ class _Teller:
 
 def _explain(scan: Scan, tell: _Teller) -> None:
     found, where = explained(scan, time.perf_counter), machine()
-    tell.event("explain", asdict(found) | {"machine": where})
+    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
+    tell.event("explain", asdict(found) | {"costs": costs, "machine": where})
     tell.lines(f"{machine_line(where)}\n\n{table(found)}")
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[str, object]:
+    n = binning or binning_of(scan.detector)
     try:
-        truth = truth_of(scan.scene.sample, scan.detector, binning or binning_of(scan.detector))
+        needed, free = memory_of(scan.detector, n), free_memory()
     except ValueError as error:
         raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
+    if free is not None and needed > free:
+        raise ConfigError(
+            f"--truth-bin {n}: the truth takes {size(needed)} of memory while it is made, {size(free)} are free; give "
+            "a larger one. Nothing was simulated."
+        )
+    truth = truth_of(scan.scene.sample, scan.detector, n)
     write_truth(path, truth)
     voxels = " x ".join(map(str, truth.grid.shape))
-    tell("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm")
+    tell("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, for `beamline recon --bin {n}`")
     return {"truth": path}
 
 
 def _scan(scene: SceneFile, scan: Scan, out: Path, tell: _Teller, sink: Sink) -> Simulated:
-    stop = StopRequest()
-    with stop_signals(stop), Terminal(sys.stderr) as terminal:
-        written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), lambda: stop.stopping)
+    ending = EndOfFit("Ending after this frame; once more ends at once.")
+    with ending() as stopped, Terminal(sys.stderr) as terminal:
+        written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
     tell("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
     found = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
     tell("labels", f"{written.labels}  {found or 'no anomaly'}")

@@ -41,11 +41,14 @@ def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
 
 
 class EndOfFit:
-    """Ctrl-C, SIGTERM or SIGHUP during the work: the first asks for a volume as soon as there is one, the second for
-    none."""
+    """Ctrl-C, SIGTERM or SIGHUP during the work: the first asks for what there is so far, the second for nothing.
 
-    def __init__(self) -> None:
-        self._asked = False
+    Args:
+        said: what the first one is answered with.
+    """
+
+    def __init__(self, said: str = "Ending as soon as there is a volume; once more throws it away.") -> None:
+        self._asked, self._said = False, said
 
     @contextmanager
     def __call__(self) -> Iterator[Callable[[], bool]]:
@@ -59,7 +62,7 @@ class EndOfFit:
             raise KeyboardInterrupt
         self._asked = True
         with suppress(OSError):  # a terminal that has hung up takes no words
-            click.echo("Ending as soon as there is a volume; once more throws it away.", err=True)
+            click.echo(self._said, err=True)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from simulators.shots import Scan
 
 COLUMNS, PICTURES = 4, 8
 _COLOURS = ("tab:orange", "tab:cyan", "tab:pink", "tab:olive", "tab:green", "tab:red", "tab:purple")
+FLATTEST, TALLEST = 0.1, 3.0  # heights of a picture over its width; frames beyond get margins
 MOST = 512  # pixels a side that a picture of 2 inches can show
 
 
@@ -33,9 +34,8 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     shown = [frame for frame, (_, planned) in zip(small, made, strict=True) if planned.kind is FrameKind.PROJECTION]
     low, high = grey_window(shown, 0.5, 99.8)
     rows = -(-len(frames) // COLUMNS)
-    figure = Figure(
-        figsize=(10.5, 0.4 + 2.9 * rows * scan.detector.shape[0] / scan.detector.shape[1] + 0.3 * rows), dpi=110
-    )
+    tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
+    figure = Figure(figsize=(10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), dpi=110)
     FigureCanvasAgg(figure)
     for place, ((number, planned), frame) in enumerate(zip(made, small, strict=True), start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)
@@ -68,11 +68,5 @@ def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:
     numbers = [0] if settings.darks else []
     numbers += [settings.darks] if settings.flats else []
     numbers += list(dict.fromkeys(marked))[: PICTURES - 1 - len(numbers)]
-    spread = np.linspace(first_view, len(scan) - 1, PICTURES).round().astype(int).tolist()
-    middle_out = sorted(spread, key=lambda n: min((abs(n - m) for m in numbers), default=0), reverse=True)
-    for number in middle_out:
-        if len(numbers) == PICTURES:
-            break
-        if number not in numbers:
-            numbers.append(number)
-    return sorted(numbers)
+    spread = np.linspace(first_view, len(scan) - 1, PICTURES - len(numbers)).round().astype(int)
+    return sorted({*numbers, *spread.tolist()})

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from beamline.digest import digest
+from beamline.errors import DataError
 from beamline.events import Event, Sink
+from beamline.plan_checks import ROOM, size
 from beamline.simulate.labels import LabelLog, Run, labels_path, write_labels
 from beamline.simulate.scene_file import SceneFile
 from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
@@ -18,6 +22,7 @@ from beamline.storage.recon_file import refuse_existing
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
+from simulators.effects.chain import Label
 from simulators.exposure import expose
 from simulators.shots import Planned, Scan
 
@@ -37,42 +42,61 @@ class Simulated:
     stopped: bool
 
 
+def refuse(scan: Scan, out: Path) -> None:
+    """Before anything is written. Raises DataError: file or labels are in the way, or the disk has too little room."""
+    for path in (out, labels_path(out)):
+        refuse_existing(path)
+    rows, cols = scan.detector.shape
+    preview = _preview_bin(scan.detector.shape)
+    needed = len(scan) * (2 * rows * cols + 4 * (rows // preview) * (cols // preview)) * ROOM
+    free = shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise DataError(
+            f"{out} would take {size(needed)} with {len(scan)} frames, its disk has {size(free)} free. Make fewer or "
+            "smaller frames, or name another disk. Nothing was written."
+        )
+
+
 def write_scan(
     scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, stopped: Callable[[], bool]
 ) -> Simulated:
-    """Make every frame of `scan` and write it to `out`, and the labels beside it.
+    """Make every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
 
     Args:
         stopped: asked before each frame; where it says so, file and labels are complete as far as they go.
 
     Raises:
-        DataError: a file is in the way, or the disk refuses.
+        DataError: a file is in the way, or the disk refuses or is too small.
     """
+    refuse(scan, out)
     labels = labels_path(out)
-    for path in (out, labels):
-        refuse_existing(path)
     log, begun, said = LabelLog(), time.monotonic(), -SAY_EVERY
     n = 0
     writer = NXtomoWriter(
         out, _info(scene, scan), scan.detector.shape, clock=clock, preview_bin=_preview_bin(scan.detector.shape)
     )
-    with writer:
-        for planned in scan:
-            if stopped():
-                writer.close("stopped")
-                break
-            log.add(n, _write(scan, planned, n, writer))
-            n += 1
-            now = time.monotonic() - begun
-            if now - said >= SAY_EVERY or n == len(scan):
-                said = now
-                sink(Event("frame", clock.now(), _progress(n, len(scan), now, scan.detector.shape, planned.kind)))
+    try:
+        with writer:
+            for planned in scan:
+                if stopped():
+                    writer.close("stopped")
+                    break
+                log.add(n, _write(scan, planned, n, writer))
+                n += 1
+                now = time.monotonic() - begun
+                if now - said >= SAY_EVERY or n == len(scan):
+                    said = now
+                    sink(Event("frame", clock.now(), _progress(n, len(scan), now, scan.detector.shape, planned.kind)))
+    except BaseException:
+        with suppress(DataError):  # why the scan ended is what is told
+            write_labels(labels, log.runs(), n)
+        raise
     runs = log.runs()
     write_labels(labels, runs, n)
     return Simulated(out, labels, n, runs, time.monotonic() - begun, n < len(scan))
 
 
-def _write(scan: Scan, planned: Planned, row: int, writer: NXtomoWriter):  # type: ignore[no-untyped-def]
+def _write(scan: Scan, planned: Planned, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:
     shot = planned.shot
     counts = expose(scan.scene, shot)
     angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan
@@ -106,6 +130,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         title=f"Simulated scan of the scene {scene.path.stem}",
         pixel_size_mm=scan.detector.pitch * magnification,
         source_distance_mm=beam.sod,
+        energy_kev=beam.energy_kev,
         distance_mm=None if beam.sod is None or beam.sdd is None else beam.sdd - beam.sod,
         exposure=scene.scene.detector.exposure_s,
         period=settings.period_s,

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import signal
+import struct
+import sys
 from pathlib import Path
 
 import h5py
@@ -10,14 +14,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from beamline.cli import simulate as module
 from beamline.cli.main import main
-from beamline.simulate import write
+from beamline.simulate import figure, write
 from beamline.simulate.labels import read_labels
-from beamline.simulate.scene_file import shipped_scenes
+from beamline.simulate.scene_file import begun, open_scene, shipped_scenes
 from beamline.storage.source import open_scan
 from drivers.frame import FrameKind
 from recon.geometry import Geometry
 from recon.volume import Grid
+from simulators.effects.shot import CannotExposeError
 
 SCENE = """
 phantom:
@@ -32,6 +38,7 @@ scan: {views: 12, darks: 2, flats: 2}
 effects: [photon_noise, read_noise, offset]
 """
 
+BAND = "{kind: black_band, width: 0.1, penumbra: 0.01}"
 FRINGES = "{kind: phase_fringes, delta_beta: 3000, distance: 1, energy: 20}"
 
 
@@ -106,19 +113,114 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
     def stopping(*arguments: object) -> object:
         made.append(1)
         if len(made) == 7:
-            import signal
-
             signal.raise_signal(signal.SIGINT)
         return real(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(write, "expose", stopping)
     result = _beamline("simulate", "scene.yaml", "--out", "scan.h5")
     assert result.exit_code == 4
+    assert "Ending after this frame; once more ends at once." in result.stderr
     assert "Stopped after 7 of 16 frames; scan.h5 is complete as far as it goes." in result.stderr
     with open_scan("scan.h5") as source:
         assert source.image_key.size == 7
         assert source.attributes["status"] == "stopped"
     assert json.loads(Path("scan.labels.json").read_text(encoding="utf-8"))["frames"] == 7
+
+
+@pytest.mark.parametrize(
+    ("ends", "code"), [(KeyboardInterrupt(), 130), (CannotExposeError("too bright"), 2), (OSError(28, "full"), 5)]
+)
+def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, ends: BaseException, code: int
+) -> None:
+    real, made = write.expose, []
+
+    def ending(*arguments: object) -> object:
+        made.append(1)
+        if len(made) == 7:
+            raise ends
+        return real(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(write, "expose", ending)
+    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5", "--json", "--set", f"effects=[{BAND}]")
+    assert result.exit_code == code
+    events = [json.loads(line)["event"] for line in result.stdout.splitlines()]
+    assert (events[-1], events.count("failed"), "done" in events) == ("failed", 1, False)
+    with open_scan("scan.h5") as source:
+        assert (source.image_key.size, source.attributes["status"]) == (6, "failed")
+    (run,) = read_labels(Path("scan.labels.json"))
+    assert (run.kind, run.first, run.last) == ("black_band", 2, 5)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there SIGTERM cannot be caught")
+def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(*arguments: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    before = sorted(path.name for path in folder.iterdir())
+    monkeypatch.setattr(module, "write_truth", asked)
+    result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
+    assert result.exit_code == 130
+    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_with_nothing_to_do_programs_are_told_too(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--json")
+    assert result.exit_code == 2
+    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
+
+
+def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    for arguments, code, words in (
+        (("--out", "scan.h5", "--frames", str(10**10)), 5, r"scan.h5 would take [0-9.]+ TB with 10000000004 frames, its"),
+        (("--truth", "t.h5", "--truth-bin", "1"), 2, r"--truth-bin 1: the truth takes 819 kB of memory .* 300 kB are"),
+    ):
+        monkeypatch.setattr(module, "free_memory", lambda: 300_000)
+        result = _beamline("simulate", "scene.yaml", *arguments)
+        assert result.exit_code == code
+        assert re.search(words, result.stderr), result.stderr
+        assert sorted(path.name for path in folder.iterdir()) == before
+    assert _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
+
+
+@pytest.mark.parametrize("shape", ["1,300", "300,1", "1,1"])
+def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> None:
+    wanted = ("--picture", "p.png", "--truth", "t.h5", "--set", f"detector.shape=[{shape}]", "--frames", "1")
+    result = _beamline("simulate", "scene.yaml", *wanted)
+    assert result.exit_code == 0, result.output
+    width, height = struct.unpack(">II", Path("p.png").read_bytes()[16:24])
+    assert 100 <= height < 3 * width
+
+
+def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
+    scan = begun(open_scene("scene.yaml"), 0, 60, 0.0)
+    # A dark, a flat, the frames asked for, and the rest evenly: views 0, 15, 30, 44, 59 are frames 4, 19, 34, 48, 63.
+    assert figure._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
+    assert figure._chosen(begun(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
+
+
+def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--out", "s.h5", "--set", "beam.sod=0.1", "--set", "beam.sdd=1")
+    assert result.exit_code == 2
+    assert "scene.yaml cannot be exposed: solid 0 (ellipsoid) reaches" in result.stderr
+    assert not Path("s.h5").exists()
+
+
+def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:
+    wanted = ("--frames", "1", "--set", "beam.energy_kev=20.5")
+    assert _beamline("simulate", "scene.yaml", "--out", "s.h5", *wanted).exit_code == 0
+    with open_scan("s.h5") as source:
+        assert source.energy_kev == 20.5
+
+
+def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
+    made = _beamline("simulate", "scene.yaml", "--out", "s.h5", "--truth", "t.h5", "--truth-bin", "4")
+    assert "voxels of 0.048 mm, for `beamline recon --bin 4`" in made.stdout
+    shape = "--truth has shape (8, 10, 10), the volume (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
+    refused = _beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
+    assert (refused.exit_code, shape in refused.stderr) == (2, True), refused.stderr
 
 
 @pytest.mark.parametrize(
@@ -130,6 +232,12 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
         (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
         (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
         (("scene.yaml", "--out", "there.h5"), 5, "there.h5 exists"),
+        (("scene.yaml", "--out", "there.h5", "--truth", "t.h5"), 5, "there.h5 exists"),
+        (("scene.yaml", "--out", "new.png"), 2, "new.png would be both the scan and the picture"),
+        (("scene.yaml", "--out", "new.h5", "--truth", "./new.h5"), 2, "new.h5 would be both the scan and the truth"),
+        (("scene.yaml", "--out", "nowhere/new.h5"), 5, "new.h5 cannot be written there. Make it first"),
+        (("scene.yaml", "--explain", "--truth-bin", "2"), 2, "--truth-bin is of --truth's voxels"),
+        (("scene.yaml", "--out", "new.h5", "--seed", str(2**64)), 2, "--seed"),
         (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),
     ],
 )
