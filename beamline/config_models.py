@@ -143,7 +143,7 @@ class Simulation(Section):
     scene: str | dict[str, Any] = "scenes/battery.yaml"
     """A scene file (relative to the configuration file or to the installed configs), or the scene itself."""
     clock: Literal["real", "virtual"] | Speed = "real"
-    seed: int = 0
+    seed: int = Field(0, ge=0, lt=2**63)
 
 
 class Config(Section):
