@@ -37,5 +37,5 @@ class EncoderError:
             raise ValueError(f"random_mdeg must be >= 0 millidegrees, got {self.random_mdeg}")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
-        error = series(pose.angle, self.harmonics).real + draws(self.name, shot).normal(0.0, self.random_mdeg)
+        error = series(pose.angle, self.harmonics).real + self.random_mdeg * draws(self.name, shot).normal()
         return pose.turned_by(np.radians(1e-3 * error))

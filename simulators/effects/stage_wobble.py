@@ -40,5 +40,5 @@ class StageWobble:
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         wave = series(pose.angle, self.harmonics)
         tilt = np.stack([wave.real, -wave.imag], axis=1)
-        tilt += draws(self.name, shot).normal(0.0, self.random_urad, 2)
+        tilt += self.random_urad * draws(self.name, shot).normal(size=2)
         return pose.tilted_by(1e-6 * tilt)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.frame import FrameKind
+from drivers.orca_quest import timing
+from drivers.protocols import CameraSettings, TriggerSource
 from simulators.exposure import expose
 from simulators.mapping import SceneError
 from simulators.scene import load_scene
@@ -77,6 +79,14 @@ def test_pixels_lie_in_the_middle_of_the_sensor_and_the_axis_where_the_scene_has
     row0, col0, rows, cols = scan.roi
     assert (rows, cols) == (48, 64)
     assert (2 * row0 + rows, 2 * col0 + cols) == (2304, 4096)
+
+
+@pytest.mark.parametrize("readout", ["standard", "ultra_quiet", "photon_number"])
+@pytest.mark.parametrize("binning", [1, 2, 4])
+def test_rows_start_as_late_as_the_camera_s(readout: str, binning: int) -> None:
+    settings = {"binning": binning, "readout": readout, "shape": [24, 32]}
+    camera = timing(CameraSettings(0.02, TriggerSource.INTERNAL, roi=(0, 0, 96, 128), readout=readout, binning=binning))
+    assert _scan(detector=settings).frame(5).shot.row_period == pytest.approx(camera.row_period, rel=1e-12)
 
 
 def test_a_converter_of_ones_own_has_its_electrons_a_count() -> None:

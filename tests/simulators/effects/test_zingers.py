@@ -69,6 +69,11 @@ def test_charge_spreads_by_the_radius_and_is_kept() -> None:
     assert np.mean(spreads) == pytest.approx(expected, abs=chance.SIGMAS * expected * np.sqrt(2 / 200 / len(spreads)))
 
 
+def test_each_keeps_its_own_charge_when_it_spreads() -> None:
+    """By next to nothing: the frame is that of zingers that do not spread."""
+    np.testing.assert_allclose(_frame(Zingers(5000.0, radius=1e-9), 0), _frame(Zingers(5000.0), 0), rtol=1e-9)
+
+
 def test_more_zingers_than_a_frame_can_hold_are_refused() -> None:
     """They would fill the memory."""
     with pytest.raises(CannotExposeError, match=r"1e\+12 a second are 1e\+10 in a frame of 0.01 s"):
