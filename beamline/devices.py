@@ -19,7 +19,7 @@ from beamline.cameras import make_camera, wait_until_cold
 from beamline.config import Config
 from beamline.config_devices import DcamOrca, NoBeamMonitor, StageOutputShutter
 from beamline.errors import ConfigError
-from beamline.simulated import clock_of, scene_of, simulated_devices
+from beamline.simulated import Simulated, clock_of, scene_of, simulated_devices
 from beamline.stages import make_stage, output_shutter, stage_limits
 from drivers import orca_quest
 from drivers.clock import Clock, SystemClock
@@ -45,17 +45,21 @@ class Bench:
 
     Attributes:
         clock: what every wait of the run goes by.
-        truth: the simulated sample's attenuation on a grid whose z is measured, as reconstructions do it, from the
-            middle of the camera's rows; None at a real instrument.
+        simulated: what the simulator knows; None at a real instrument.
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None where none is configured.
     """
 
     devices: Devices
     clock: Clock
-    truth: Callable[[Grid], Volume] | None
+    simulated: Simulated | None
     close: Callable[[], None]
     beam_monitor: BeamMonitor | None = None
+
+    @property
+    def truth(self) -> Callable[[Grid], Volume] | None:
+        """See Simulated.truth; None at a real instrument."""
+        return None if self.simulated is None else self.simulated.truth
 
     def __enter__(self) -> Self:
         return self
@@ -80,16 +84,16 @@ def connect(
     """
     with ExitStack() as opened:
         if config.simulation is None:
-            clock, truth = clock or SystemClock(), None
+            clock, simulated = clock or SystemClock(), None
             devices = _instrument(config, clock, ask or ask_operator, heed, opened)
         else:
             clock = clock or clock_of(config.simulation.clock)
-            devices, truth = simulated_devices(config, config.simulation, clock, opened)
+            devices, simulated = simulated_devices(config, config.simulation, clock, opened)
         monitor = None
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        return Bench(devices, clock, truth, opened.pop_all().close, monitor)
+        return Bench(devices, clock, simulated, opened.pop_all().close, monitor)
 
 
 @contextmanager

@@ -48,7 +48,8 @@ def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
         runs: where the file will be, for the free disk.
 
     Raises:
-        ConfigError: a plan that cannot be, every broken limit, or an unknown threshold.
+        ConfigError: a plan that cannot be, every broken limit, an unknown threshold, or a simulated scene that cannot
+            be exposed with the camera's settings.
         DeviceRefused: the camera does not take its settings.
     """
     stage, camera = bench.devices.stage, bench.devices.camera
@@ -70,6 +71,8 @@ def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
     watch = monitor.start(_context(plan, timeline, timing), config.monitor.thresholds)
     # The first call compiles, which must not happen while frames are coming.
     digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, preview_bin)
+    if bench.simulated is not None:
+        bench.simulated.rehearse()
     return Prepared(plan, timeline, settings, timing, watch, _info(config, bench, plan, timeline))
 
 
@@ -86,6 +89,11 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> Contex
 
 def _info(config: Config, bench: Bench, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
     optics, devices, monitor = config.optics, bench.devices, config.devices.beam_monitor
+    pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
+    if bench.simulated is not None and bench.simulated.cone is not None:
+        # The scene's cone, in the words of NXtomo: the pixel is that on the detector.
+        source_distance, sdd = bench.simulated.cone
+        pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     asked = {
         "scheme": plan.scheme,
         "mode": plan.mode,
@@ -99,9 +107,10 @@ def _info(config: Config, bench: Bench, plan: ScanPlan, timeline: Timeline) -> S
     return ScanInfo(
         sample=config.sample.name,
         title=config.sample.description,
-        pixel_size_mm=optics.pixel_size_um * 1e-3 * config.devices.camera.binning,
+        pixel_size_mm=pixel_size * config.devices.camera.binning,
         energy_kev=optics.energy_kev,
-        distance_mm=optics.distance_mm,
+        distance_mm=distance,
+        source_distance_mm=source_distance,
         exposure=plan.exposure,
         period=timeline.views.period,
         axis_col=optics.axis_col,

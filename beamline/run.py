@@ -26,6 +26,7 @@ from beamline.narration import UserLog
 from beamline.prepare import Prepared, prepare
 from beamline.recorder import Recorder
 from beamline.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
+from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.stop import ScanAborted, StopRequest
 from beamline.storage.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
@@ -175,9 +176,10 @@ class _Run:
     ) -> RunResult:
         recorder = self._recorder(writer)
         acquisition = self._acquisition()
+        labels = LabelLog()
         self._enter(State.ACQUIRING)
         with self._beam_log() as beam:
-            error = _failure_of(lambda: _acquire(acquisition, recorder))
+            error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
         self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
         disk = _failure_of(recorder.finish)
         error = self._graver(error, disk)
@@ -186,6 +188,9 @@ class _Run:
         # A write that does not return holds HDF5's lock: to close the file would be to wait for it.
         unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
         error = self._graver(error, unfinished)
+        if self.bench.simulated is not None and not recorder.hangs:
+            n = writer.committed
+            error = self._graver(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
         for remark in writer.remarks:
             self.emit("warning", {"message": remark})
         error = self._graver(error, _failure_of(release))
@@ -205,6 +210,14 @@ class _Run:
         if error is not None:
             raise error
         return replace(result, seconds=time.monotonic() - self.began)
+
+    def _acquire(self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog) -> None:
+        # Closing the iterator is what makes the instrument safe when the recorder fails.
+        with closing(acquisition.frames()) as frames:
+            for frame in frames:
+                if self.bench.simulated is not None:
+                    labels.add(frame.index, self.bench.simulated.labels(frame.time))
+                recorder.put(frame)
 
     def _give_up(self, unfinished: bool) -> Callable[[], bool]:
         """The live reconstruction ends early after an abort, a stop that came after the scan, or with a broken file."""
@@ -269,13 +282,6 @@ class _Run:
             "total_bytes": timeline.total_bytes,
             "remarks": timeline.remarks,
         }
-
-
-def _acquire(acquisition: Acquisition, recorder: Recorder) -> None:
-    # Closing the iterator is what makes the instrument safe when the recorder fails.
-    with closing(acquisition.frames()) as frames:
-        for frame in frames:
-            recorder.put(frame)
 
 
 def _failure_of(action: Callable[[], None]) -> BaseException | None:

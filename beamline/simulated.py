@@ -5,9 +5,9 @@ Simulators are imported where they are needed, so that an instrument loads none.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
@@ -17,22 +17,42 @@ from beamline.config_models import Simulation, Speed
 from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
 from beamline.errors import ConfigError
 from beamline.stages import make_stage, output_shutter
+from drivers import orca_quest
 from drivers.clock import Clock, SystemClock
 from drivers.protocols import Devices, Shutter
 
 if TYPE_CHECKING:
     from recon.volume import Grid, Volume
     from simulators.camera import SimulatedOrcaQuest
+    from simulators.effects.chain import Label
     from simulators.scene import Scene
     from simulators.shutter import BeamGate
     from simulators.trigger_line import TriggerLine
     from simulators.wire import Wire
 
 
+@dataclass(frozen=True)
+class Simulated:
+    """What a simulator knows and an instrument does not.
+
+    Attributes:
+        truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
+            camera's rows.
+        cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
+        labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch).
+        rehearse: makes a frame with the camera's present settings; ConfigError where the scene cannot be exposed so.
+    """
+
+    truth: Callable[[Grid], Volume]
+    cone: tuple[float, float] | None
+    labels: Callable[[float], Sequence[Label]]
+    rehearse: Callable[[], None]
+
+
 def simulated_devices(
     config: Config, simulation: Simulation, clock: Clock, opened: ExitStack
-) -> tuple[Devices, Callable[[Grid], Volume]]:
-    """Every device of the configuration, connected, and the truth of the sample (see `devices.Bench`).
+) -> tuple[Devices, Simulated]:
+    """Every device of the configuration, connected, and what is known of them.
 
     Args:
         opened: takes what closes them.
@@ -69,7 +89,8 @@ def simulated_devices(
     pitch = config.optics.pixel_size_um * 1e-3
     camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
     opened.callback(camera.close)
-    return Devices(stage, camera, shutter, sample), _truth(scene, camera)
+    known = Simulated(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
+    return Devices(stage, camera, shutter, sample), known
 
 
 def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, Callable[[int], bool]]:
@@ -128,9 +149,43 @@ def scene_of(config: Config) -> Scene:
     # Paths in a scene that stands in the configuration itself are full ones by now.
     folder = config_folder() if isinstance(said, dict) else (config_folder() / said).parent
     try:
-        return load_scene(scene_mapping(config), volumes_beside(folder))
+        scene = load_scene(scene_mapping(config), volumes_beside(folder))
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
+    if _cone(scene) is not None:
+        _refuse_untold(config, scene)
+    return scene
+
+
+def _refuse_untold(config: Config, scene: Scene) -> None:
+    """Raises ConfigError where the file of a cone's scan could not be reconstructed: what it has no words for."""
+    camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
+    row0, col0, rows, _ = camera.roi or (0, 0, height, width)
+    if 2 * row0 + rows != height:
+        raise ConfigError(
+            f"devices.camera.roi: the scene is a cone beam, whose central ray meets the middle of the sensor's rows; "
+            f"{rows} of them begin at {(height - rows) // 2} then, not at {row0}. Nothing was started."
+        )
+    if config.optics.axis_col is None:
+        axis_col = ((width - camera.binning) / 2 + scene.axis_offset_px - col0) / camera.binning
+        raise ConfigError(
+            "optics.axis_col: the scene is a cone beam, whose rotation axis is not searched; set its column, here "
+            f"{axis_col:g}. Nothing was started."
+        )
+
+
+def _cone(scene: Scene) -> tuple[float, float] | None:
+    beam = scene.beam
+    return None if beam.sod is None or beam.sdd is None else (beam.sod, beam.sdd)
+
+
+def _rehearse(camera: SimulatedOrcaQuest) -> None:
+    from simulators.effects.shot import CannotExposeError
+
+    try:
+        camera.rehearse()
+    except CannotExposeError as error:
+        raise ConfigError(f"simulation.scene cannot be exposed: {error}. Nothing was started.") from error
 
 
 def clock_of(kind: str | Speed) -> Clock:

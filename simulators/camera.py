@@ -19,6 +19,7 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.detector import Detector
+from simulators.effects.chain import Label
 from simulators.effects.shot import CannotExposeError, Shot
 from simulators.exposure import expose
 from simulators.scene import Scene
@@ -93,6 +94,7 @@ class SimulatedOrcaQuest:
         self._armed_for = self._framestamp = 0  # frames asked for (0: not armed), next framestamp
         self._seen, self._accepted = 0.0, -np.inf  # time of the last trigger looked at, and of the last accepted
         self._gone = ""
+        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame, where there are any
         self._lock = threading.Lock()
 
     @property
@@ -114,6 +116,19 @@ class SimulatedOrcaQuest:
             axis_row=(axis_row - row0 - middle) / binning,
             sod=self._scene.beam.source_distance,
         )
+
+    def labels_at(self, time: float) -> tuple[Label, ...]:
+        """The anomalies in the frame, taken already, that was exposed at `time` (s since the Unix epoch)."""
+        return self._labels.get(time, ())
+
+    def rehearse(self) -> None:
+        """Make a frame of the sample with the present settings, which nobody gets and no number counts.
+
+        Raises:
+            CannotExposeError: the scene cannot be exposed so; the message says what would help.
+        """
+        now = self._clock.now()
+        expose(self._scene, self._shot(_Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Apply and read back; the exposure is rounded to 10 ns. Raises DeviceRefused: nothing has changed."""
@@ -279,7 +294,18 @@ class SimulatedOrcaQuest:
             )
 
     def _render(self, frame: _Exposed) -> CameraFrame:
-        shot = Shot(
+        shot = self._shot(frame)
+        try:
+            counts = expose(self._scene, shot)
+        except CannotExposeError as error:
+            advice = "Change the scene, or the settings that it does not go with"
+            raise DeviceRefused(self.name, f"cannot show the scene: {error}", advice=advice) from error
+        if labels := self._scene.chain.labels(shot):
+            self._labels[frame.time] = labels
+        return CameraFrame(counts, frame.framestamp, frame.time)
+
+    def _shot(self, frame: _Exposed) -> Shot:
+        return Shot(
             detector=self.detector,
             exposure=self._settings.exposure,
             time=frame.time,
@@ -298,9 +324,3 @@ class SimulatedOrcaQuest:
             frame=frame.number,
             view=frame.view,
         )
-        try:
-            counts = expose(self._scene, shot)
-        except CannotExposeError as error:
-            advice = "Change the scene, or the settings that it does not go with"
-            raise DeviceRefused(self.name, f"cannot show the scene: {error}", advice=advice) from error
-        return CameraFrame(counts, frame.framestamp, frame.time)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from beamline.storage.recon_file import named_on_failure, whole_file
-from simulators.effects.chain import Label
+
+if TYPE_CHECKING:
+    from simulators.effects.chain import Label
 
 Region = tuple[int, int, int, int]
 
@@ -42,11 +45,11 @@ class LabelLog:
     def add(self, frame: int, labels: Sequence[Label]) -> None:
         self._frames.extend((frame, label) for label in labels)
 
-    def runs(self) -> tuple[Run, ...]:
-        """In the order in which they begin."""
+    def runs(self, n_frames: float = math.inf) -> tuple[Run, ...]:
+        """In the order in which they begin; of the first `n_frames`, where not all came into the file."""
         open_runs: dict[tuple[str, int], Run] = {}
         done: list[Run] = []
-        for frame, label in self._frames:
+        for frame, label in (entry for entry in self._frames if entry[0] < n_frames):
             body = label.kind, label.which
             run = open_runs.get(body)
             if run is not None and run.last == frame - 1:

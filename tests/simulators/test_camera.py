@@ -234,6 +234,8 @@ def test_noise_belongs_to_seed_and_frame_number() -> None:
     second.fire(3, period=0.3)
     for mine, again in zip(frames, second.take(3), strict=True):
         np.testing.assert_array_equal(mine, again.counts)
+    second.camera.rehearse()  # which is no frame: the next is as if it had not been
+    np.testing.assert_array_equal(second.one().counts, first.one().counts)
     other_seed = SimulatedOrcaQuest(first.scene, first.line, first.clock, 6, first.shutter, first.sample)
     other_seed.configure(replace(SETTINGS, trigger=TriggerSource.INTERNAL))
     other_seed.arm(1)

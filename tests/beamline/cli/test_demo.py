@@ -95,7 +95,7 @@ def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPa
     def without_truth(config: Config) -> object:
         from dataclasses import replace
 
-        return replace(connect(config), truth=None)
+        return replace(connect(config), simulated=None)
 
     monkeypatch.setattr(demo, "connect", without_truth)
     with pytest.raises(ConfigError, match="simulated devices"):
