@@ -174,7 +174,7 @@ def test_with_nothing_to_do_programs_are_told_too(folder: Path) -> None:
 def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = sorted(path.name for path in folder.iterdir())
     for arguments, code, words in (
-        (("--out", "scan.h5", "--frames", str(10**10)), 5, r"scan.h5 would take [0-9.]+ TB with 10000000004 frames, its"),
+        (("--out", "scan.h5", "--frames", str(10**10)), 5, r"scan.h5 would take [0-9.]+ TB with 10000000004 frames"),
         (("--truth", "t.h5", "--truth-bin", "1"), 2, r"--truth-bin 1: the truth takes 819 kB of memory .* 300 kB are"),
     ):
         monkeypatch.setattr(module, "free_memory", lambda: 300_000)
