@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,11 +72,22 @@ def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
         ValueError: the binning does not fit into the frame.
     """
     grid = _grid(detector, binning)
-    return Truth(grid, sample.attenuation(grid), sample.labels(grid), sample.names)
+    z, y, x = grid.centre
+    there = replace(grid, centre=(z + _above(detector, binning), y, x))
+    return Truth(grid, sample.attenuation(there), sample.labels(there), sample.names)
 
 
 def _grid(detector: Detector, binning: int) -> Grid:
     return Grid.matching(geometry_of(detector, np.zeros(1)).binned(binning))
+
+
+def _above(detector: Detector, binning: int) -> float:
+    """mm by which a reconstruction's z = 0 lies above the scene's: a parallel beam's is the middle of the rows that
+    make whole bins, see Geometry.binned."""
+    if np.isfinite(detector.sod):
+        return 0.0
+    rows = detector.shape[0] // binning * binning
+    return ((rows - 1) / 2 - detector.axis_row) * detector.pitch
 
 
 def write_truth(path: Path, truth: Truth) -> None:
