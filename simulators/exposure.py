@@ -14,7 +14,7 @@ from simulators.effects.chain import Watch
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
 from simulators.pose import Pose
-from simulators.sample import Counted
+from simulators.samples.sample import Counted
 from simulators.scene import Scene
 from simulators.sensor import digitise, largest_count
 

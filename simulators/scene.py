@@ -4,7 +4,7 @@ Only what a scene names is imported. Keys are the field names of the dataclasses
 
     phantom: {kind: battery, field_of_view: [0.9, 0.9], n_particles: 150, seed: 7}
     # or:    {kind: solids, solids: [{kind: cylinder, radius: 0.3, height: 0.6, attenuation: 1.5}, ...]}
-    # or:    kind cathode, foam or resolution (simulators.cathode, ...), or volume, from a file (simulators.voxel_scene)
+    # or:    kind cathode, foam or resolution (simulators.samples.cathode, ...), or volume, from a file (voxel_scene)
     beam: {photons_per_s: 1.0e5}        # detected a second and sensor pixel (quantum efficiency included)
     axis_offset_px: 3.4                 # rotation axis right of the sensor's middle, in sensor pixels
     effects: [photon_noise, {kind: zingers, rate: 5.0}]
@@ -18,14 +18,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from simulators.beam import Beam
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
+from simulators.light.beam import Beam
 from simulators.mapping import SceneError, build, items, keys, named, number
-from simulators.phantoms import build_sample
-from simulators.sample import Sample
+from simulators.samples.phantoms import build_sample
+from simulators.samples.sample import Sample
+from simulators.samples.stored import ReadVolume
 from simulators.shooting import DetectorSettings, ScanSettings
-from simulators.stored import ReadVolume
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,13 +15,13 @@ from beamline.errors import ConfigError
 from beamline.simulate.scene_file import open_scene, volumes_beside
 from beamline.xafs.contrast import Regions
 from beamline.xafs.series import Series
-from simulators.beam import Beam
 from simulators.exposure import expose
+from simulators.light.beam import Beam
+from simulators.light.parts import Constituent, Mixture
+from simulators.light.spectrum import Attenuation, light
 from simulators.mapping import SceneError
-from simulators.parts import Constituent, Mixture
 from simulators.scene import load_scene
 from simulators.shots import Scan
-from simulators.spectrum import Attenuation, light
 
 Reals = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from beamline.storage.volume_file import read_volume
 from simulators.effects.shot import CannotExposeError
 from simulators.exposure import expose
 from simulators.mapping import SceneError
+from simulators.samples.stored import ReadVolume, Stored
 from simulators.scene import Scene, load_scene
 from simulators.shots import Scan
-from simulators.stored import ReadVolume, Stored
 
 __all__ = ["Scan", "SceneFile", "begun", "open_scene", "shipped_scenes", "shown", "volumes_beside"]
 

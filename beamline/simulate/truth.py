@@ -14,7 +14,7 @@ from beamline.storage.recon_file import named_on_failure, whole_file
 from recon.geometry import Geometry
 from recon.volume import Grid
 from simulators.detector import Detector
-from simulators.sample import Sample
+from simulators.samples.sample import Sample
 
 LARGEST = 256
 """Voxels across, unless asked otherwise: 256³ take 84 MB with the labels."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
-from simulators.noise import poisson
+from simulators.pixels.noise import poisson
 from simulators.sensor import DARK_CURRENT
 
 FEW = 1.0

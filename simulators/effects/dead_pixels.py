@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
-from simulators.pattern import places
+from simulators.pixels.pattern import places
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
-from simulators.pattern import binned, normals
+from simulators.pixels.pattern import binned, normals
 from simulators.sensor import OFFSET
 
 

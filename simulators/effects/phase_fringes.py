@@ -11,11 +11,11 @@ from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
 
-from simulators.bands import share_rows
-from simulators.broad_blur import add_enlarged
 from simulators.detector import Detector
 from simulators.effects.domain import Domain
 from simulators.effects.shot import CannotExposeError, Image, Shot
+from simulators.pixels.bands import share_rows
+from simulators.pixels.broad_blur import add_enlarged
 
 HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
-from simulators.noise import poisson
+from simulators.pixels.noise import poisson
 
 
 @dataclass(frozen=True)

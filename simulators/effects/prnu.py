@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
-from simulators.pattern import binned, normals
+from simulators.pixels.pattern import binned, normals
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, draws
-from simulators.noise import add_normal
-from simulators.pattern import binned, normals
+from simulators.pixels.noise import add_normal
+from simulators.pixels.pattern import binned, normals
 from simulators.sensor import READ_NOISE
 
 

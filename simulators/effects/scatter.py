@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.broad_blur import add_enlarged, broad_blur, gaussian
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
+from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
 
 @dataclass(frozen=True)

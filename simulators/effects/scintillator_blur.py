@@ -12,10 +12,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from simulators.bands import share_rows
-from simulators.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
 from simulators.effects.domain import Domain
 from simulators.effects.shot import CannotExposeError, Image, Shot
+from simulators.pixels.bands import share_rows
+from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
 
 TAILS = MappingProxyType({"exponential": exponential, "lorentzian": lorentzian})
 NEGLIGIBLE = 1e-9

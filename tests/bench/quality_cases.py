@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from recon.geometry import Geometry
 from recon.operators import Projector
 from recon.volume import Grid
-from simulators.battery import battery
 from simulators.detector import Detector
-from simulators.phantom import Phantom
+from simulators.samples.battery import battery
+from simulators.samples.phantom import Phantom
 
 F32 = NDArray[np.float32]
 

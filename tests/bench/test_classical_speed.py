@@ -19,9 +19,9 @@ from recon.iterative import Method, default_settings, solve
 from recon.metrics import psnr
 from recon.operators import Projector
 from recon.volume import Grid
-from simulators.battery import battery
 from simulators.detector import Detector
-from simulators.phantom import Phantom
+from simulators.samples.battery import battery
+from simulators.samples.phantom import Phantom
 
 F32 = NDArray[np.float32]
 

@@ -25,9 +25,9 @@ from recon.quality import CURVES, Curve
 from recon.views import parse_views
 from recon.volume import Grid
 from recon.warm_up import warm_up
-from simulators.battery import battery
 from simulators.detector import Detector
-from simulators.phantom import Phantom
+from simulators.samples.battery import battery
+from simulators.samples.phantom import Phantom
 
 F32 = NDArray[np.float32]
 STEPS = (30, 60, 125, 250, 500, 1000)

@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 
 from recon.volume import Grid
-from simulators.battery import battery
-from simulators.beam import Beam
 from simulators.detector import Detector
 from simulators.effects.chain import Chain
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
 from simulators.exposure import expose
-from simulators.phantom import Phantom
+from simulators.light.beam import Beam
 from simulators.pose import Pose
-from simulators.sample import Sample
+from simulators.samples.battery import battery
+from simulators.samples.phantom import Phantom
+from simulators.samples.sample import Sample
+from simulators.samples.solids import Cylinder, Ellipsoid, Octahedron, Plate, Solid, TruncatedOctahedron, Tube
 from simulators.scene import Scene
-from simulators.solids import Cylinder, Ellipsoid, Octahedron, Plate, Solid, TruncatedOctahedron, Tube
 from tests.simulators import shots
 
 SIDE = 2048

@@ -13,8 +13,8 @@ from recon.kernels.voxels_reference import system_matrix
 from recon.operators import Projector, data_residual, project
 from recon.volume import Grid, Volume
 from simulators.detector import Detector
-from simulators.phantom import Phantom
-from simulators.solids import Ellipsoid
+from simulators.samples.phantom import Phantom
+from simulators.samples.solids import Ellipsoid
 
 
 def _gaussian_case(

@@ -17,8 +17,8 @@ from recon.metrics import psnr
 from recon.operators import Projector
 from recon.splat import RayModel, project, voxelize
 from simulators.detector import Detector
-from simulators.phantom import Phantom
-from simulators.solids import Cylinder, Ellipsoid
+from simulators.samples.phantom import Phantom
+from simulators.samples.solids import Cylinder, Ellipsoid
 
 SHAPE, PITCH = (20, 40), 0.1
 ANGLES = np.linspace(0, np.pi, 24, endpoint=False)

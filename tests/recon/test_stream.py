@@ -14,8 +14,8 @@ from recon.initialise import default_count
 from recon.metrics import psnr
 from recon.stream import StreamingFit
 from simulators.detector import Detector
-from simulators.phantom import Phantom
-from simulators.solids import Cylinder, Ellipsoid
+from simulators.samples.phantom import Phantom
+from simulators.samples.solids import Cylinder, Ellipsoid
 
 SHAPE, PITCH = (24, 36), 0.1
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)

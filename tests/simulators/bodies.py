@@ -12,9 +12,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from simulators.detector import Detector
-from simulators.packing import rotation
 from simulators.pose import Pose
-from simulators.solids import (
+from simulators.samples.packing import rotation
+from simulators.samples.solids import (
     Box,
     Cylinder,
     Ellipsoid,

@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators.battery import battery
-from simulators.beam import Beam
 from simulators.detector import Detector
 from simulators.effects.chain import Chain
 from simulators.exposure import expose
-from simulators.phantom import Phantom
+from simulators.light.beam import Beam
 from simulators.pose import Pose
-from simulators.sample import Counted, Sample
+from simulators.samples.battery import battery
+from simulators.samples.phantom import Phantom
+from simulators.samples.sample import Counted, Sample
+from simulators.samples.solids import Box, Cylinder, Ellipsoid, Solid
 from simulators.scene import Scene
-from simulators.solids import Box, Cylinder, Ellipsoid, Solid
 from tests.simulators import shots
 from tests.simulators.bodies import SOLIDS
 

@@ -15,12 +15,12 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from recon.volume import Grid
-from simulators.battery import battery
 from simulators.detector import Detector
-from simulators.packing import pack
-from simulators.phantom import Phantom
 from simulators.pose import Pose
-from simulators.solids import Box, Cylinder, Polyhedron, Solid, Tube
+from simulators.samples.battery import battery
+from simulators.samples.packing import pack
+from simulators.samples.phantom import Phantom
+from simulators.samples.solids import Box, Cylinder, Polyhedron, Solid, Tube
 from tests.simulators.bodies import SOLIDS, rays
 
 ANGLES = st.floats(-7.0, 7.0)

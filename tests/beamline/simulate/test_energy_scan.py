@@ -14,7 +14,7 @@ from beamline.simulate.energy_scan import open_energy_scan
 from beamline.xafs.edge import find_edge
 from beamline.xafs.series import take
 from drivers.clock import SystemClock
-from simulators.palette import palette
+from simulators.light.palette import palette
 
 SCENE: dict[str, Any] = {
     "phantom": {
@@ -76,7 +76,7 @@ def test_regions_are_the_material_and_what_is_next_to_it(tmp_path: Path) -> None
 
 
 def test_a_series_of_charges_moves_the_edge_as_the_radiographs_show_it(tmp_path: Path) -> None:
-    """By 2 eV from the discharged to the charged state, as simulators.edge has it."""
+    """By 2 eV from the discharged to the charged state, as simulators.light.edge has it."""
     energies = np.arange(8.320, 8.375, 0.001)
     found = []
     for charge in (0.0, 0.5, 1.0):

@@ -1,0 +1,111 @@
+"""Broad blur: a wide, round blur worked out on a smaller image, since what is wide has no fine detail.
+
+Edges are mirrors, so that light is neither lost nor made: the sum of the image is kept to rounding. A blur is given by
+its transfer as a function of (ω width)², ω the angular frequency; in its place stands the discrete Laplacian's symbol,
+(2 - 2 cos ω_x) + (2 - 2 cos ω_y). Each transfer of this module is a mixture of Gaussians, so that its kernel is then
+a mixture of discrete Gaussians (Lindeberg 1990), which are nowhere negative at any width: nor are the photons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numba import config, njit
+from numpy.typing import NDArray
+from scipy import fft
+
+from simulators.pixels.bands import share_rows
+
+Image = NDArray[np.float64]
+Transfer = Callable[[Image], Image]
+COARSE = 4
+"""Pixels of the smaller image in the width of a blur, at least; more are finer and slower."""
+FAR = 1e6
+"""Frames in the width of a blur, at most: the light is even then."""
+
+
+def gaussian(s: Image) -> Image:
+    """Kernel exp(-r²/2w²) / 2πw²."""
+    return np.exp(-0.5 * s)
+
+
+def exponential(s: Image) -> Image:
+    """Kernel exp(-r/w) / 2πw²."""
+    return (1 + s) ** -1.5
+
+
+def lorentzian(s: Image) -> Image:
+    """Kernel w / 2π (r² + w²)^1.5, the Lorentzian of two dimensions; its line spread is w / π (x² + w²)."""
+    return np.exp(-np.sqrt(s))
+
+
+def broad_blur(image: Image, width: float, transfer: Transfer) -> Image:
+    """The blurred image, shrunk by the largest factor that divides it and leaves COARSE pixels in the width.
+
+    Args:
+        image: float64 [row, col], >= 0.
+        width: pixels.
+
+    Returns:
+        float64 [rows / factor, cols / factor], means over factor x factor pixels; see add_enlarged.
+    """
+    rows, cols = image.shape
+    shared = math.gcd(rows, cols)
+    width = min(width, FAR * max(rows, cols))
+    factor = max((f for f in range(1, min(int(width / COARSE), shared) + 1) if shared % f == 0), default=1)
+    small = np.empty((rows // factor, cols // factor))
+    share_rows(lambda first, end: _shrink(first, end, image, small), small.shape)
+    laplacian = _symbol(small.shape[0])[:, None] + _symbol(small.shape[1])
+    threads = config.NUMBA_NUM_THREADS
+    spectrum = fft.dctn(small, overwrite_x=True, workers=threads)
+    spectrum *= transfer(laplacian * (width / factor) ** 2)
+    blurred = fft.idctn(spectrum, overwrite_x=True, workers=threads)
+    return np.maximum(blurred, 0.0, out=blurred)  # rounding alone: the kernel is nowhere negative
+
+
+def _symbol(n: int) -> NDArray[np.float64]:
+    return 2 - 2 * np.cos(np.pi * np.arange(n) / n)
+
+
+@njit(cache=True, nogil=True)
+def _shrink(begin: int, end: int, image: Image, small: Image) -> None:
+    """Means over the blocks of `image` that rows begin ... end of `small` have pixels for."""
+    factor = image.shape[0] // small.shape[0]
+    for j in range(begin, end):
+        line = np.zeros(image.shape[1])
+        for k in range(j * factor, (j + 1) * factor):
+            for i in range(line.size):
+                line[i] += image[k, i]
+        for i in range(small.shape[1]):
+            small[j, i] = line[i * factor : (i + 1) * factor].sum() / factor**2
+
+
+def add_enlarged(image: Image, small: Image, share: float) -> None:
+    """image += share x small, drawn straight from centre to centre of its pixels and level at the edges.
+
+    The sum grows by share x sum of small x pixels in one of its blocks, to rounding: straight lines keep the mean.
+    """
+    share_rows(lambda first, end: _add_enlarged(first, end, image, small, share), image.shape)
+
+
+@njit(cache=True, nogil=True)
+def _add_enlarged(begin: int, end: int, image: Image, small: Image, share: float) -> None:
+    """The rows begin ... end of it."""
+    factor = image.shape[0] // small.shape[0]
+    rows, cols = small.shape
+    for j in range(begin, end):
+        y = (j + 0.5) / factor - 0.5
+        first = math.floor(y)
+        above, below = share * (first + 1 - y), share * (y - first)
+        upper, lower = small[max(first, 0)], small[min(first + 1, rows - 1)]
+        line = np.empty(cols + 2)
+        line[1:-1] = above * upper + below * lower
+        line[0], line[-1] = line[1], line[-2]
+        for k in range(factor):
+            x = (k + 0.5) / factor + 0.5
+            left = int(x)
+            part = x - left
+            for i in range(cols):
+                image[j, i * factor + k] += (1 - part) * line[i + left] + part * line[i + left + 1]

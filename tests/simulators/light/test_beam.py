@@ -1,0 +1,62 @@
+"""Beam: what a scene may say of its light, and what contradicts itself."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from simulators.light.beam import Beam, Tube
+from simulators.mapping import SceneError, build
+
+
+def test_a_scene_can_say_every_light() -> None:
+    said = {"photons_per_s": 1e5, "energy_kev": 8.3485, "bandwidth": 1e-4, "harmonics": {3: 0.01}}
+    beam = build(Beam, "beam", said)
+    assert (beam.energy_kev, beam.bandwidth, dict(beam.harmonics or {})) == (8.3485, 1e-4, {3: 0.01})
+    assert dict(build(Beam, "beam", said | {"harmonics": {"3": 0.01}}).harmonics or {}) == {3: 0.01}  # as JSON says it
+    table = build(Beam, "beam", {"photons_per_s": 1, "spectrum": [[20, 1], [30, 2]]})
+    assert table.spectrum == ((20.0, 1.0), (30.0, 2.0))
+    tube = build(Beam, "beam", {"photons_per_s": 1, "tube": {"kv": 60, "filters": {"Al": 1.0}}}).tube
+    assert tube is not None and (tube.kv, dict(tube.filters or {})) == (60.0, {"Al": 1.0})
+    assert [build(Beam, "beam", {"photons_per_s": 1} | more).has_energy for more in ({}, {"energy_kev": 8})] == [
+        False, True,
+    ]  # fmt: skip
+
+
+def test_the_source_is_far_unless_it_is_said() -> None:
+    assert Beam(1.0).source_distance == math.inf
+    assert Beam(1.0, 20.0, 100.0).source_distance == 20.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"photons_per_s": -1}, "photons_per_s must be >= 0, got -1.0"),
+        ({"sod": 5}, "a cone needs both sod and sdd"),
+        ({"sod": 5, "sdd": 4}, "got 5.0 and 4.0 mm"),
+        ({"energy_kev": 8, "tube": {"kv": 60}}, "energy_kev and tube are different lights"),
+        ({"bandwidth": 0.01}, "bandwidth belongs to an energy_kev, which is missing"),
+        ({"harmonics": {3: 0.1}, "spectrum": [[8, 1]]}, "harmonics belongs to an energy_kev"),
+        ({"energy_kev": 0}, "energy_kev must be positive, got 0.0"),
+        ({"energy_kev": 8, "bandwidth": 0.5}, "above 0 and up to 0.2, got 0.5"),
+        ({"energy_kev": 8, "harmonics": {1: 0.1}}, "multiples >= 2"),
+        ({"energy_kev": 8, "harmonics": {2: 0.5, 3: 0.5}}, "below 1 in sum"),
+        ({"energy_kev": 8, "harmonics": [3, 0.1]}, r"beam.harmonics must be a mapping, got \[3, 0.1\]"),
+        ({"energy_kev": 8, "harmonics": {"third": 0.1}}, "beam.harmonics: key must be a whole number, got 'third'"),
+        ({"spectrum": [[20, -1]]}, "keV > 0, weight >= 0"),
+        ({"spectrum": []}, "not all 0"),
+        ({"spectrum": [[20]]}, r"beam.spectrum\[0\] must be a list of 2 numbers"),
+        ({"tube": {"kv": 2}}, "beam.tube: kv must lie in 5 ... 800, got 2.0"),
+        ({"tube": {"kv": 60, "filters": {"Al": -1}}}, "filters are mm >= 0 of a material"),
+        ({"tube": {"volts": 60}}, "beam.tube: key 'volts' is unknown; legal: kv, filters"),
+    ],
+)
+def test_a_light_that_cannot_be_is_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        build(Beam, "beam", {"photons_per_s": 1.0} | wrong)
+
+
+def test_a_tube_without_filters() -> None:
+    assert Tube(40.0).filters is None
