@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import kstest, truncnorm
-from tests.simulators.samples.test_arrangement import corners, overlapping, spread
 
 from recon.volume import Grid
 from simulators.light.beam import Beam
@@ -19,6 +18,7 @@ from simulators.samples.cathode import GREY, Cathode
 from simulators.samples.grains import HABITS, Sizes, core, crack, grain, grains, inner_radius
 from simulators.samples.phantoms import build_sample
 from simulators.samples.solids import Ellipsoid
+from tests.simulators.samples.test_arrangement import corners, overlapping, spread
 
 SMALL = {"diameter": 0.2, "height": 0.15, "wall_um": 10, "size_um": 25, "fill": 0.3}
 FALSE_ALARM = 1e-6
