@@ -19,6 +19,8 @@ Quaternion = tuple[float, float, float, float]
 Face = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
+LEAST, MOST = 1e-9, 1e9
+"""mm: with lengths far beyond, squares and quotients in the kernels are no numbers, and no place in a frame."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Tube:
     centre: Vector = ORIGIN
 
     def __post_init__(self) -> None:
-        _check(self, inner_radius=self.inner_radius, height=self.height)
+        _check(self, inner_radius=self.inner_radius, outer_radius=self.outer_radius, height=self.height)
         if not math.inf > self.outer_radius > self.inner_radius:
             raise ValueError(
                 f"tube: outer_radius must exceed the inner {self.inner_radius} mm, got {self.outer_radius}"
@@ -212,12 +214,18 @@ def kind_of(solid: Solid) -> str:
 
 
 def _check(solid: Solid, **lengths: float | Vector) -> None:
-    """Raises ValueError for a length that is not positive, a non-finite number or a zero quaternion."""
+    """Raises ValueError for a length that is not positive or not of this world, a non-finite number or a zero
+    quaternion."""
     name = kind_of(solid)
     for key, value in lengths.items():
-        if not all(math.isfinite(v) and v > 0 for v in (value if isinstance(value, tuple) else (value,))):
+        each = value if isinstance(value, tuple) else (value,)
+        if not all(math.isfinite(v) and v > 0 for v in each):
             raise ValueError(f"{name}: {key} must be positive in mm, got {value}")
+        if not all(LEAST <= v <= MOST for v in each):
+            raise ValueError(f"{name}: {key} must lie in {LEAST:g} ... {MOST:g} mm, got {value}")
     if not all(math.isfinite(v) for v in (solid.attenuation, *solid.centre)):
         raise ValueError(f"{name}: attenuation {solid.attenuation} and centre {solid.centre} must be finite")
+    if max(map(abs, solid.centre)) > MOST:
+        raise ValueError(f"{name}: centre must lie within {MOST:g} mm, got {solid.centre}")
     if not isinstance(solid, Cylinder | Tube) and not 0 < math.hypot(*solid.quaternion) < math.inf:
         raise ValueError(f"{name}: quaternion must be four numbers (w, x, y, z), finite and not all zero")
