@@ -7,6 +7,9 @@ from typing import Literal
 
 from drivers.orca_quest import BINNINGS, SENSOR_SHAPE
 
+MOST_FRAMES = 1_000_000  # as in a configuration
+LONGEST = 1e6  # s
+
 
 @dataclass(frozen=True)
 class DetectorSettings:
@@ -29,6 +32,11 @@ class DetectorSettings:
     def __post_init__(self) -> None:
         if not (min(self.shape) >= 1 and self.pixel_size_um > 0 and self.exposure_s > 0):
             raise ValueError(f"shape, pixel_size_um and exposure_s must be positive, got {self}")
+        if not (1e-3 <= self.pixel_size_um <= 1e6 and self.exposure_s <= LONGEST):
+            raise ValueError(
+                f"pixel_size_um must lie in 0.001 ... 1e6 and exposure_s be {LONGEST:g} at most, got "
+                f"{self.pixel_size_um} and {self.exposure_s}"
+            )
         if self.binning not in BINNINGS:
             raise ValueError(f"binning must be 1, 2 or 4, got {self.binning}")
         if any(n * self.binning > whole for n, whole in zip(self.shape, SENSOR_SHAPE, strict=True)):
@@ -60,3 +68,12 @@ class ScanSettings:
     def __post_init__(self) -> None:
         if not (self.views >= 1 and self.period_s > 0 and self.range_deg != 0 and min(self.darks, self.flats) >= 0):
             raise ValueError(f"views and period_s must be positive, range_deg not 0, darks and flats >= 0, got {self}")
+        if (
+            max(self.views, self.darks, self.flats) > MOST_FRAMES
+            or abs(self.range_deg) > 1e6
+            or self.period_s > LONGEST
+        ):
+            raise ValueError(
+                f"views, darks and flats must be {MOST_FRAMES} at most each, range_deg 1e6 and period_s {LONGEST:g}, "
+                f"got {self}"
+            )

@@ -20,7 +20,7 @@ from beamline.plan_checks import size
 from beamline.simulate.explained import explained, table
 from beamline.simulate.figure import sheet
 from beamline.simulate.labels import labels_path
-from beamline.simulate.scene_file import Scan, SceneFile, begun, open_scene, shipped_scenes, shown
+from beamline.simulate.scene_file import MOST_FRAMES, Scan, SceneFile, begun, open_scene, shipped_scenes, shown
 from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
 from beamline.simulate.write import Simulated, refuse, write_scan
 from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
@@ -28,6 +28,7 @@ from beamline.terminal import Terminal
 from drivers.clock import Clock, SystemClock
 
 _OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."
+_VIEWS = click.IntRange(1, MOST_FRAMES)
 _SEED = click.IntRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -36,7 +37,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.argument("scene", metavar="SCENE")
 @click.option("--explain", "explains", is_flag=True, help="What a frame computes, in order, and what each step costs.")
 @click.option(
-    "--frames", "views", type=click.IntRange(min=1), help="Views over the scene's range; its own number unless given."
+    "--frames", "views", type=_VIEWS, metavar="N", help="Views over the scene's range; its own number unless given."
 )
 @click.option("--out", type=_FILE, help="Write the scan to this HDF5 file, and its labels beside it.")
 @click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")

@@ -18,9 +18,10 @@ from simulators.exposure import expose
 from simulators.mapping import SceneError
 from simulators.samples.stored import ReadVolume, Stored
 from simulators.scene import Scene, load_scene
+from simulators.shooting import MOST_FRAMES
 from simulators.shots import Scan
 
-__all__ = ["Scan", "SceneFile", "begun", "open_scene", "shipped_scenes", "shown", "volumes_beside"]
+__all__ = ["MOST_FRAMES", "Scan", "SceneFile", "begun", "open_scene", "shipped_scenes", "shown", "volumes_beside"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,6 +90,8 @@ class Floaters:
                 f"count must be >= 1, depth >= {4 * SEEN}, speed positive in mm a view and heights [least, most], got "
                 f"{self.count}, {self.depth}, {self.speed} and {list(self.heights)}"
             )
+        if self.seed < 0:
+            raise ValueError(f"seed must be >= 0, got {self.seed}")
         if self.motion == "loose" and self.views is None:
             raise ValueError("loose floaters need views, [first, one after the last], between which they pass the axis")
 

@@ -107,6 +107,10 @@ def test_what_cannot_be_is_refused() -> None:
         ({"detector": {"exposure_s": 0}}, "must be positive"),
         ({"detector": {"readout": "fast"}}, "must be one of standard, ultra_quiet, photon_number, got 'fast'"),
         ({"scan": {"views": 0}}, "views and period_s must be positive"),
+        ({"scan": {"flats": 10**7}}, "views, darks and flats must be 1000000 at most"),
+        ({"scan": {"range_deg": -1e9}}, "range_deg 1e6"),
+        ({"scan": {"period_s": 1e308}}, "period_s 1e\\+06"),
+        ({"detector": {"pixel_size_um": 1e-308}}, "pixel_size_um must lie in 0.001"),
         ({"scan": {"fly": 1}}, "scene.scan.fly must be true or false, got 1"),
     ):
         with pytest.raises(SceneError, match=words):

@@ -171,6 +171,7 @@ def test_it_is_only_where_the_sample_is_and_in_its_views() -> None:
         ({"depth": 0.0}, "depth >= 0.004"),
         ({"heights": (0.2, -0.2)}, "heights"),
         ({"views": (2, 2)}, "views must be"),
+        ({"seed": -1}, "seed must be >= 0, got -1"),
         ({"motion": "loose"}, "loose floaters need views"),
     ],
 )
