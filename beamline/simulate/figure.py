@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from beamline.figures import grey_window
 from drivers.frame import FrameKind
+from simulators.effects.chain import Anomaly
 from simulators.exposure import expose
 from simulators.shots import Scan
 
@@ -37,6 +38,7 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
     figure = Figure(figsize=(10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), dpi=110)
     FigureCanvasAgg(figure)
+    anomalies = [effect.name for effect in scan.scene.chain.effects if isinstance(effect, Anomaly)]
     for place, ((number, planned), frame) in enumerate(zip(made, small, strict=True), start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)
         axes.imshow(frame, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
@@ -50,7 +52,7 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
         for label in labels:
             row = kinds.index(label.kind)
             top, bottom, left, right = (edge / step for edge in label.region)
-            colour = _COLOURS[sum(label.kind.encode()) % len(_COLOURS)]
+            colour = _COLOURS[anomalies.index(label.kind) % len(_COLOURS)]
             corner, size = (left - 0.5, top - 0.5), (right - left, bottom - top)
             axes.add_patch(Rectangle(corner, *size, fill=False, color=colour, lw=1.2))
             axes.text(0.02, 0.97 - 0.07 * row, label.kind, color=colour, fontsize=7, va="top", transform=axes.transAxes)
@@ -67,6 +69,6 @@ def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:
     first_view = settings.darks + settings.flats
     numbers = [0] if settings.darks else []
     numbers += [settings.darks] if settings.flats else []
-    numbers += list(dict.fromkeys(marked))[: PICTURES - 1 - len(numbers)]
+    numbers += list(dict.fromkeys(marked))[: PICTURES - len(numbers)]
     spread = np.linspace(first_view, len(scan) - 1, PICTURES - len(numbers)).round().astype(int)
     return sorted({*numbers, *spread.tolist()})

@@ -199,6 +199,7 @@ def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
     scan = begun(open_scene("scene.yaml"), 0, 60, 0.0)
     # A dark, a flat, the frames asked for, and the rest evenly: views 0, 15, 30, 44, 59 are frames 4, 19, 34, 48, 63.
     assert figure._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
+    assert figure._chosen(scan, (9, 9, 8, 7, 6, 5, 63)) == [0, 2, 5, 6, 7, 8, 9, 63]  # six kinds of anomaly have room
     assert figure._chosen(begun(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
 
 
