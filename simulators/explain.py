@@ -9,7 +9,7 @@ from __future__ import annotations
 import statistics
 import tracemalloc
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -75,12 +75,12 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explain
     rest = [effect for effect in scene.chain.effects if effect.domain is not Domain.MOTION]
     # From the standing sample to the whole scene, one effect of motion more each time.
     growing = [replace(scene, chain=Chain.of([*motion[:n], *rest])) for n in range(len(motion) + 1)]
-    seconds, sizes = _steps(growing[0], shot, now, repeats)
-    whole = _whole(growing, shot, now, repeats)
-    peaks = [_peak(each, shot) for each in growing]
+    rounds = [_round(growing, shot, now) for _ in range(repeats + 1)][1:]
+    seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
+    sizes, peaks = _sizes(growing[0], shot), [_peak(each, shot) for each in growing]
     costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
     for n, effect in enumerate(motion):
-        more = statistics.median(run[n + 1] - run[n] for run in whole)
+        more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
         costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))
     order = [effect.name for effect in rest]
     depth = [effect.name for effect in rest if effect.domain is Domain.OPTICAL_DEPTH]
@@ -89,7 +89,7 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explain
             costs.append(_cost(name, seconds[name], sizes[name]))
     named = {effect.name for effect in scene.chain.effects}
     left = tuple((name, entry.says) for name, entry in CATALOGUE.items() if name not in named)
-    return Explained(tuple(costs), statistics.median(run[-1] for run in whole) * 1e3, left)
+    return Explained(tuple(costs), statistics.median(each.whole[-1] for each in rounds) * 1e3, left)
 
 
 def _cost(name: str, seconds: float, size: int) -> Cost:
@@ -98,21 +98,35 @@ def _cost(name: str, seconds: float, size: int) -> Cost:
     return Cost(name, CATALOGUE[name].domain, seconds * 1e3, size, CATALOGUE[name].says)
 
 
-def _steps(scene: Scene, shot: Shot, now: Seconds, repeats: int) -> tuple[dict[str, float], dict[str, int]]:
-    """Median seconds and peak bytes of each step of a frame."""
-    expose(scene, shot)
-    runs: list[dict[str, float]] = []
-    for _ in range(repeats):
-        run: dict[str, float] = defaultdict(float)
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """Seconds of one round: of the steps of the first scene by name, and of a whole frame of each."""
 
-        @contextmanager
-        def timed(name: str, run: dict[str, float] = run) -> Iterator[None]:
-            start = now()
-            yield
-            run[name] += now() - start
+    steps: Mapping[str, float]
+    whole: Sequence[float]
 
-        expose(scene, shot, timed)
-        runs.append(run)
+
+def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> _Round:
+    """All that is compared in turns, so that a machine that slows down does so for all of it."""
+    steps: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def timed(name: str) -> Iterator[None]:
+        start = now()
+        yield
+        steps[name] += now() - start
+
+    expose(scenes[0], shot, timed)
+    whole = []
+    for scene in scenes:
+        start = now()
+        expose(scene, shot)
+        whole.append(now() - start)
+    return _Round(steps, whole)
+
+
+def _sizes(scene: Scene, shot: Shot) -> dict[str, int]:
+    """Bytes that each step of a frame takes at most."""
     sizes: dict[str, int] = defaultdict(int)
 
     @contextmanager
@@ -124,20 +138,7 @@ def _steps(scene: Scene, shot: Shot, now: Seconds, repeats: int) -> tuple[dict[s
 
     with _traced():
         expose(scene, shot, weighed)
-    return {name: statistics.median(run[name] for run in runs) for name in runs[0]}, sizes
-
-
-def _whole(scenes: Sequence[Scene], shot: Shot, now: Seconds, repeats: int) -> list[list[float]]:
-    """Seconds of a frame of each scene, [repeat][scene]; in turns, for a machine that slows down does so for all."""
-    runs: list[list[float]] = []
-    for _ in range(repeats + 1):
-        run = []
-        for scene in scenes:
-            start = now()
-            expose(scene, shot)
-            run.append(now() - start)
-        runs.append(run)
-    return runs[1:]  # the first one compiles
+    return sizes
 
 
 def _peak(scene: Scene, shot: Shot) -> int:
