@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,32 +16,7 @@ settings.register_profile("ci", deadline=None, max_examples=500, print_blob=True
 settings.register_profile("thorough", deadline=None, max_examples=10_000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
 
-ROOT = Path(__file__).parents[1]
-WITH_KERNELS = ("beamline", "bench", "recon")
-"""Folders of tests that need compiled kernels."""
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def _folder(item: pytest.Item) -> str:
-    return item.path.relative_to(ROOT / "tests").parts[0]
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests without kernels go first: meanwhile `compiled_ahead` compiles."""
-    items.sort(key=lambda item: _folder(item) in WITH_KERNELS)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compiled_ahead(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Where tests of both kinds are run, kernels that are not in numba's cache yet are compiled in the background."""
-    needs_kernels = {_folder(item) in WITH_KERNELS for item in request.session.items}
-    if needs_kernels != {True, False}:
-        yield
-        return
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_NUM_THREADS": "1"}
-    with subprocess.Popen([sys.executable, str(ROOT / "tests" / "compile_ahead.py")], env=environment) as process:
-        yield
-        process.kill()
 
 
 @pytest.fixture
