@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,31 +20,18 @@ from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.detector import Detector
 from simulators.effects.chain import Label
-from simulators.effects.shot import CannotExposeError, Shot
+from simulators.effects.shot import CannotExposeError
 from simulators.exposure import expose
 from simulators.scene import Scene
 from simulators.sensor import CONVERSION, OFFSET
 from simulators.shutter import BeamGate, SimulatedSampleMover
+from simulators.sight import Exposed, Sight
 from simulators.trigger_line import TriggerLine
 
 POLL = 0.02
 """s between looks at the trigger line while waiting: a stop may cancel pulses, a move may add some."""
 TOLERANCE = 1e-6
 """s by which a trigger may come early; a float64 of seconds since 1970 resolves 2e-7 s."""
-
-
-@dataclass(frozen=True)
-class _Exposed:
-    """A frame in the ring: what it takes to compute it."""
-
-    framestamp: int
-    number: int
-    time: float
-    angle: float
-    ready: float
-    beam: bool
-    sample: bool
-    view: int
 
 
 class SimulatedOrcaQuest:
@@ -56,7 +43,7 @@ class SimulatedOrcaQuest:
 
     Args:
         scene: what stands in the beam.
-        seed: of all noise; frame number k uses the generator of (seed, k).
+        seed: of all random numbers, with the effect's name and the frame's number over the camera's life.
         shutter, sample: looked at when a frame is exposed: dark, flat or projection.
         pixel_pitch: mm at the sample of an unbinned sensor pixel.
         ring_frames: frames that the ring holds; a reader who falls further behind loses the oldest.
@@ -90,7 +77,7 @@ class SimulatedOrcaQuest:
         self._timing = orca_quest.timing(self._settings)
         self._connected = clock.now()
         self._triggers = self._frames = self._views = 0  # over the camera's life
-        self._ring: deque[_Exposed] = deque()
+        self._ring: deque[Exposed] = deque()
         self._armed_for = self._framestamp = 0  # frames asked for (0: not armed), next framestamp
         self._seen, self._accepted = 0.0, -np.inf  # time of the last trigger looked at, and of the last accepted
         self._gone = ""
@@ -104,18 +91,7 @@ class SimulatedOrcaQuest:
     @property
     def detector(self) -> Detector:
         """Where the pixels of the present frames are, in mm from the rotation axis: the truth that alignment seeks."""
-        row0, col0, *_ = self._roi()
-        binning = self._settings.binning
-        axis_row, axis_col = ((n - 1) / 2 for n in orca_quest.SENSOR_SHAPE)
-        axis_col += self._scene.axis_offset_px
-        middle = (binning - 1) / 2  # of a binned pixel, in sensor pixels from the middle of its first
-        return Detector(
-            shape=self._timing.shape,
-            pitch=self._pitch * binning,
-            axis_col=(axis_col - col0 - middle) / binning,
-            axis_row=(axis_row - row0 - middle) / binning,
-            sod=self._scene.beam.source_distance,
-        )
+        return self._sight().detector
 
     def labels_at(self, time: float) -> tuple[Label, ...]:
         """The anomalies in the frame, taken already, that was exposed at `time` (s since the Unix epoch)."""
@@ -128,7 +104,7 @@ class SimulatedOrcaQuest:
             CannotExposeError: the scene cannot be exposed so; the message says what would help.
         """
         now = self._clock.now()
-        expose(self._scene, self._shot(_Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
+        expose(self._scene, self._sight().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Apply and read back; the exposure is rounded to 10 ns. Raises DeviceRefused: nothing has changed."""
@@ -207,7 +183,7 @@ class SimulatedOrcaQuest:
             self._ring.clear()
 
     def describe(self) -> dict[str, str | int | float]:
-        row0, col0, rows, cols = self._roi()
+        row0, col0, rows, cols = self._sight().roi
         return {
             "model": "C15550-20UP (simulated)",
             "exposure": self._settings.exposure,
@@ -230,8 +206,8 @@ class SimulatedOrcaQuest:
         self.disarm()
         self._gone = self._gone or "was closed"
 
-    def _roi(self) -> tuple[int, int, int, int]:
-        return self._settings.roi or (0, 0, *orca_quest.SENSOR_SHAPE)
+    def _sight(self) -> Sight:
+        return Sight(self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected)
 
     def _answer(self, armed: bool = False) -> None:
         """Raises DeviceError where the camera is gone (once its last frame is taken) or not armed though it must be."""
@@ -277,7 +253,7 @@ class SimulatedOrcaQuest:
         ready = time + self._settings.exposure + self._timing.readout
         beam, sample = self._shutter.is_open(), self._sample.is_in()
         if self._frames not in self._lost:
-            self._ring.append(_Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
+            self._ring.append(Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
         self._framestamp += 1
         self._frames += 1
         self._views += beam and sample
@@ -293,8 +269,8 @@ class SimulatedOrcaQuest:
                 state="Later frames can still be taken",
             )
 
-    def _render(self, frame: _Exposed) -> CameraFrame:
-        shot = self._shot(frame)
+    def _render(self, frame: Exposed) -> CameraFrame:
+        shot = self._sight().shot(frame)
         try:
             counts = expose(self._scene, shot)
         except CannotExposeError as error:
@@ -303,24 +279,3 @@ class SimulatedOrcaQuest:
         if labels := self._scene.chain.labels(shot):
             self._labels[frame.time] = labels
         return CameraFrame(counts, frame.framestamp, frame.time)
-
-    def _shot(self, frame: _Exposed) -> Shot:
-        return Shot(
-            detector=self.detector,
-            exposure=self._settings.exposure,
-            time=frame.time,
-            angle=frame.angle,
-            angle_at=self._line.angle_at,
-            elapsed=frame.time - self._connected,
-            row_period=self._timing.row_period,
-            roi=self._roi(),
-            binning=self._settings.binning,
-            readout=self._settings.readout,
-            conversion=CONVERSION[self._settings.readout],
-            beam=frame.beam,
-            sample=frame.sample,
-            radius=self._scene.sample.radius,
-            seed=self._seed,
-            frame=frame.number,
-            view=frame.view,
-        )
