@@ -29,7 +29,8 @@ class Scan:
     Attributes:
         seed: of all random numbers.
         start: s since the Unix epoch, of the first frame.
-        views: projections, spread over the scene's range whatever their number.
+        views: projections, spread over the scene's range whatever their number. Fewer than the scene's come after
+            longer periods where the stage flies: it turns no faster, so that a view is blurred as the scene has it.
     """
 
     scene: Scene
@@ -66,6 +67,12 @@ class Scan:
         rows, cols = (n * self.scene.detector.binning for n in self.scene.detector.shape)
         return (SENSOR_SHAPE[0] - rows) // 2, (SENSOR_SHAPE[1] - cols) // 2, rows, cols
 
+    @property
+    def period(self) -> float:
+        """s from one trigger to the next."""
+        settings = self.scene.scan
+        return settings.period_s * (max(settings.views / self.views, 1.0) if settings.fly else 1.0)
+
     def angle(self, view: int) -> float:
         """Radians at the trigger of a view."""
         return math.radians(self.scene.scan.range_deg) * view / self.views
@@ -82,7 +89,7 @@ class Scan:
         view = number - scan.darks - scan.flats
         beam, sample = number >= scan.darks, view >= 0
         kind = FrameKind.PROJECTION if sample else FrameKind.FLAT if beam else FrameKind.DARK
-        time = self.start + number * scan.period_s
+        time = self.start + number * self.period
         angle = self.angle(max(view, 0))
         shot = Shot(
             detector=self.detector,
@@ -90,7 +97,7 @@ class Scan:
             time=time,
             angle=angle,
             angle_at=self._stage(time, angle, turns=sample and scan.fly),
-            elapsed=number * scan.period_s,
+            elapsed=number * self.period,
             row_period=LINE_TIME[settings.readout] / 2 * settings.binning,
             roi=self.roi,
             binning=settings.binning,
@@ -109,5 +116,5 @@ class Scan:
         return (self.frame(number) for number in range(len(self)))
 
     def _stage(self, time: float, angle: float, turns: bool) -> AngleAt:
-        speed = math.radians(self.scene.scan.range_deg) / self.views / self.scene.scan.period_s if turns else 0.0
+        speed = math.radians(self.scene.scan.range_deg) / self.views / self.period if turns else 0.0
         return lambda at: angle + speed * (at - time)

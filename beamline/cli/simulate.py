@@ -37,7 +37,11 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.argument("scene", metavar="SCENE")
 @click.option("--explain", "explains", is_flag=True, help="What a frame computes, in order, and what each step costs.")
 @click.option(
-    "--frames", "views", type=_VIEWS, metavar="N", help="Views over the scene's range; its own number unless given."
+    "--frames",
+    "views",
+    type=_VIEWS,
+    metavar="N",
+    help="Views over the scene's range, its own number unless given; the stage turns no faster for fewer.",
 )
 @click.option("--out", type=_FILE, help="Write the scan to this HDF5 file, and its labels beside it.")
 @click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")

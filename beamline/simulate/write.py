@@ -133,7 +133,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         energy_kev=beam.energy_kev,
         distance_mm=None if beam.sod is None or beam.sdd is None else beam.sdd - beam.sod,
         exposure=scene.scene.detector.exposure_s,
-        period=settings.period_s,
+        period=scan.period,
         axis_col=scan.detector.axis_col,
         plan=json.dumps(asked),
         config=scene.text,

@@ -51,6 +51,21 @@ def test_fewer_views_are_spread_over_the_same_range() -> None:
     np.testing.assert_allclose(np.degrees([frame.shot.angle for frame in list(_scan(views=3))[5:]]), [0, 60, 120])
 
 
+@pytest.mark.parametrize(
+    ("fly", "views", "period"), [(True, 3, 0.2), (True, 4, 0.15), (True, 12, 0.1), (False, 3, 0.1)]
+)
+def test_a_flying_stage_turns_no_faster_for_fewer_views(fly: bool, views: int, period: float) -> None:
+    scan = _scan(views=views, scan={"fly": fly})
+    first, second = (scan.frame(number).shot for number in (5, 6))
+    assert scan.period == pytest.approx(period)
+    assert second.time - first.time == pytest.approx(period)
+    assert second.elapsed - first.elapsed == pytest.approx(period)
+    if fly:
+        assert first.angle_at(second.time) == pytest.approx(second.angle)
+        speed = math.degrees(first.angle_at(first.time + 0.01)) / 0.01
+        assert speed == pytest.approx(min(300.0, 180 / views / period))
+
+
 def test_a_flying_stage_turns_steadily_and_a_stepping_one_stands() -> None:
     flying = _scan().frame(7).shot
     speed = math.radians(30) / 0.1
