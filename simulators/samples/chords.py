@@ -49,9 +49,11 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
         return
     if p.kind[b] == ELLIPSOID:
         U, D, V = _times(p.matrix[b], axes, 0), _times(p.matrix[b], axes, 1), _times(p.matrix[b], axes, 2)
-        dd, du, dv = _dot(D, D), _dot(D, U), _dot(D, V)
-        su, suv, sv = _dot(U, U) - du * du / dd, _dot(U, V) - du * dv / dd, _dot(V, V) - dv * dv / dd
-        place[3], place[4], place[5] = su, suv / su, sv - suv * suv / su
+        X, Y, dd, det = _cross(D, U), _cross(D, V), _dot(D, D), 1.0
+        for k in range(3):  # of W W^T, which is diagonal
+            det *= p.matrix[b, k, 0] ** 2 + p.matrix[b, k, 1] ** 2 + p.matrix[b, k, 2] ** 2
+        # Products, not differences as the complement is defined by: of those nothing is left for a needle.
+        place[3], place[4], place[5] = _dot(X, X) / dd, _dot(X, Y) / _dot(X, X), det / _dot(X, X)
         place[6] = 2.0 * p.attenuation[b] / math.sqrt(dd)
     elif p.kind[b] == POLYHEDRON:
         for f in range(p.first_face[b], p.first_face[b + 1]):
@@ -166,10 +168,13 @@ def leaning_cylinder(
 
 @njit(**KERNEL)
 def columns(u: Reals, per_mm: float, low: float, high: float) -> Span:
-    """First column whose centre lies in low..high, and the one after the last."""
+    """First column whose centre lies in low..high, and the one after the last; none where these are no numbers."""
     cols = float(u.size)
-    first = math.ceil(min(max((low - u[0]) * per_mm, 0.0), cols))
-    stop = math.floor(min(max((high - u[0]) * per_mm, -1.0), cols - 1.0)) + 1
+    left, right = (low - u[0]) * per_mm, (high - u[0]) * per_mm
+    if not left <= right:
+        return 0, 0
+    first = math.ceil(min(max(left, 0.0), cols))
+    stop = math.floor(min(max(right, -1.0), cols - 1.0)) + 1
     return first, max(first, stop)
 
 

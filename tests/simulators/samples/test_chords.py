@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from recon.geometry import Geometry
 from simulators.detector import Detector
 from simulators.pose import Pose
+from simulators.samples.chords import columns
 from simulators.samples.phantom import Phantom
 from simulators.samples.solids import Box, Cylinder, Ellipsoid, Octahedron, Tube
 from tests.simulators.bodies import SOLIDS, chords, rays
@@ -132,6 +133,24 @@ def test_a_leaning_cylinder_and_a_box_on_edge() -> None:
     assert box.line_integrals(math.pi / 4, detector)[0, 0] == pytest.approx(0.3 * math.sqrt(2))
     corner = Pose.turned(math.pi / 4, 1).tilted_by((math.atan(math.sqrt(0.5)), 0.0))
     assert box.line_integrals(corner, detector)[0, 0] == pytest.approx(0.3 * math.sqrt(3))
+
+
+@pytest.mark.parametrize("thin", [1e-3, 1e-6, 1e-9])
+def test_a_needle_across_the_frame(thin: float) -> None:
+    """A ray that meets it halfway to its tip has √(1 - 1/4) of the thickness in the middle; it lies along u = v."""
+    needle = Ellipsoid((1.0, thin, thin), 1.0, quaternion=(math.cos(math.pi / 8), 0, -math.sin(math.pi / 8), 0))
+    detector = Detector((1, 2), math.sqrt(0.125), -1.0, -1.0)
+    seen = Phantom.of([needle]).line_integrals(0.0, detector)[0]
+    # A ray is as far off as a length is rounded, and that is 1e-7 of the thinnest.
+    np.testing.assert_allclose(seen, [thin * math.sqrt(3), 0.0], rtol=1e-12 + (2e-16 / thin) ** 2)
+
+
+def test_where_a_shadow_is_no_number_there_is_none() -> None:
+    """Before, first and last column were whole numbers far outside of the frame."""
+    assert columns(np.arange(5.0), 1.0, 1.0, 2.0) == (1, 3)
+    for low, high in ((math.nan, 2.0), (1.0, math.nan), (2.0, 1.0)):
+        assert columns(np.arange(5.0), 1.0, low, high) == (0, 0)
+    assert columns(np.arange(5.0), 1.0, -math.inf, math.inf) == (0, 5)
 
 
 def test_a_far_source_is_a_parallel_beam() -> None:
