@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -96,7 +97,8 @@ def pack(solids: Sequence[Solid]) -> Packed:
 
 def rotation(quaternion: Quaternion) -> Reals:
     """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any length but zero."""
-    w, x, y, z = np.array(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    length = math.hypot(*quaternion)  # numpy's norm squares, and of 1e200 and 1e-200 nothing is left
+    w, x, y, z = (part / length for part in quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

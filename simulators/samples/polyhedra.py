@@ -114,10 +114,11 @@ def hull_of_faces(faces: Sequence[Sequence[float]]) -> Hull:
             without bounds.
     """
     planes = _numbers("faces", faces, 4)
-    length = np.linalg.norm(planes[:, :3], axis=1)
-    if not length.all():
-        raise ValueError(f"polyhedron: face {int(length.argmin())} has a normal of length zero")
-    normals, distances = planes[:, :3] / length[:, None], planes[:, 3]
+    largest = np.abs(planes[:, :3]).max(axis=1)
+    if not largest.all():
+        raise ValueError(f"polyhedron: face {int(largest.argmin())} has a normal of length zero")
+    normals, distances = planes[:, :3] / largest[:, None], planes[:, 3]  # first, for their squares may be no numbers
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     # Bounded where no direction leads away from all faces: the normals then span space with positive weights. The
     # extreme directions are among those along two faces.
     i, j = np.array(list(combinations(range(len(normals)), 2))).T

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
+
 from simulators.samples.polyhedra import Hull, hull_of_faces, hull_of_vertices
 
 Vector = tuple[float, float, float]
@@ -21,6 +23,8 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 LEAST, MOST = 1e-9, 1e9
 """mm: with lengths far beyond, squares and quotients in the kernels are no numbers, and no place in a frame."""
+DENSEST = 1e12
+"""1/mm: sums of far larger ones over chords are no numbers."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +180,15 @@ class Polyhedron:
         _check(self)
         if (self.vertices is None) == (self.faces is None):
             raise ValueError("polyhedron: give either vertices or faces, not both and not neither")
-        self.hull()
+        given = [c for p in self.vertices or () for c in p] or [face[-1] for face in self.faces or () if face]
+        self._check_size(max(map(abs, given), default=1.0))  # first, for their products may be no numbers
+        corners = self.hull().vertices
+        self._check_size(float(np.ptp(corners, axis=0).max()))
+        self._check_size(float(np.abs(corners).max()))
+
+    def _check_size(self, length: float) -> None:
+        if math.isfinite(length) and not LEAST <= length <= MOST:
+            raise ValueError(f"polyhedron: its size must lie in {LEAST:g} ... {MOST:g} mm, got {length:g}")
 
     def hull(self) -> Hull:
         """In its own axes."""
@@ -225,6 +237,8 @@ def _check(solid: Solid, **lengths: float | Vector) -> None:
             raise ValueError(f"{name}: {key} must lie in {LEAST:g} ... {MOST:g} mm, got {value}")
     if not all(math.isfinite(v) for v in (solid.attenuation, *solid.centre)):
         raise ValueError(f"{name}: attenuation {solid.attenuation} and centre {solid.centre} must be finite")
+    if abs(solid.attenuation) > DENSEST:
+        raise ValueError(f"{name}: attenuation must lie within {DENSEST:g} 1/mm, got {solid.attenuation}")
     if max(map(abs, solid.centre)) > MOST:
         raise ValueError(f"{name}: centre must lie within {MOST:g} mm, got {solid.centre}")
     if not isinstance(solid, Cylinder | Tube) and not 0 < math.hypot(*solid.quaternion) < math.inf:

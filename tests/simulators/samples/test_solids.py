@@ -84,6 +84,22 @@ def test_a_tube_is_packed_with_its_bore() -> None:
     assert p.attenuation.tolist() == [1, 2, -2, 3, -3]
 
 
+def _sized(factor: float) -> tuple[tuple[float, float, float], ...]:
+    return tuple((factor * x, factor * y, factor * z) for x, y, z in bodies.CORNERS)
+
+
+@pytest.mark.parametrize("length", [1e-320, 1e-200, 1e200])
+def test_quaternions_and_normals_may_have_any_length(length: float) -> None:
+    """Where squares of them are no numbers, too."""
+    w, x, y, z = bodies.QUATERNION
+    turned = pack([Box((0.1, 0.2, 0.3), 1.0, quaternion=bodies.QUATERNION)])
+    scaled = pack([Box((0.1, 0.2, 0.3), 1.0, quaternion=(w * length, x * length, y * length, z * length))])
+    np.testing.assert_allclose(scaled.faces, turned.faces, atol=1e-3 if length < 1e-300 else 1e-15)
+    faces = [(a * length, b * length, c * length, d) for a, b, c, d in bodies.WEDGE]
+    wedge = Polyhedron(1.0, faces=tuple(faces))
+    assert wedge.volume == pytest.approx(Polyhedron(1.0, faces=bodies.WEDGE).volume, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -101,6 +117,10 @@ def test_a_tube_is_packed_with_its_bore() -> None:
         (lambda: Plate(0.1, 0.0, 1.0), "plate: thickness must be positive"),
         (lambda: TruncatedOctahedron((0.1, 0.1, 0.1), 1.0, 1.0), "truncated_octahedron: cut must be >= 0.5 and < 1"),
         (lambda: TruncatedOctahedron((0.1, 0.1, 0.1), 1.0, 0.4), "got 0.4"),
+        (lambda: Ellipsoid((0.1, 0.1, 0.1), 1e300), r"attenuation must lie within 1e\+12 1/mm"),
+        (lambda: Polyhedron(1.0, vertices=_sized(1e300)), r"size must lie in 1e-09 \.\.\. 1e\+09 mm, got 3e\+299"),
+        (lambda: Polyhedron(1.0, vertices=_sized(1e-200)), "size must lie in"),
+        (lambda: Polyhedron(1.0, faces=[(*f[:3], 1e200 * f[3]) for f in bodies.WEDGE]), "size must lie in"),
         (lambda: Polyhedron(1.0), "give either vertices or faces"),
         (lambda: Polyhedron(1.0, vertices=bodies.CORNERS, faces=bodies.WEDGE), "give either vertices or faces"),
         (lambda: Polyhedron(math.nan, vertices=bodies.CORNERS), "polyhedron: attenuation nan"),
