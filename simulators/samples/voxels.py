@@ -17,9 +17,12 @@ from recon.volume import Grid
 from simulators.detector import Detector
 from simulators.effects.shot import CannotExposeError
 from simulators.pose import Pose
+from simulators.samples.solids import LEAST, MOST
 from simulators.samples.voxel_projector import padded, project
 
 MOST_LABELS = 255
+ON = 1e-9
+"""Voxels: a point so close to a centre is on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,8 @@ class Voxels:
             raise ValueError(f"a volume has three axes [z, y, x], not the shape {attenuation.shape}")
         if not all(math.isfinite(step) and step > 0 for step in along):
             raise ValueError(f"voxels must be of positive size in mm, got {spacing}")
+        if not all(LEAST <= step <= MOST for step in along):
+            raise ValueError(f"voxels must be {LEAST:g} ... {MOST:g} mm in size, got {spacing}")
         volume = padded(attenuation)
         if not np.isfinite(volume).all():
             raise ValueError("the volume holds values that are not finite")
@@ -168,6 +173,8 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
     """Matrix [target, padded voxel] that interpolates along one axis and takes the mean over each target voxel."""
     within = (np.arange(points) + 0.5) / points - 0.5
     place = (centres[:, None] + within * edge - first) / step + 1.0
+    # On a voxel's centre it is the voxel's value, to the bit: what rounding takes of its neighbour would be matter.
+    place = np.where(np.abs(place - np.rint(place)) < ON, np.rint(place), place)
     below = np.floor(place)
     rows = np.repeat(np.arange(centres.size), points)
     entries = []

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import config
 from scipy.ndimage import map_coordinates
 
 from recon.volume import Grid
@@ -187,6 +188,31 @@ def test_labels_are_of_thresholds_or_of_the_nearest_voxel() -> None:
     assert not fine[:, :, [0, -1]].any()
 
 
+@pytest.mark.parametrize("spacing", [0.003, 1 / 3, (0.05, 0.04, 0.03)])
+def test_no_voxel_takes_a_label_or_a_value_from_its_neighbour(
+    rng: np.random.Generator, spacing: float | tuple[float, float, float]
+) -> None:
+    """On its own grid, however its coordinates are rounded; at a threshold, too."""
+    values = rng.integers(0, 3, (5, 30, 30)).astype(np.float32)
+    pitch, edge = (spacing[0], spacing[2]) if isinstance(spacing, tuple) else (spacing, spacing)
+    if isinstance(spacing, tuple):
+        spacing = (pitch, edge, edge)
+    grid = Grid(values.shape, edge, slice_pitch=pitch)
+    np.testing.assert_array_equal(Voxels.of(values, spacing).attenuation(grid), values)
+    np.testing.assert_array_equal(Voxels.of(values, spacing).labels(grid), values > 0)
+    np.testing.assert_array_equal(Voxels.of(values, spacing, thresholds=[1.0, 2.0]).labels(grid), values)
+
+
+@pytest.mark.parametrize("sod", [math.inf, 1e5])
+@pytest.mark.parametrize("shift", [1e6, 1e8])
+def test_a_volume_far_from_its_rays_is_seen_by_none(sod: float, shift: float) -> None:
+    """It is 1e15 voxels away, and a ray's place in it is known to several voxels only."""
+    voxels, detector = Voxels.of(np.ones((3, 3, 3)), 1e-9), Detector((5, 70), 1e-6, 3.3, 1.0, sod)
+    for moved in ((0.0, 1.0, shift), (shift, 1.0, 0.0)):
+        for angle in (0.0, math.pi / 2):
+            assert np.abs(voxels.line_integrals(Pose.turned(angle, 5).shifted_by(moved), detector)).max() < 1e-8
+
+
 def test_the_radius_holds_all_matter() -> None:
     values = np.zeros((3, 21, 21))
     values[1, 10, 18] = 1.0
@@ -212,9 +238,9 @@ def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch)
     detector = Detector.centred((30, 20), 0.02)
     pose = Pose.turned(0.4, 30)
     for stands in (pose, pose.tilted_by([0.1, 0.1])):
-        monkeypatch.setattr("simulators.samples.voxel_projector.get_num_threads", lambda: 1)
+        monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 1)
         alone = random.line_integrals(stands, detector)
-        monkeypatch.setattr("simulators.samples.voxel_projector.get_num_threads", lambda: 3)
+        monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 3)
         np.testing.assert_array_equal(random.line_integrals(stands, detector), alone)
         assert alone.any()
 
@@ -224,6 +250,7 @@ def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch)
     [
         ({"attenuation": np.zeros((3, 3))}, "three axes"),
         ({"spacing": 0.0}, "positive size"),
+        ({"spacing": (0.1, 1e-308, 0.1)}, r"must be 1e-09 \.\.\. 1e\+09 mm in size"),
         ({"attenuation": np.full((2, 2, 2), np.nan)}, "not finite"),
         ({"thresholds": [2.0, 1.0]}, "ascend"),
         ({"labels": np.zeros((1, 2, 2), int)}, "do not go with"),
