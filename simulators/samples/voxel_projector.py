@@ -12,7 +12,7 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import config, njit
 from numpy.typing import NDArray
 
 from simulators.detector import Detector
@@ -21,7 +21,7 @@ from simulators.pose import Pose
 Reals = NDArray[np.float64]
 Voxels32 = NDArray[np.float32]
 
-_EDGE = 1e-7  # voxels: kept clear of the outer edge, so that rounding never reads beyond the padding
+_EDGE = 1e-7  # voxels: kept clear of the outer edge
 
 
 def padded(values: NDArray[np.floating]) -> Voxels32:
@@ -52,7 +52,8 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
         def rows(low: int, high: int) -> None:
             _any(volume, spacing, first, axes, origin, u0, v0, detector.pitch, detector.sod, low, high, out)
 
-    threads = min(get_num_threads(), detector.shape[0])
+    # Not numba's get_num_threads: it would start numba's own threads, which slows torch down.
+    threads = min(int(config.NUMBA_NUM_THREADS), detector.shape[0])
     if threads == 1:
         rows(0, detector.shape[0])
         return out
@@ -102,7 +103,7 @@ def _upright(
                 line = between[b + 1]
                 for i in range(start, stop):
                     place = at + i * step
-                    a = int(place)
+                    a = min(max(int(place), 0), nx)
                     row[i] += line[a] + (place - a) * (line[a + 1] - line[a])
             length = spacing[1] / abs(c)
         else:  # from plane to plane of x: y = u / sin θ - x cot θ
@@ -113,7 +114,7 @@ def _upright(
                 start, stop = _columns(at, step, ny, row.size)
                 for i in range(start, stop):
                     place = at + i * step
-                    b = int(place)
+                    b = min(max(int(place), 0), ny)
                     row[i] += between[b, a + 1] + (place - b) * (between[b + 1, a + 1] - between[b, a + 1])
             length = spacing[0] / abs(s)
         for i in range(row.size):
@@ -124,7 +125,8 @@ def _upright(
 def _columns(at: float, step: float, n: int, cols: int) -> tuple[int, int]:
     """Columns start ... stop - 1 with 0 < at + i step < n + 1, the padded line's inside."""
     one, other = (_EDGE - at) / step, (n + 1 - _EDGE - at) / step
-    return max(0, math.ceil(min(one, other))), min(cols, math.floor(max(one, other)) + 1)
+    start, stop = max(0.0, min(min(one, other), 1.0 * cols)), max(-1.0, min(max(one, other), cols - 1.0))
+    return math.ceil(start), math.floor(stop) + 1
 
 
 @njit(cache=True, nogil=True)
@@ -171,6 +173,8 @@ def _any(
                     continue
                 one, other = (_EDGE - at) / step[n], (size[n] + 1 - _EDGE - at) / step[n]
                 start, stop = max(start, min(one, other)), min(stop, max(one, other))
+            if not start <= stop:  # asked here, for far off they are beyond whole numbers
+                continue
             total = 0.0
             for k in range(math.ceil(start), math.floor(stop) + 1):
                 t = k - point[main]
@@ -185,7 +189,8 @@ def _any(
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(plane: Voxels32, down: float, across: float) -> float:
-    j, i = int(down), int(across)
+    # On the plane, even where the rounding of a ray from far says otherwise.
+    j, i = min(max(int(down), 0), plane.shape[0] - 2), min(max(int(across), 0), plane.shape[1] - 2)
     q, p = down - j, across - i
     upper = plane[j, i] + p * (plane[j, i + 1] - plane[j, i])
     lower = plane[j + 1, i] + p * (plane[j + 1, i + 1] - plane[j + 1, i])
