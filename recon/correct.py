@@ -12,6 +12,7 @@ from scipy import ndimage
 from recon.masks import NEIGHBOURS, Image, Mask, fill, plan_fill
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
+_UNLIT = 0.01  # of the light that well-lit pixels get
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ class Projections:
 
 
 def dead_pixels(references: References, hot_threshold: float = CorrectionSettings.hot_threshold) -> Mask:
-    """Pixels [row, col] that cannot be trusted: not finite, blind (flat <= dark), or unlike all their neighbours.
+    """Pixels [row, col] that cannot be trusted: not finite, blind or unlit (a flat next to its dark), or unlike their neighbours.
 
     Raises:
         ValueError: where more than half of the detector is dead: no beam, or darks and flats exchanged.
@@ -94,6 +95,8 @@ def dead_pixels(references: References, hot_threshold: float = CorrectionSetting
             f"{dead.mean():.0%} of the pixels have flat <= dark (median flat {np.median(references.flats[0][1]):.4g}, "
             f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
         )
+    # Behind a slit, flat and view are both noise, and their ratio is anything.
+    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], 90) for net in nets)])
     response = np.median([np.median(net[~dead]) for net in nets])
 
     def outliers(image: Image, least: float) -> Mask:

@@ -147,6 +147,23 @@ def test_blind_and_hot_pixels_are_filled_from_their_neighbours(rng: np.random.Ge
     np.testing.assert_array_equal(again.data, result.data)
 
 
+def test_what_stands_behind_a_slit_is_filled_from_beside_it(rng: np.random.Generator) -> None:
+    """Flat less dark is noise there, as often above zero as below: nothing of its ratio to a view may come through."""
+    truth = sphere()
+    counts, references = beer_lambert(truth, rng)
+    behind = np.zeros(counts.shape[1:], bool)
+    behind[:, :7] = behind[:, 44:] = True
+    light = np.where(behind, 1e-4, 1.0)
+    noise = rng.normal(0, 4.0, (len(counts) + 1, *behind.shape))
+    flat = references.dark + (references.flats[0][1] - references.dark) * light + behind * noise[0]
+    counts = references.dark + (counts - references.dark) * light + behind * noise[1:]
+    seen = correct(counts, positions(counts), References(references.dark, ((0.0, flat.astype(np.float32)),)))
+    np.testing.assert_array_equal(seen.masked, behind)
+    np.testing.assert_allclose(seen.data[:, ~behind], truth[:, ~behind], atol=5e-3)
+    assert np.abs(seen.data[:, behind]).max() < 0.1  # air, as at the edge of what is seen
+    assert seen.floored == 0
+
+
 def test_flats_are_interpolated_between_groups_and_held_outside(rng: np.random.Generator) -> None:
     dark = np.full((2, 5), 10, np.float32)
     groups = ((110.0, dark + 3000), (10.0, dark + 1000))  # not in order
