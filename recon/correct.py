@@ -81,7 +81,7 @@ class Projections:
 
 
 def dead_pixels(references: References, hot_threshold: float = CorrectionSettings.hot_threshold) -> Mask:
-    """Pixels [row, col] that cannot be trusted: not finite, blind or unlit (a flat next to its dark), or unlike their neighbours.
+    """Pixels [row, col] that cannot be trusted: not finite, blind or unlit (flat near dark), or unlike all around them.
 
     Raises:
         ValueError: where more than half of the detector is dead: no beam, or darks and flats exchanged.
