@@ -2,7 +2,8 @@
 
 exp(-mu(E) t) of different energies are nearly dependent on one another, so that a sum over many of them is a sum over a
 few to any practical accuracy. Which, and with what weights, is found by non-negative least squares (Lawson & Hanson,
-Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and all of them.
+Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and all of them: first those that
+let through the very same light, a hundred or so of however many there are, then as few of these as the tolerance asks.
 """
 
 from __future__ import annotations
@@ -36,10 +37,13 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     rays = (lengths[:, None, None] * np.concatenate(ways)).reshape(-1, n_materials)
     through = np.exp(-rays @ attenuation.T)
     light = through @ weights
+    exact, _ = nnls(through, light)
+    enough = np.flatnonzero(exact)
+    through = through[:, enough]
     chosen: list[int] = []
     found = np.zeros(0)
     missing = light
-    while len(chosen) < weights.size:
+    while len(chosen) < enough.size:
         pull = through.T @ missing
         pull[chosen] = -np.inf
         chosen.append(int(np.argmax(pull)))
@@ -50,6 +54,6 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
             break
     else:
         return np.arange(weights.size), weights
-    kept = np.array(chosen, dtype=np.intp)[found > 0]
+    kept = enough[chosen][found > 0]
     order = np.argsort(kept)
     return kept[order], found[found > 0][order]
