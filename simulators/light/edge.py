@@ -1,7 +1,8 @@
 """Edge: the K edge of a transition metal in an oxide, with its white line, where the tables have a bare step.
 
-Tables of free atoms end at a step; a solid has a rise as wide as the core hole's level (Krause & Oliver, J. Phys. Chem.
-Ref. Data 8, 329, 1979) and, in an oxide, a line of bound final states above it. The usual form of both is
+Tables of free atoms end at a step; a solid has a rise as wide as the core hole's level (Campbell & Papp, At. Data Nucl.
+Data Tables 77, 1, 2001, which xraylib has: Mn 1.11, Co 1.28, Ni 1.39 eV) and, in an oxide, a line of bound final states
+above it. The usual form of both is
 
     f(E) = 1/2 + arctan((E - E_step) / (Γ/2)) / π + h / (1 + ((E - E_line) / (γ/2))²)        (Teo, EXAFS, 1986, ch. 2)
 
@@ -24,6 +25,8 @@ Table = Callable[[Reals], Reals]
 """Mass attenuation in cm²/g at energies in keV, as tabulated."""
 
 NEAR, FAR = 60.0, 150.0
+MOST_SHIFT = 20.0
+"""eV by which an edge may move: more, and it leaves the range in which the form stands for the table."""
 CLEAR = 1.0
 """eV from the edge at which a table is read: nearer, a spline through it may still be on its way up."""
 

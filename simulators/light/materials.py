@@ -14,7 +14,7 @@ import numpy as np
 import xraylib
 from numpy.typing import ArrayLike, NDArray
 
-from simulators.light.edge import K_EDGES, near_edge
+from simulators.light.edge import K_EDGES, MOST_SHIFT, near_edge
 
 Reals = NDArray[np.float64]
 LEAST_KEV, MOST_KEV = 0.1, 800.0
@@ -32,7 +32,8 @@ class Material:
         state_of_charge: of a cathode material, 0 (all lithium in) to 1: it then has the near-edge structure of
             simulators.light.edge; None: the bare tables. Composition and density stay those of the discharged state:
             lithium carries about a thousandth of an oxide's attenuation.
-        edge_shift_ev: eV from the edge of state 0 to that of state 1; None: as simulators.light.edge has it.
+        edge_shift_ev: eV from the edge of state 0 to that of state 1, the same for Mn, Co and Ni, -20 ... 20; None:
+            as simulators.light.edge has it.
     """
 
     name: str
@@ -45,9 +46,13 @@ class Material:
         if not 0 < self.density < 100:
             raise ValueError(f"{self.name}: density must lie between 0 and 100 g/cm3, got {self.density}")
         if self.state_of_charge is None:
+            if self.edge_shift_ev is not None:
+                raise ValueError(f"{self.name}: edge_shift_ev moves nothing without a state_of_charge; say that, too")
             return
         if not 0 <= self.state_of_charge <= 1:
             raise ValueError(f"{self.name}: state_of_charge must lie in 0 ... 1, got {self.state_of_charge}")
+        if self.edge_shift_ev is not None and not abs(self.edge_shift_ev) <= MOST_SHIFT:
+            raise ValueError(f"{self.name}: edge_shift_ev must lie in -20 ... 20 eV, got {self.edge_shift_ev}")
         if not K_EDGES.keys() & dict(self.fractions).keys():
             symbols = ", ".join(xraylib.AtomicNumberToSymbol(z) for z in K_EDGES)
             raise ValueError(f"{self.name}: state_of_charge is that of an oxide with {symbols}; this has none of them")

@@ -34,6 +34,12 @@ def test_edges_are_where_the_tables_have_them(z: int, kev: float) -> None:
     assert _edge(z) == pytest.approx(kev, abs=2.5e-4)
 
 
+@pytest.mark.parametrize(("z", "ev"), [(25, 1.11), (27, 1.28), (28, 1.39)])
+def test_core_holes_are_as_wide_as_the_source_has_them(z: int, ev: float) -> None:
+    """Campbell & Papp 2001; Krause & Oliver 1979 have 0.05 eV more, which nothing here would show."""
+    assert xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3 == pytest.approx(ev, abs=0.005)
+
+
 @pytest.mark.parametrize("z", Z)
 @pytest.mark.parametrize("charge", [0.0, 1.0])
 def test_the_jump_is_the_table_s(z: int, charge: float) -> None:

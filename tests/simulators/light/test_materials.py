@@ -86,16 +86,21 @@ def test_the_shift_of_the_edge_may_be_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("density", "charge", "words"),
+    ("density", "charge", "shift", "words"),
     [
-        (0.0, None, "density must lie between 0 and 100 g/cm3, got 0.0"),
-        (5.0, 1.5, r"state_of_charge must lie in 0 ... 1, got 1.5"),
-        (5.0, 0.5, "an oxide with Mn, Co, Ni; this has none of them"),
+        (0.0, None, None, "density must lie between 0 and 100 g/cm3, got 0.0"),
+        (5.0, 1.5, None, r"state_of_charge must lie in 0 ... 1, got 1.5"),
+        (5.0, 0.5, None, "an oxide with Mn, Co, Ni; this has none of them"),
+        (5.0, 0.5, 20.5, r"edge_shift_ev must lie in -20 ... 20 eV, got 20.5"),
+        (5.0, 0.5, -400.0, "edge_shift_ev must lie in"),
+        (5.0, None, 2.0, "edge_shift_ev moves nothing without a state_of_charge"),
     ],
 )
-def test_impossible_materials_are_refused(density: float, charge: float | None, words: str) -> None:
+def test_impossible_materials_are_refused(
+    density: float, charge: float | None, shift: float | None, words: str
+) -> None:
     with pytest.raises(ValueError, match=words):
-        Material("it", density, ((13, 1.0),), charge)
+        Material("it", density, ((13, 1.0),), charge, shift)
 
 
 def test_what_is_no_formula_and_what_is_not_tabulated_is_refused() -> None:
