@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from simulators.detector import Detector
 from simulators.pose import Pose
 from simulators.samples import rows
 from simulators.samples.filling import add_attenuation, put_labels
-from simulators.samples.packing import Packed, pack
+from simulators.samples.packing import CYLINDER, ELLIPSOID, Packed, pack
 from simulators.samples.solids import Solid, kind_of
 from simulators.samples.view import View, view_of
 
@@ -51,12 +52,22 @@ class Phantom:
             raise ValueError(f"labels are bytes: at most {MOST_NAMES} names, got {len(set(called))}; let solids share")
         return cls(tuple(solids), called, pack(solids))
 
-    @property
+    @cached_property
     def radius(self) -> float:
-        """mm from the rotation axis to the farthest matter (of the boxes around the bodies)."""
+        """mm from the rotation axis to the farthest matter; an ellipsoid counts as the upright elliptic cylinder around
+        it turned with its longer axis outwards."""
         p = self.packed
-        reach = np.abs(p.centre[:, :2]) + p.extent[:, :2]
-        return float(np.hypot(reach[:, 0], reach[:, 1]).max(initial=0.0))
+        out = np.hypot(p.centre[:, 0], p.centre[:, 1])
+        round_ = p.kind == ELLIPSOID
+        across = np.linalg.inv(p.matrix[round_])[:, :2]  # columns: the semi-axes, seen from above
+        half = np.linalg.norm(across, ord=2, axis=(1, 2))
+        corners = np.repeat(p.centre, np.diff(p.first_vertex), axis=0)[:, :2] + p.vertices[:, :2]
+        reaches = (
+            (out + p.size[:, 0])[p.kind == CYLINDER],
+            out[round_] + half,
+            np.hypot(corners[:, 0], corners[:, 1]),
+        )
+        return max(float(reach.max(initial=0.0)) for reach in reaches)
 
     @property
     def names(self) -> tuple[str, ...]:
