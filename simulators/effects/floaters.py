@@ -14,6 +14,8 @@ from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, lasting
 from simulators.effects.views import Views, check, within
 
+MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
+"""Crumbs, mm and optical depth: beyond, a frame takes seconds, or its numbers are none."""
 SEEN = 1e-3
 """Optical depth at which a crumb ends: a tenth of a percent of the light."""
 
@@ -40,8 +42,9 @@ class Crumb:
         middle, size = np.array([self.row, self.col]), np.array(shape)
         aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # of a circle, the frame may have only a cap
         reach = np.sqrt(np.maximum(2 * math.log(self.depth / SEEN) * self.sigma**2 - aside**2, 0.0))
-        top, left = np.maximum(np.ceil(middle - reach).astype(int), 0).tolist()
-        below, right = np.minimum(np.floor(middle + reach).astype(int) + 1, size).tolist()
+        # Clipped first: close to a cone's source a crumb is beyond whole numbers.
+        top, left = np.clip(np.ceil(middle - reach), 0, size).astype(int).tolist()
+        below, right = np.clip(np.floor(middle + reach) + 1, 0, size).astype(int).tolist()
         return top, below, left, right
 
 
@@ -89,6 +92,12 @@ class Floaters:
             raise ValueError(
                 f"count must be >= 1, depth >= {4 * SEEN}, speed positive in mm a view and heights [least, most], got "
                 f"{self.count}, {self.depth}, {self.speed} and {list(self.heights)}"
+            )
+        lengths = (*self.distance, *self.size, *map(abs, self.heights), self.speed)
+        if self.count > MOST or max(lengths) > FARTHEST or min(self.size) < 1 / FARTHEST or self.depth > DEEPEST:
+            raise ValueError(
+                f"count must be {MOST} at most, depth {DEEPEST:g}, lengths {FARTHEST:g} mm and size "
+                f"{1 / FARTHEST:g} mm at least, got {self}"
             )
         if self.seed < 0:
             raise ValueError(f"seed must be >= 0, got {self.seed}")
