@@ -82,7 +82,7 @@ def arrange(
         sweeps: over all bodies, before it is given up.
 
     Raises:
-        ValueError: a body is larger than the cylinder, or they do not come apart.
+        ValueError: a body is larger than the cylinder, the gaps alone are, or they do not come apart.
     """
     room, tall = radius - bodies.across, height / 2 - bodies.up
     if min(room.min(), tall.min()) < 0:
@@ -91,6 +91,13 @@ def arrange(
             "(diameter x height); make the room larger or the particles smaller"
         )
     n = room.size
+    # Balls of the gap's width around the centres do not overlap either. Asked first: with all of them neighbours of all
+    # it would take hours to find that out.
+    if n * gap**3 / 6 > (radius + gap / 2) ** 2 * (height + gap):
+        raise ValueError(
+            f"a gap of {1e3 * gap:.3g} um between {n} particles is more than {2 * radius:.3g} x {height:.3g} mm "
+            "(diameter x height) have room for; make the gap or the fill smaller"
+        )
     turn, out = rng.uniform(0, 2 * math.pi, n), room * np.sqrt(rng.uniform(0, 1, n))
     centres = np.stack([out * np.cos(turn), out * np.sin(turn), tall * rng.uniform(-1, 1, n)], axis=1)
     middling = float(np.median(bodies.reach))
@@ -162,11 +169,15 @@ def _near(centres: Reals, reach: Reals, room: float) -> Wholes:
     n = centres.shape[0]
     edge = 2 * reach.max() + room
     low, cells, size = np.empty(3), np.empty(3, np.int64), np.empty(3)
-    for a in range(3):
-        low[a] = centres[:, a].min()
-        span = centres[:, a].max() - low[a]
-        cells[a] = min(max(1, math.floor(span / edge)), 512)
-        size[a] = max(span / cells[a], 1e-300)
+    while True:
+        for a in range(3):
+            low[a] = centres[:, a].min()
+            span = centres[:, a].max() - low[a]
+            cells[a] = max(1, math.floor(min(span / edge, 512.0)))
+            size[a] = max(span / cells[a], 1e-300)
+        if cells[0] * cells[1] * cells[2] <= 8 * n + 64:
+            break
+        edge *= 1.25  # where bodies are few and far between, most cells were empty
     head, follow = np.full(cells[0] * cells[1] * cells[2], -1), np.empty(n, np.int64)
     home = np.empty((n, 3), np.int64)
     pairs, found = np.empty((32 * n, 2), np.int64), 0

@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.samples.solids import Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
+from simulators.samples.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
 
 # Attenuation times the can's radius. Whatever the can's size, its largest line integral lies between 1.5 and 3, so that
 # at least 5 % of the beam comes through.
 WALL, ELECTROLYTE, PARTICLE = 0.9, 0.15, 1.9
 
 CANDIDATES, ROUNDS = 256, 40
+MOST_PARTICLES = 5000
+"""Each looks at all that have their places: so many take a minute."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,18 @@ def battery(
         fill: share of the electrolyte's volume that spheres of the particles' median radius would take.
 
     Raises:
-        ValueError: for a field of view that is not positive, or where the particles do not fit without overlap.
+        ValueError: for a field of view that is not positive or not of this world, too many particles, or where they do
+            not fit without overlap.
     """
     width, height = field_of_view
     if not (width > 0 and height > 0):
         raise ValueError(f"field_of_view must be (width, height) > 0 in mm, got {field_of_view}")
+    if not (LEAST <= width <= MOST and LEAST <= height <= MOST):
+        raise ValueError(f"field_of_view must lie in {LEAST:g} ... {MOST:g} mm, got {field_of_view}")
+    if not (0 <= n_particles <= MOST_PARTICLES and 0 < fill <= 1):
+        raise ValueError(
+            f"n_particles must be 0 ... {MOST_PARTICLES}, fill above 0 and 1 at most, got {n_particles} and {fill}"
+        )
     radius, inside, tall = 0.44 * width, 0.95 * 0.44 * width, 0.9 * height
     can = (Tube(radius, inside, tall, WALL / radius), Cylinder(inside, tall, ELECTROLYTE / radius))
     if n_particles < 1:

@@ -12,7 +12,10 @@ import numpy as np
 from simulators.samples.arrangement import arrange, bodies_of
 from simulators.samples.grains import HABITS, Sizes, core, crack, grains
 from simulators.samples.pieces import Piece, check_roles
-from simulators.samples.solids import Cylinder, Tube
+from simulators.samples.solids import LEAST, MOST, Cylinder, Tube
+
+WIDEST = 2.0
+"""Of the logarithm of the grains' diameters: the largest are 20 000 times the smallest."""
 
 MADE_OF: Mapping[str, str] = MappingProxyType(
     {
@@ -45,7 +48,8 @@ class Cathode:
         diameter, height: mm, of the can outside; it has neither lid nor bottom.
         wall_um: thickness of the can's wall.
         size_um: median diameter of spheres of the grains' volumes.
-        spread: standard deviation of the logarithm of the diameter; none is farther than 2.5 of them from the median.
+        spread: standard deviation of the logarithm of the diameter, 2 at most; none is farther than 2.5 of them from
+            the median.
         fill: share of the volume between collector and separator that grains take, pores and cracks included.
         habits: shares of the number of sphere, ellipsoid, octahedron, truncated_octahedron and plate.
         irregularity: axes are longer or shorter by up to this share.
@@ -87,6 +91,12 @@ class Cathode:
         for name in ("spread", "gap_um", "collector_um", "separator_um"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        if not LEAST <= self.size_um * 1e-3 <= MOST:
+            raise ValueError(f"size_um must lie in {LEAST * 1e3:g} ... {MOST * 1e3:g}, got {self.size_um}")
+        if self.gap_um * 1e-3 > MOST:
+            raise ValueError(f"gap_um must be {MOST * 1e3:g} at most, got {self.gap_um}")
+        if self.spread > WIDEST:
+            raise ValueError(f"spread must be {WIDEST:g} at most, got {self.spread}")
         if not 0 <= self.fill < 0.64:
             raise ValueError(f"fill must be >= 0 and below 0.64, where balls jam, got {self.fill}")
         if not 0 <= self.irregularity < 1 or not self.aspect > 0:
@@ -99,6 +109,8 @@ class Cathode:
             raise ValueError(f"habits: {unknown[0]!r} is unknown; known: {', '.join(HABITS)}")
         if not (sum(self.habits.values()) > 0 and min(self.habits.values()) >= 0):
             raise ValueError(f"habits are shares >= 0, not all 0, got {dict(self.habits)}")
+        if sum(self.habits.values()) > MOST:
+            raise ValueError(f"habits are shares, {MOST:g} at most in sum, got {dict(self.habits)}")
         if not (self.inner_radius > 0 and self.bed_height > 0):
             raise ValueError(f"nothing is left inside {self.diameter} x {self.height} mm for the cathode")
         check_roles("made_of", MADE_OF, self.made_of)

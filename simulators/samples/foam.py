@@ -17,11 +17,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from simulators.samples.pieces import Piece, check_roles
-from simulators.samples.solids import Box, Cylinder, Ellipsoid
+from simulators.samples.solids import LEAST, MOST, Box, Cylinder, Ellipsoid
 
 Reals = NDArray[np.float64]
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"matter": "polypropylene", "hole": "air"})
+MOST_HOLES, MOST_CANDIDATES = 200_000, 10_000_000
+"""They take minutes, and 2 GB of memory."""
 POINTS_A_CELL = 8
 GREY = 2.0
 """Attenuation of the matter times half its width, in a beam without energies."""
@@ -65,8 +67,21 @@ class Foam:
                 f"holes go from largest_um down to smallest_um > 0 with gap_um >= 0 between them, got "
                 f"{self.largest_um}, {self.smallest_um} and {self.gap_um}"
             )
+        lengths = (self.diameter, self.height, *(self.edges or ()))
+        if not LEAST <= min(lengths) <= max(lengths) <= MOST:
+            raise ValueError(f"diameter, height and edges must lie in {LEAST:g} ... {MOST:g} mm, got {lengths}")
+        if not (self.smallest_um * 0.5e-3 >= LEAST and self.gap_um * 1e-3 <= MOST):
+            raise ValueError(
+                f"smallest_um must be {2e3 * LEAST:g} at least and gap_um {1e3 * MOST:g} at most, got "
+                f"{self.smallest_um} and {self.gap_um}"
+            )
         if not (self.n_holes >= 0 and self.candidates >= 1):
             raise ValueError(f"n_holes must be >= 0, candidates positive, got {self.n_holes} and {self.candidates}")
+        if self.n_holes > MOST_HOLES or self.candidates > MOST_CANDIDATES:
+            raise ValueError(
+                f"n_holes must be {MOST_HOLES} and candidates {MOST_CANDIDATES} at most, got {self.n_holes} and "
+                f"{self.candidates}"
+            )
         check_roles("made_of", MADE_OF, self.made_of)
         check_roles("attenuation", MADE_OF, self.attenuation)
 
@@ -116,6 +131,8 @@ def holes(points: Reals, radii: Reals, smallest: float, gap: float, n: int) -> R
     low = points.min(axis=0)
     span = np.maximum(points.max(axis=0) - low, 1e-12)
     edge = float((span.prod() * POINTS_A_CELL / len(points)) ** (1 / 3))
+    while np.maximum(1, span / edge).prod() > len(points):  # of what is thin or flat there were too many
+        edge *= 1.5
     cells = np.maximum(1, np.floor(span / edge)).astype(np.int64)
     size = span / cells * (1 + 1e-9)
     at = np.floor((points - low) / size).astype(np.int64)

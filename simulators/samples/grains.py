@@ -21,6 +21,8 @@ TAIL = 2.5
 """Standard deviations beyond which no size is drawn."""
 HOLLOW, CRACK = 0.5, (0.95, 0.06)
 """Size of the core of a hollow grain, of the grain's; radius and half width of a crack, of the sphere inside."""
+MOST = 100_000
+"""Grains of a cell: so many take minutes to arrange."""
 ROUNDEST, FLATTEST = 0.6, 0.85
 """The least and the most that truncated octahedra keep of their corners."""
 
@@ -88,9 +90,13 @@ def grains(
 
     Args:
         habits: shares of the grains' number, of any sum.
+
+    Raises:
+        ValueError: that were more than MOST.
     """
     names = list(habits)
     shares = np.array([habits[name] for name in names])
+    largest = math.pi / 6 * (sizes.median * math.exp(TAIL * sizes.spread)) ** 3
     made: list[Grain] = []
     taken = 0.0
     while True:
@@ -98,6 +104,11 @@ def grains(
         own = math.pi / 6 * diameter**3
         if taken + own / 2 > volume:
             return made
+        if len(made) == MOST or volume > MOST * largest:
+            raise ValueError(
+                f"{volume:.3g} mm3 of grains of {1e3 * sizes.median:g} um are more than {MOST} grains; make the cell "
+                "smaller, the grains larger or the fill lower"
+            )
         made.append(grain(rng, str(rng.choice(names, p=shares / shares.sum())), diameter, irregularity, aspect))
         taken += own
 

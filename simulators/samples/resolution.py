@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from simulators.samples.pieces import Piece, check_roles
-from simulators.samples.solids import Box, Cylinder, Ellipsoid, Polyhedron, Vector
+from simulators.samples.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Vector
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"carrier": "polypropylene", "bar": "Al", "star": "Al", "ball": "Al"})
 GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star": 2.0, "ball": 2.0})
 """Attenuation times the carrier's radius, in a beam without energies."""
+MOST_BARS, MOST_SPOKES = 100, 1000
 MARGIN = 1.1
 """The carrier's size over that of what it holds."""
 
@@ -49,6 +50,16 @@ class Resolution:
     def __post_init__(self) -> None:
         if not min(*self.widths_um, *self.balls_um, self.star_height_um, 1.0) > 0:
             raise ValueError(f"widths, diameters and heights must be positive in um, got {self}")
+        lengths = [um * 1e-3 for um in (*self.widths_um, *self.balls_um, self.star_height_um, self.star_um or 1.0)]
+        if not LEAST <= min(map(abs, lengths)) <= max(lengths) <= MOST:
+            raise ValueError(
+                f"widths, diameters and heights must lie in {1e3 * LEAST:g} ... {1e3 * MOST:g} um, got {self}"
+            )
+        if max(len(self.widths_um), len(self.balls_um), self.bars) > MOST_BARS or self.spokes > MOST_SPOKES:
+            raise ValueError(
+                f"a pattern has {MOST_BARS} widths, bars of each and balls at most, and {MOST_SPOKES} spokes, got "
+                f"{len(self.widths_um)}, {self.bars}, {len(self.balls_um)} and {self.spokes}"
+            )
         if self.bars < 2 or self.spokes < 3 or self.star_um < 0:
             raise ValueError(f"a group needs 2 bars and a star 3 spokes, got {self.bars} and {self.spokes}")
         if not (self.widths_um or self.balls_um or self.star_um):

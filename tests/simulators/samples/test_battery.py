@@ -49,3 +49,9 @@ def test_battery_repeats_with_its_seed_and_refuses_what_does_not_fit() -> None:
         battery(np.random.default_rng(4), n_particles=50, fill=0.9)
     with pytest.raises(ValueError, match="field_of_view must be"):
         battery(np.random.default_rng(4), (0.0, 1.0))
+    for field in ((1e308, 1.0), (1.0, 1e-308)):
+        with pytest.raises(ValueError, match=r"field_of_view must lie in 1e-09 \.\.\. 1e\+09 mm, got"):
+            battery(np.random.default_rng(4), field)
+    for count, fill in ((10**30, 0.1), (-1, 0.1), (10, -1.0)):
+        with pytest.raises(ValueError, match=r"n_particles must be 0 \.\.\. 5000, fill above 0 and 1 at most"):
+            battery(np.random.default_rng(4), n_particles=count, fill=fill)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,17 @@ def test_sizes_go_from_the_largest_down_to_the_smallest_that_is_allowed() -> Non
     assert Foam(**SETTINGS, seed=1).pieces() != Foam(**SETTINGS).pieces()
 
 
+@pytest.mark.parametrize("edges", [(3e4, 3e4, 0.01), (1e8, 0.3, 0.3)])
+def test_thin_and_flat_foams_cost_no_more_than_others(edges: tuple[float, float, float]) -> None:
+    """Cells that points are sorted into are no more than the points: there were millions."""
+    tracemalloc.start()
+    balls = _balls(Foam(n_holes=50, candidates=2000, smallest_um=1.0, gap_um=0.0, edges=edges))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(balls) == 50
+    assert peak < 5e6
+
+
 def test_labels_and_mass_are_those_of_matter_less_holes() -> None:
     entry = {"kind": "foam", **SETTINGS, "attenuation": {"matter": 3.0}}
     sample = build_sample("phantom", entry, Beam(1e5))
@@ -92,6 +104,12 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
         ({"gap_um": -1}, "from largest_um down"),
         ({"candidates": 0}, "candidates positive"),
         ({"n_holes": -1}, "n_holes must be >= 0"),
+        ({"diameter": 1e-308}, r"must lie in 1e-09 \.\.\. 1e\+09 mm, got \(1e-308, 0.5\)"),
+        ({"edges": [1e308, 1, 1]}, "must lie in"),
+        ({"smallest_um": 1e-308}, "smallest_um must be 2e-06 at least"),
+        ({"gap_um": 1e308}, r"gap_um 1e\+12 at most"),
+        ({"n_holes": 10**30}, "n_holes must be 200000 and candidates 10000000 at most"),
+        ({"candidates": 10**30}, "at most"),
         ({"attenuation": {"foam": 1.0}}, "'foam' is no part"),
     ],
 )

@@ -106,6 +106,11 @@ def test_a_pattern_may_have_one_kind_only() -> None:
         ({"bars": 1}, "needs 2 bars"),
         ({"spokes": 2}, "a star 3 spokes"),
         ({"widths_um": [], "balls_um": [], "star_um": 0}, "needs widths_um"),
+        ({"bars": 10**30}, "100 widths, bars of each and balls at most, and 1000 spokes, got 2, 10{30}, 3 and 12"),
+        ({"spokes": 10**30}, "1000 spokes, got"),
+        ({"balls_um": [1.0] * 101}, "got 2, 3, 101 and 12"),
+        ({"star_um": 1e308}, r"must lie in 1e-06 \.\.\. 1e\+12 um"),
+        ({"widths_um": [1e-300]}, "must lie in"),
         ({"made_of": {"wedge": "Al"}}, "'wedge' is no part"),
     ],
 )
