@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtr
 
 from beamline.xafs.local import local_parabolas
 
@@ -15,6 +17,7 @@ LEAST = 9
 """Energies that a curve must have."""
 WINDOW = 5  # points of a local parabola
 SURE = 5.0  # times the noise that what is not smooth must be
+FALSE_ALARM = 1e-6  # of a curve without an edge, under normal noise of any size
 SMOOTH = 1e-3  # of the absorption: what a smooth curve may differ from Victoreen's by without any noise
 
 
@@ -42,10 +45,12 @@ class Edge:
 def find_edge(energies: Reals, absorption: Reals) -> Edge:
     """The edge of a curve.
 
-    A curve without an edge is Victoreen's, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise; the
-    noise is taken from second differences, which see hardly anything else. Where it is not, the edge is the maximum of
-    the slope (of parabolas through five points), and the white line the first
-    maximum above it that stands out of the noise.
+    A curve without an edge is Victoreen's, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise. There
+    is an edge where a step upwards at one of the energies makes it fit better than chance would in one of a million
+    such curves (Student's t of the step, times the number of places where it may stand), or where it differs from
+    Victoreen's by five times its noise, which is taken from second differences: these see hardly anything else. The
+    edge is the maximum of the slope near that step (of parabolas through five points), and the white line the top
+    above it, if that stands out of the noise and of the curve's far end, continued.
 
     Args:
         energies: keV, rising, [n].
@@ -57,15 +62,20 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
     if energies.size < LEAST or not (np.diff(energies) > 0).all():
         raise ValueError(f"an edge needs at least {LEAST} rising energies, got {energies.size}")
     noise = _noise(absorption)
-    misfit = float(np.sqrt(np.mean((absorption - _victoreen(energies, absorption)) ** 2)))
+    basis = np.linalg.qr(_victoreen(energies))[0]
+    rest = absorption - basis @ (basis.T @ absorption)
+    misfit = float(np.sqrt(np.mean(rest**2)))
+    step, chance = _step(rest, basis)
 
     def none(why: str) -> Edge:
         return Edge(False, why, None, None, misfit, noise)
 
-    if misfit <= max(SURE * noise, SMOOTH * float(np.abs(absorption).mean())):
+    stands_out = chance < FALSE_ALARM or misfit > SURE * noise
+    if not stands_out or misfit <= SMOOTH * float(np.abs(absorption).mean()):
         return none("the curve is as smooth as one without an edge, to within its noise")
     _, slope = local_parabolas(energies, absorption, WINDOW)
-    steepest = int(np.argmax(slope))
+    first = max(step - max(WINDOW, energies.size // 10), 0)
+    steepest = first + int(np.argmax(slope[first : step + max(WINDOW, energies.size // 10)]))
     if slope[steepest] <= 0:
         return none("the absorption rises nowhere")
     if steepest < 2 or steepest > energies.size - 3:
@@ -75,12 +85,35 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
     )
 
 
+def _step(rest: Reals, basis: Reals) -> tuple[int, float]:
+    """Where a step upwards explains most of what is left of a curve, and the chance that noise alone does as much: the
+    first energy above the step, and at most 1.
+
+    Args:
+        rest: [n], without what `basis` holds.
+        basis: orthonormal, [n, k].
+    """
+    at = np.arange(2, rest.size - 1)
+    above, held = (np.cumsum(values[::-1], axis=0)[::-1][at] for values in (rest, basis))
+    free = np.maximum(rest.size - at - (held**2).sum(axis=1), 1e-9)  # of the step, squared: what no smooth curve has
+    gain = np.where(above > 0, above**2 / free, 0.0)
+    best, left = int(np.argmax(gain)), rest.size - basis.shape[1] - 1
+    noise = max(float(rest @ rest) - float(gain[best]), 0.0) / left
+    t = math.sqrt(float(gain[best]) / noise) if noise > 0 else math.inf
+    return int(at[best]), min(float(stdtr(left, -t)) * at.size, 1.0)
+
+
 def _white_line(energies: Reals, absorption: Reals, edge: int, noise: float) -> float | None:
-    above = absorption[edge:]
-    top = edge + int(np.argmax(above))
-    falls = float(absorption[top] - absorption[top:].min())
+    top = edge + int(np.argmax(absorption[edge:]))
     rises = float(absorption[top] - absorption[: edge + 1].min())
-    if top > energies.size - 3 or falls <= max(SURE * noise, 0.05 * rises):
+    far = energies > (energies[top] + energies[-1]) / 2
+    if top > energies.size - 3 or far.sum() < 3:
+        return None
+    # The far end as a + b E^-3: what a long range falls by, the top of a bare step stands above the end as well.
+    basis = _victoreen(energies)[:, :2]
+    of_far = np.linalg.pinv(basis[far]).T @ basis[top]
+    stands = float(absorption[top] - of_far @ absorption[far])
+    if stands <= max(SURE * noise * math.sqrt(1 + float(of_far @ of_far)), 0.05 * rises):
         return None
     return _top(energies, absorption, top, 2)
 
@@ -90,10 +123,10 @@ def _noise(values: Reals) -> float:
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / np.sqrt(6))
 
 
-def _victoreen(energies: Reals, absorption: Reals) -> Reals:
+def _victoreen(energies: Reals) -> Reals:
+    """1, E^-3 and E^-4, [n, 3]."""
     x = energies.mean() / energies
-    basis = np.stack([np.ones_like(x), x**3, x**4], axis=1)
-    return np.asarray(basis @ np.linalg.lstsq(basis, absorption, rcond=None)[0])
+    return np.stack([np.ones_like(x), x**3, x**4], axis=1)
 
 
 def _top(energies: Reals, values: Reals, at: int, reach: int) -> float:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from beamline.xafs.edge import LEAST, find_edge
+from beamline.xafs.edge import LEAST, _step, find_edge
 
 Reals = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def test_an_edge_without_a_white_line_has_none() -> None:
     seed=st.integers(0, 10**6),
 )  # fmt: skip
 def test_a_curve_without_an_edge_has_none(low: float, width: float, noise: float, seed: int) -> None:
-    """Whatever the noise: 121 normal numbers differ from a smooth curve by five times their own noise never (1e-30)."""
+    """Whatever the noise: a false alarm in a million curves."""
     energies = np.linspace(low, low + width, 121)
     found = find_edge(energies, _smooth(energies) + np.random.default_rng(seed).normal(0, noise, 121))
     assert not found.seen
@@ -81,6 +81,39 @@ def test_an_edge_at_the_end_of_the_range_is_told_apart() -> None:
     for energies in (np.arange(8.30, 8.344, 0.001), np.arange(8.3437, 8.40, 0.001)):
         found = find_edge(energies, _curve(energies, 8.3437))
         assert not found.seen and "steepest at the end of the range; widen the range" in found.why
+
+
+@pytest.mark.parametrize("line", [0.0, 0.6])
+def test_an_edge_of_six_times_the_noise_is_seen(line: float) -> None:
+    """To a person it is plain; it is within 4 eV, which is as much as five energies' noise leaves open."""
+    energies = np.arange(8.30, 8.42, 0.001)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0, 1 / 6, energies.size)
+        found = find_edge(energies, _curve(energies, 8.3437, line, jump=1.0) + noise)
+        assert found.seen and found.energy == pytest.approx(8.3437, abs=0.004)
+
+
+@pytest.mark.parametrize("n", [LEAST, 40])
+def test_the_chance_of_a_false_alarm_is_what_it_says(n: int) -> None:
+    """A chance below p comes in at most p of 3000 curves of noise: 1e-6 of all such tests have more than these."""
+    basis = np.linalg.qr(np.linspace(1, 1.1, n)[:, None] ** np.array([0, -3, -4]))[0]
+    noise = np.random.default_rng(n).normal(size=(3000, n))
+    chances = np.array([_step(one - basis @ (basis.T @ one), basis)[1] for one in noise])
+    for p, most in ((0.1, 380), (0.01, 58), (0.001, 15)):
+        assert (chances < p).sum() <= most
+    assert (chances < 0.1).sum() > 60  # and not because it never rings
+
+
+def test_the_top_of_a_bare_step_is_no_white_line_however_far_the_curve_falls_beyond() -> None:
+    for last in (8.42, 8.7, 9.2):
+        energies = np.arange(8.30, last, 0.002)
+        assert find_edge(energies, _curve(energies, 8.3437, line=0.0)).white_line is None
+        found = find_edge(energies, _curve(energies, 8.3437))
+        assert found.white_line == pytest.approx(8.3497, abs=0.001)
+    energies = np.arange(8.30, 8.42, 0.001)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0, 0.02, energies.size)
+        assert find_edge(energies, _curve(energies, 8.3437, line=0.0) + noise).white_line is None
 
 
 def test_what_only_falls_has_no_edge() -> None:
