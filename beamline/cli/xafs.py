@@ -19,13 +19,12 @@ from beamline.cli.scan_options import underscored
 from beamline.cli.told import told_as_json
 from beamline.errors import DataError, QualityError, ScanStopped
 from beamline.events import Event, fan_out
-from beamline.simulate.energy_scan import open_energy_scan
 from beamline.stop import StopRequest
 from beamline.terminal import Terminal
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import LEAST, find_edge
 from beamline.xafs.measured import Asked, open_series
-from beamline.xafs.results import Found, lines, refuse_existing_results, table_beside, write
+from beamline.xafs.results import Found, left_out, lines, refuse_existing_results, table_beside, write
 from beamline.xafs.series import Series, Taken, take
 from drivers.clock import SystemClock
 
@@ -92,7 +91,8 @@ def xafs(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Find the energy at which a material stands out most of what is around it, and its absorption edge.
+    """Find the energy at which a material, as thick as it is, stands out most of what is around it, and its absorption
+    edge.
 
     SCENE is a YAML file or the name of a scene that comes with the package: its radiographs are simulated at all
     energies from --from to --to. FILE is a text table of energy and absorption, or an HDF5 file with `energy` and
@@ -106,18 +106,24 @@ def xafs(
         raise click.BadParameter(f"{str(target)!r} is no picture; name a .png file", param_hint="--output")
     is_scene = Path(source).suffix.lower() in _SCENES
     _refuse_foreign(click.get_current_context(), _OF_FILES if is_scene else _OF_SCENES)
-    refuse_existing_results(target)
     clock, stop = SystemClock(), StopRequest()
     with told_as_json(as_json) as sinks, ExitStack() as opened:
+        refuse_existing_results(target)
         opened.enter_context(stop_signals(stop))
         series: Series | Curve
         if is_scene:
+            from beamline.simulate.energy_scan import open_energy_scan  # and xraylib, of which measured files need none
+
             series = open_energy_scan(
                 source, _grid(low, high, step or 0.001), material, math.radians(angle or 0.0), seed or 0
             ).series()
         else:
             asked = Asked(low or 0.0, high or math.inf, region, around, unit, quantity)
             series = opened.enter_context(open_series(Path(source), asked))
+            n = series.energies.size if isinstance(series, Curve) else series.n
+            if n < LEAST:
+                within = " between --from and --to" if low or high else ""
+                raise DataError(f"{source}: {n} energies{within} are too few for an edge, which takes {LEAST}.")
         with Terminal(sys.stderr) as terminal:
             sink = fan_out(*(sinks or [terminal]))
             taken = Taken(series) if isinstance(series, Curve) else take(series, sink, clock, lambda: stop.stopping)
@@ -129,21 +135,21 @@ def xafs(
     if not as_json:
         click.echo("\n".join([*lines(found), f"written     {target}, {table_beside(target)}"]))
     if taken.cut:
-        raise ScanStopped(f"Stopped after {taken.curve.energies.size} energies; picture and table hold them.")
+        n = taken.curve.energies.size + taken.curve.left_out.size
+        raise ScanStopped(f"Stopped after {n} energies; picture and table hold them.")
     if not found.edge.seen:
         raise QualityError(f"No absorption edge is seen: {found.edge.why}. Picture and table were written.")
 
 
 def _found(what: str, taken: Taken) -> Found:
     """What a curve shows. Raises ScanStopped or DataError, with nothing written: it has too few energies."""
-    energies = taken.curve.energies
-    if energies.size < LEAST:
+    n, lost = taken.curve.energies.size, taken.curve.left_out
+    if n < LEAST:
+        why = f" Left out: {left_out(taken.curve)}." if lost.size else ""
         if taken.cut:
-            raise ScanStopped(f"Stopped after {energies.size} energies, too few for an edge; nothing was written.")
-        raise DataError(f"{what}: {energies.size} energies are too few for an edge, which takes {LEAST}.")
-    if not (np.diff(energies) > 0).all():
-        raise DataError(f"{what}: an energy occurs twice. Nothing was written.")
-    return Found(what, taken.curve, find_edge(energies, taken.curve.absorption))
+            raise ScanStopped(f"Stopped after {n + lost.size} energies, too few for an edge; nothing was written.{why}")
+        raise DataError(f"{what}: {n} energies are too few for an edge, which takes {LEAST}; nothing was written.{why}")
+    return Found(what, taken.curve, find_edge(taken.curve.energies, taken.curve.absorption))
 
 
 def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.float64]:

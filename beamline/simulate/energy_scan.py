@@ -14,6 +14,7 @@ from beamline.config_text import read
 from beamline.errors import ConfigError
 from beamline.simulate.scene_file import open_scene, volumes_beside
 from beamline.xafs.contrast import Regions
+from beamline.xafs.depth import line_integrals
 from beamline.xafs.series import Series
 from simulators.exposure import expose
 from simulators.light.beam import Beam
@@ -60,7 +61,7 @@ class EnergyScan:
 
     def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
         """(keV, line integrals [row, col]) of each energy, with all the effects of the scene: a dark level once, then
-        flats and a radiograph each, one after the other as the scene's period has it."""
+        flats and a radiograph each, one after the other as the scene's period has it. A pixel without light is +inf."""
         n_darks = max(self.scan.scene.scan.darks, 1)
         dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(n_darks)], axis=0)
         number = n_darks
@@ -69,8 +70,7 @@ class EnergyScan:
             flat = np.mean([here._counts(number + k, sample=False) for k in range(FLATS)], axis=0) - dark
             signal = here._counts(number + FLATS) - dark
             number += FLATS + 1
-            # A pixel without light is taken to have half a count, as the correction of scans takes it.
-            yield energy, -np.log(np.maximum(signal, 0.5) / np.maximum(flat, 0.5))
+            yield energy, line_integrals(signal, flat)
 
     def _at(self, energy: float) -> EnergyScan:
         """The same scan in light of that energy."""
@@ -134,7 +134,15 @@ def open_energy_scan(
         regions = _regions(scene.sample, chosen, scan, angle)
     except ValueError as error:
         raise ConfigError(f"{opened.path}: {chosen} cannot be compared: {error}. Nothing was simulated.") from None
-    return EnergyScan(opened.path.stem, scan, scene.sample, beam, energies, angle, chosen, regions)
+    made = EnergyScan(opened.path.stem, scan, scene.sample, beam, energies, angle, chosen, regions)
+    try:
+        for end in (float(energies.min()), float(energies.max())):
+            seen = made._at(end).sample  # with its bandwidth and harmonics, which may lie outside the tables
+            for constituent in seen.constituents:
+                constituent.attenuation(seen.spectrum.energies)
+    except ValueError as error:
+        raise ConfigError(f"{opened.path}: {error}. Nothing was simulated.") from None
+    return made
 
 
 def _chosen(sample: Mixture, wanted: str | None) -> str:

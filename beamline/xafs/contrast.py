@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,9 @@ Mask = NDArray[np.bool_]
 NEARLY_BEST = 0.95
 WINDOW = 7  # energies
 ENOUGH = 50  # pixels to take a noise from
+FEWEST = 16  # of them, to take any
+DARK = 0.01  # of a region's pixels: with more of them dark, nothing is known of it
+KNOWN = 0.5  # of a region's pixels, at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +29,7 @@ class Regions:
 
     Attributes:
         inside: bool [row, col], of the material.
-        around: bool [row, col], of what it is compared with; None: with nothing.
+        around: bool [row, col], of what it is compared with, none of it inside; None: with nothing.
         thickness: mm of the material, mean over `inside`; None: not known.
     """
 
@@ -46,8 +51,10 @@ class Curve:
         energies: keV, rising, [n].
         absorption: [n], of the region less what is around it, in `unit`.
         contrast: the same as a line integral, [n]; None where only the absorption is known.
-        noise: rms noise of the difference of a pixel inside and one around, as a line integral, [n]; None likewise.
+        noise: rms noise of the difference of a pixel inside and one around, as a line integral, [n]; None likewise, and
+            where the regions are too small to tell.
         unit: "1/mm" where the thickness is known, else "line integral" or the file's own word.
+        left_out: keV, rising, of the energies at which too little light came through, or too few pixels had a value.
     """
 
     energies: Reals
@@ -55,6 +62,7 @@ class Curve:
     contrast: Reals | None = None
     noise: Reals | None = None
     unit: str = "line integral"
+    left_out: Reals = field(default_factory=lambda: np.zeros(0))
 
     @property
     def contrast_to_noise(self) -> Reals | None:
@@ -90,7 +98,12 @@ class Curve:
 
 
 def measured(frame: Reals, regions: Regions) -> tuple[float, float]:
-    """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels."""
+    """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
+    pixels to tell).
+
+    Both are NaN where nothing is known of a region: more than 1 % of its pixels are dark (+inf; what is left of such a
+    region is not its mean, and the noise of no light is none), or less than half of them have a value.
+    """
     inside, noise = _level(frame, regions.inside)
     if regions.around is None:
         return inside, noise
@@ -98,13 +111,15 @@ def measured(frame: Reals, regions: Regions) -> tuple[float, float]:
     return inside - around, float(np.hypot(noise, noise_around))
 
 
-def curve_of(energies: Reals, points: list[tuple[float, float]], regions: Regions) -> Curve:
-    """The curve of the points that `measured` gave, in the order of the energies."""
+def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Regions) -> Curve:
+    """The curve of the points that `measured` gave, in the order of the energies, of those that are known."""
     order = np.argsort(energies, kind="stable")
-    contrast, noise = np.array(points, dtype=np.float64).T[:, order]
+    contrast, noise = np.array(points, dtype=np.float64).reshape(-1, 2).T[:, order]
+    known, e = np.isfinite(contrast), energies[order]
+    contrast, noises = contrast[known], None if np.isnan(noise[known]).any() else noise[known]
     if regions.thickness is None:
-        return Curve(energies[order], contrast, contrast, noise)
-    return Curve(energies[order], contrast / regions.thickness, contrast, noise, "1/mm")
+        return Curve(e[known], contrast, contrast, noises, left_out=e[~known])
+    return Curve(e[known], contrast / regions.thickness, contrast, noises, "1/mm", e[~known])
 
 
 def _level(frame: Reals, mask: Mask) -> tuple[float, float]:
@@ -114,14 +129,23 @@ def _level(frame: Reals, mask: Mask) -> tuple[float, float]:
     Comput. Vis. Image Underst. 64, 300, 1996); its median over the pixels, for a normal distribution, so that edges
     within the region count for little. The region's own rim is left out where enough pixels are within it.
     """
-    curved = np.zeros_like(frame)
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    # Only the region and the pixels next to it: frames may be far larger.
+    part = slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(cols[0] - 1, 0), cols[-1] + 2)
+    frame, mask = frame[part], mask[part]
+    values = frame[mask]
+    dark, known = np.isposinf(values), np.isfinite(values)
+    if dark.sum() > DARK * (dark | known).sum() or known.sum() < KNOWN * values.size:
+        return math.nan, math.nan
+    frame = np.where(np.isfinite(frame), frame, np.nan)
+    curved = np.full_like(frame, np.nan)
     inner = frame[1:-1, 1:-1]
     sides = frame[:-2, 1:-1] + frame[2:, 1:-1] + frame[1:-1, :-2] + frame[1:-1, 2:]
     corners = frame[:-2, :-2] + frame[:-2, 2:] + frame[2:, :-2] + frame[2:, 2:]
     curved[1:-1, 1:-1] = 4 * inner - 2 * sides + corners
-    whole = binary_erosion(mask, np.ones((3, 3)))
-    if whole.sum() < ENOUGH:
-        whole = mask.copy()
-        whole[[0, -1]] = whole[:, [0, -1]] = False
-    chosen = curved[whole] if whole.any() else np.zeros(1)
-    return float(frame[mask].mean()), float(np.median(np.abs(chosen)) / 0.6745 / 6)
+    left = curved[binary_erosion(mask, np.ones((3, 3)))]
+    left = left[np.isfinite(left)]
+    if left.size < ENOUGH:
+        left = curved[mask & np.isfinite(curved)]
+    noise = float(np.median(np.abs(left)) / 0.6745 / 6) if left.size >= FEWEST else math.nan
+    return float(values[known].mean()), noise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,47 +15,17 @@ from numpy.typing import NDArray
 
 from beamline.errors import ConfigError, DataError
 from beamline.storage import hdf5
+from beamline.storage.scan_source import require_real
 from beamline.xafs.contrast import Curve, Regions
+from beamline.xafs.radiographs import Part, Radiographs, reals
 from beamline.xafs.series import Series
 
 Reals = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 
-EV_BEYOND = 500.0
-"""An energy above this is none in keV that a beamline has."""
+EV_BEYOND, KEV_BELOW = 500.0, 0.05
+"""keV: an energy above the first was eV, one below the second was keV already; no beamline has such."""
 _KEV = {"keV": 1.0, "eV": 1e-3}
-
-
-@dataclass(frozen=True, eq=False)
-class Radiographs:
-    """A file of frames over energies, open for reading.
-
-    Attributes:
-        energies: keV, [n].
-        frames: dataset [n, row, col].
-        flats: [n, row, col], or [row, col] for all energies; None where frames are line integrals.
-        dark: [row, col], of the same unit as frames.
-    """
-
-    energies: Reals
-    frames: h5py.Dataset
-    flats: h5py.Dataset | None
-    dark: Reals
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return int(self.frames.shape[1]), int(self.frames.shape[2])
-
-    def line_integrals(self, which: Sequence[int]) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of the frames `which`, in that order."""
-        for i in which:
-            energy = float(self.energies[i])
-            frame = np.asarray(self.frames[i], dtype=np.float64)
-            if self.flats is None:
-                yield energy, frame
-                continue
-            flat = np.asarray(self.flats[i] if self.flats.ndim == 3 else self.flats[()], dtype=np.float64)
-            yield energy, -np.log(np.maximum(frame - self.dark, 0.5) / np.maximum(flat - self.dark, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +37,8 @@ class Table:
 
 
 def read_table(path: Path, unit: str | None) -> Table:
-    """Two columns of text, energy and absorption, split by commas, semicolons or blanks; lines that begin with a letter
-    or # are left out.
+    """Two columns of text, energy and absorption, split by commas, semicolons, tabs or blanks; lines that begin with a
+    letter, # or % are left out. Where something else splits the columns, a comma may be the decimal point.
 
     Args:
         unit: of the energy, "keV" or "eV"; None: keV.
@@ -82,15 +52,21 @@ def read_table(path: Path, unit: str | None) -> Table:
         raise DataError(f"{path} cannot be read ({error}).") from error
     rows = []
     for number, line in enumerate(lines, start=1):
-        if not line.strip() or re.match(r"\s*[#A-Za-z\"]", line):
+        if not line.strip() or re.match(r"\s*(?!(?:nan|inf)\b)[#%A-Za-z\"]", line, re.IGNORECASE):
             continue
         try:
-            energy, absorption = (float(field) for field in re.split(r"[,;\s]+", line.strip())[:2])
+            energy, absorption = (float(field) for field in _fields(line.strip())[:2])
         except ValueError:
             raise DataError(f"{path}, line {number}: {line.strip()!r} is not an energy and an absorption.") from None
         rows.append((energy, absorption))
     values = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return Table(_in_kev(path, values[:, 0], unit), _finite(path, "absorption", values[:, 1]))
+
+
+def _fields(line: str) -> list[str]:
+    if re.search(r"[;\t]", line) or re.match(r"[-+]?\d+,\d+\s+[-+]?\d+,\d+(?:\s|$)", line):
+        return [re.sub(r"(?<=\d),(?=\d)", ".", field) for field in re.split(r"\s*[;\t]\s*|\s+", line)]
+    return re.split(r"[,\s]+", line)
 
 
 @dataclass(frozen=True)
@@ -100,7 +76,7 @@ class Asked:
     Attributes:
         low, high: keV, the first and the last energy.
         region, around: (first row, row after the last, first column, column after the last) of the material, and of
-            what it is compared with; None: all of the frame, and nothing.
+            what it is compared with, less the material; None: all of the frame, and nothing.
         unit: of the energies, "keV" or "eV"; None: as the file says, else keV.
         quantity: of the frames, "counts" or "line_integrals"; None: counts.
     """
@@ -118,23 +94,36 @@ def open_series(path: Path, asked: Asked) -> Iterator[Series | Curve]:
     """A file's curve, or the radiographs that make one, while it is open.
 
     Raises:
-        ConfigError: a region is not in the frame.
-        DataError: it is no such file; see `open_measured`.
+        ConfigError: a region is not in the frame, or there is nothing around it.
+        DataError: it is no such file, see `open_measured`, or an energy is there twice.
     """
     with open_measured(path, asked.unit, asked.quantity) as found:
         order = np.argsort(found.energies, kind="stable")
         kept = order[(found.energies[order] >= asked.low) & (found.energies[order] <= asked.high)]
+        energies = found.energies[kept]
+        if not (rises := np.diff(energies) > 0).all():
+            raise DataError(
+                f"{path}: {energies[np.argmin(rises)]:.9g} keV is there more than once; take the mean of what belongs "
+                "to one energy. Nothing was written."
+            )
         if isinstance(found, Table):
             if asked.region or asked.around:
                 raise ConfigError(f"{path} holds no frames, so that regions say nothing of it. Nothing was written.")
-            yield Curve(found.energies[kept], found.absorption[kept], unit="as in the file")
+            yield Curve(energies, found.absorption[kept], unit="as in the file")
             return
-        everything = (0, found.shape[0], 0, found.shape[1])
-        regions = Regions(
-            _mask(found.shape, asked.region or everything),
-            None if asked.around is None else _mask(found.shape, asked.around),
-        )
-        yield Series(path.name, kept.size, found.line_integrals(kept.tolist()), regions)
+        inside = _mask(found.shape, asked.region or (0, found.shape[0], 0, found.shape[1]))
+        around = None if asked.around is None else _mask(found.shape, asked.around) & ~inside
+        if around is not None and not around.any():
+            raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
+        part = _bounds(inside if around is None else inside | around)
+        regions = Regions(inside[part], None if around is None else around[part])
+        yield Series(path.name, kept.size, found.line_integrals(kept.tolist(), part), regions)
+
+
+def _bounds(mask: NDArray[np.bool_]) -> Part:
+    """The rows and columns that hold it and the pixels next to it: no more of a frame is read."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
 
 
 def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
@@ -165,11 +154,11 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
         return
     with hdf5.open_hdf5(path) as file:
         energies = _energies(path, file, unit)
-        if (mu := hdf5.dataset(file, "mu")) is not None:
+        if (mu := _numbers(path, file, "mu")) is not None:
             yield Table(energies, _finite(path, "mu", _like(path, "mu", mu, energies)))
             return
-        frames, flats = _needed(path, file, "frames"), hdf5.dataset(file, "flats")
-        if frames.ndim != 3 or frames.shape[0] != energies.size:
+        frames, flats = _needed(path, file, "frames"), _numbers(path, file, "flats")
+        if frames.ndim != 3 or frames.shape[0] != energies.size or 0 in frames.shape[1:]:
             raise DataError(f"{path}: frames are {frames.shape}; they must be [energy, row, col] of {energies.size}.")
         if quantity == "line_integrals":
             flats = None
@@ -180,7 +169,7 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
             )
         elif flats.shape not in (frames.shape, frames.shape[1:]):
             raise DataError(f"{path}: flats are {flats.shape}; they must be {frames.shape} or {frames.shape[1:]}.")
-        yield Radiographs(energies, frames, flats, _dark(path, file, frames.shape[1:]))
+        yield Radiographs(energies, frames, flats, _darks(path, file, frames.shape[1:]))
 
 
 def _energies(path: Path, file: h5py.File, unit: str | None) -> Reals:
@@ -189,23 +178,33 @@ def _energies(path: Path, file: h5py.File, unit: str | None) -> Reals:
         unit = {"kev": "keV", "ev": "eV"}.get(said)
         if unit is None:
             raise DataError(f"{path}: energies are in {said!r}, which is neither keV nor eV; say --unit.")
-    return _in_kev(path, np.asarray(item[()], dtype=np.float64).reshape(-1), unit)
+    return _in_kev(path, reals(item[()]).reshape(-1), unit)
 
 
-def _dark(path: Path, file: h5py.File, shape: tuple[int, ...]) -> Reals:
-    item = hdf5.dataset(file, "darks")
-    if item is None:
-        return np.zeros(shape)
-    dark = np.asarray(item[()], dtype=np.float64)
-    if dark.shape[-2:] != shape or dark.ndim not in (2, 3):
-        raise DataError(f"{path}: darks are {dark.shape}; they must be {shape} or several of them.")
-    return dark if dark.ndim == 2 else np.asarray(dark.mean(axis=0))
+def _darks(path: Path, file: h5py.File, shape: tuple[int, ...]) -> h5py.Dataset | None:
+    item = _numbers(path, file, "darks")
+    if item is not None and (item.shape[-2:] != shape or item.ndim not in (2, 3) or item.size == 0):
+        raise DataError(f"{path}: darks are {item.shape}; they must be {shape} or several of them.")
+    return item
+
+
+def _numbers(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
+    """A dataset of numbers; None where there is none of that name."""
+    item = hdf5.dataset(file, name)
+    if item is not None:
+        require_real(item.dtype, f"{path}: {name}")
+        if missing := hdf5.missing_links(item):
+            raise DataError(f"{path}: {name} is in {missing[0]}, which is not there.")
+    return item
 
 
 def _needed(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    item = hdf5.dataset(file, name)
+    item = _numbers(path, file, name)
     if item is None:
-        raise DataError(f"{path} has no dataset {name}; it needs energy, and mu or frames (with flats).")
+        raise DataError(
+            f"{path} has no dataset {name}; it needs energy, and mu or frames (with flats). It has "
+            f"{', '.join(sorted(file)) or 'nothing'}."
+        )
     return item
 
 
@@ -224,9 +223,12 @@ def _finite(path: Path, name: str, values: Any) -> Reals:
 
 def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
     energies = _finite(path, "energy", values) * _KEV[unit or "keV"]
-    if energies.size and not 0 < energies.min() <= energies.max() <= EV_BEYOND:
+    if not energies.size:
+        return energies
+    low, high = float(energies.min()), float(energies.max())
+    if not KEV_BELOW <= low <= high <= EV_BEYOND:
+        other = "keV" if high < EV_BEYOND and unit == "eV" else "eV"
         raise DataError(
-            f"{path}: energies from {energies.min():g} to {energies.max():g} keV cannot be; where they are eV, say "
-            "--unit eV."
+            f"{path}: energies from {low:g} to {high:g} keV cannot be; where they are {other}, say --unit {other}."
         )
     return energies

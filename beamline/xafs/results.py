@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ class Found:
         return {
             "what": self.what,
             "n_energies": curve.energies.size,
+            "n_left_out": curve.left_out.size,
             "from_kev": curve.energies[0],
             "to_kev": curve.energies[-1],
             "edge_seen": edge.seen,
@@ -62,6 +64,8 @@ def lines(found: Found) -> list[str]:
     """For people."""
     curve, edge = found.curve, found.edge
     said = [f"{found.what}: {curve.energies.size} energies, {curve.energies[0]:.4f} to {curve.energies[-1]:.4f} keV"]
+    if curve.left_out.size:
+        said.append(f"left out    {left_out(curve)}")
     if edge.energy is None:
         said.append(f"no edge     {edge.why}")
     else:
@@ -73,12 +77,19 @@ def lines(found: Found) -> list[str]:
         )
     first, last = curve.nearly_best
     cnr = curve.contrast_to_noise
-    height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel"
+    height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel, as thick as it is"
     said.append(
         f"best        {curve.energies[curve.best]:.4f} keV: highest {found.by}{height} "
         f"(95 % of it from {first:.4f} to {last:.4f} keV)"
     )
     return said
+
+
+def left_out(curve: Curve) -> str:
+    """At how many energies nothing is known of a region, and where these are."""
+    e = curve.left_out
+    where = f"{e[0]:.4f} keV" if e.size == 1 else f"{e.size} energies between {e[0]:.4f} and {e[-1]:.4f} keV"
+    return f"{where}: too little light comes through, or too few pixels have a value"
 
 
 def table(curve: Curve) -> str:
@@ -107,6 +118,8 @@ def picture(found: Found) -> bytes:
         panels[1].plot(curve.energies, cnr, color="tab:green", lw=1.2, marker=".", ms=3)
         panels[1].set(ylabel="contrast-to-noise a pixel")
     panels[-1].set(xlabel="energy (keV)")
+    for energy in curve.left_out:
+        top.axvline(energy, color="0.85", lw=1.0, zorder=0)
     marks = (
         (edge.energy, "edge", "tab:blue"),
         (edge.white_line, "white line", "tab:orange"),
@@ -136,8 +149,11 @@ def write(found: Found, target: Path) -> None:
     """The picture and the table beside it.
 
     Raises:
-        DataError: one of them exists, or the disk refuses.
+        DataError: one of them exists, or the disk refuses; then neither is there.
     """
-    for path, content in ((target, picture(found)), (table_beside(target), table(found.curve).encode())):
-        with named_on_failure(path), whole_file(path) as partial:
-            partial.write_bytes(content)
+    with ExitStack() as undo:
+        for path, content in ((target, picture(found)), (table_beside(target), table(found.curve).encode())):
+            with named_on_failure(path), whole_file(path) as partial:
+                partial.write_bytes(content)
+            undo.callback(path.unlink)
+        undo.pop_all()

@@ -25,7 +25,8 @@ class Series:
     Attributes:
         what: whose absorption it will be.
         n: how many.
-        frames: (keV, line integrals [row, col]) of each energy, in any order.
+        frames: (keV, line integrals [row, col]) of each energy, in any order; +inf where a pixel is dark, NaN where
+            nothing is known of it.
         regions: what is compared in them.
     """
 

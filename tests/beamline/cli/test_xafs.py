@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
 from pathlib import Path
 
 import h5py
@@ -114,6 +115,8 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
         (["mu.csv", "--material", "Cu"], 2, "--material is for scenes"),
         (["mu.csv"], 5, "say --unit eV"),
         (["mu.csv", "--unit", "eV", "--from", "8.395"], 5, "too few for an edge, which takes 9"),
+        (["scan.h5", "--from", "9"], 5, "0 energies between --from and --to are too few for an edge, which takes 9"),
+        (["scan.h5", "--from", "8.35", "--to", "8.34"], 5, "0 energies between"),
         (["scan.h5", "--region", "5:4,0:1"], 2, "is not ROW:END,COL:END"),
         (["scan.h5", "--region", "0:99,0:1"], 2, "is not in frames of 20 x 24 pixels"),
         (["plain", "--from", "8.3", "--to", "8.4"], 2, "names a material"),
@@ -137,3 +140,26 @@ def test_nothing_is_overwritten(folder: Path) -> None:
     assert result.exit_code == 5
     assert "mu_xafs.csv exists and results are never overwritten" in result.stderr
     assert Path("mu_xafs.csv").read_text(encoding="utf-8") == "mine"
+    told = _beamline("mu.csv", "--unit", "eV", "--json")
+    assert (told.exit_code, json.loads(told.stdout)["event"]) == (5, "failed")
+
+
+def test_frames_without_light_are_not_compared(folder: Path) -> None:
+    with h5py.File("scan.h5", "a") as file:
+        file["frames"][70:] = 100  # the dark level
+    result = _beamline("scan.h5", "--json")
+    done = json.loads(result.stdout.splitlines()[-1])
+    assert (done["n_energies"], done["n_left_out"]) == (70, 30)
+    with h5py.File("scan.h5", "a") as file:
+        file["frames"][:] = 100
+    result = _beamline("scan.h5", "-o", "dark.png")
+    assert result.exit_code == 5
+    assert "0 energies are too few" in result.stderr and "too little light comes through" in result.stderr
+    assert not Path("dark.png").exists()
+
+
+def test_measured_files_need_no_tables_of_materials(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither when the command is imported nor when it runs is the simulator, and with it xraylib, asked for."""
+    assert not [name for name, value in vars(xafs).items() if "simulate" in str(getattr(value, "__module__", ""))]
+    monkeypatch.setitem(sys.modules, "beamline.simulate.energy_scan", None)  # to import it is an ImportError
+    assert _beamline("mu.csv", "--unit", "eV").exit_code == 0

@@ -89,6 +89,20 @@ def test_a_series_of_charges_moves_the_edge_as_the_radiographs_show_it(tmp_path:
     np.testing.assert_allclose(np.diff(edges), 1e-3, atol=2e-4)
 
 
+def test_energies_at_which_nothing_comes_through_are_left_out(tmp_path: Path) -> None:
+    """0.2 mm of the oxide are 18 depths above the edge, 5 below: where no light is, there is no noise either, and it
+    must not look like the best of all contrasts."""
+    bar = {"kind": "box", "edges": [0.03, 0.2, 0.03], "material": "NMC811"}
+    phantom = SCENE["phantom"] | {"solids": [bar]}
+    path = _scene(tmp_path, phantom=phantom, beam=SCENE["beam"] | {"photons_per_s": 1.5e5}, effects=["photon_noise"])
+    energies = np.arange(8.320, 8.365, 0.001)
+    taken = take(open_energy_scan(path, energies).series(), lambda event: None, SystemClock(), lambda: False)
+    assert taken.curve.energies.size >= 9 and taken.curve.energies.max() < 8.344
+    assert taken.curve.left_out.min() > 8.335 and taken.curve.left_out.max() == pytest.approx(8.364)
+    expected = palette("", SCENE["phantom"]["materials"])("NMC811").attenuation(taken.curve.energies[:5])
+    np.testing.assert_allclose(taken.curve.absorption[:5], expected, rtol=0.02)
+
+
 def test_noise_is_the_seed_s(tmp_path: Path) -> None:
     path = _scene(tmp_path, effects=["photon_noise"])
     one, same, other = (next(open_energy_scan(path, ENERGIES, seed=seed).frames(ENERGIES))[1] for seed in (1, 1, 2))
@@ -96,6 +110,12 @@ def test_noise_is_the_seed_s(tmp_path: Path) -> None:
     assert (one != other).mean() > 0.9
     first, second = (frame for _, frame in open_energy_scan(path, ENERGIES).frames(np.array([8.4, 8.4])))
     assert (first != second).mean() > 0.9  # frames of their own
+
+
+def test_harmonics_beyond_the_tables_are_refused_before_anything_is_simulated(tmp_path: Path) -> None:
+    path = _scene(tmp_path, beam=SCENE["beam"] | {"harmonics": {3: 0.01}})
+    with pytest.raises(ConfigError, match=r"from 0.1 to 800 keV; got 300 ... 900 keV. Nothing was simulated"):
+        open_energy_scan(path, np.linspace(200, 300, 9))
 
 
 @pytest.mark.parametrize(

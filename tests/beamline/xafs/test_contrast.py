@@ -60,6 +60,50 @@ def test_a_dark_material_stands_out_as_a_bright_one_does() -> None:
     assert Curve(energies, contrast, contrast, np.full(10, 0.1)).best in (0, 9)
 
 
+def test_dead_pixels_count_for_nothing_and_a_region_without_light_is_not_told() -> None:
+    rng = np.random.default_rng(1)
+    frame = 0.3 + 1.5 * INSIDE + rng.normal(0, 0.01, ROWS.shape)
+    clean, noise = measured(frame, Regions(INSIDE, AROUND))
+    dead = np.where(rng.random(ROWS.shape) < 0.1, np.nan, frame)
+    assert measured(dead, Regions(INSIDE, AROUND)) == (
+        pytest.approx(clean, abs=0.002),
+        pytest.approx(noise, rel=0.2),
+    )
+    assert np.isnan(measured(np.where(rng.random(ROWS.shape) < 0.6, np.nan, frame), Regions(INSIDE))).all()
+    for share, told in ((0.003, True), (0.03, False)):
+        dark = np.where(rng.random(ROWS.shape) < share, np.inf, frame)
+        contrast, _ = measured(dark, Regions(INSIDE, AROUND))
+        assert contrast == pytest.approx(clean, abs=0.002) if told else np.isnan(contrast)
+
+
+def test_energies_of_which_nothing_is_known_are_left_out() -> None:
+    points = [(0.4, 0.1), (np.nan, np.nan), (0.2, 0.1), (np.nan, np.nan)]
+    curve = curve_of(np.array([8.3, 8.2, 8.1, 8.0]), points, Regions(INSIDE, thickness=2.0))
+    assert (curve.energies.tolist(), curve.left_out.tolist()) == ([8.1, 8.3], [8.0, 8.2])
+    np.testing.assert_allclose(curve.absorption, [0.1, 0.2])
+    empty = curve_of(np.zeros(0), [], Regions(INSIDE))
+    assert empty.energies.size == empty.left_out.size == 0
+
+
+def test_a_few_pixels_tell_a_contrast_and_no_noise() -> None:
+    """The noise of one pixel is any number; which energy is best must not hang on it."""
+    few = np.zeros_like(INSIDE)
+    few[40, 45:48] = True
+    level, noise = measured(0.3 + 0.01 * ROWS, Regions(few))
+    assert level == pytest.approx(0.7) and np.isnan(noise)
+    curve = curve_of(np.array([8.0, 8.1]), [(0.4, 0.1), (0.5, np.nan)], Regions(few))
+    assert curve.noise is None and curve.contrast_to_noise is None and curve.best == 1
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (70, 80), (33, 0)])
+def test_only_the_region_s_own_part_of_a_frame_matters(corner: tuple[int, int]) -> None:
+    frame = np.random.default_rng(3).normal(0.5, 0.02, ROWS.shape)
+    region = np.zeros_like(INSIDE)
+    region[corner[0] : corner[0] + 10, corner[1] : corner[1] + 10] = True
+    part = slice(max(corner[0] - 1, 0), corner[0] + 11), slice(max(corner[1] - 1, 0), corner[1] + 11)
+    assert measured(frame, Regions(region)) == measured(frame[part], Regions(region[part]))
+
+
 def test_an_empty_region_is_refused() -> None:
     with pytest.raises(ValueError, match="the region around the material has no pixel"):
         Regions(INSIDE, np.zeros_like(INSIDE))

@@ -26,13 +26,27 @@ def _hdf5(path: Path, **content: Any) -> Path:
     return path
 
 
+def _text(path: Path, content: str) -> Path:
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
 def _counts() -> dict[str, Any]:
     return {"energy": ENERGIES, "frames": 100 + 9000 * np.exp(-TRUE), "flats": np.full((11, 6, 8), 9100.0),
             "darks": np.full((3, 6, 8), 100.0)}  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "text", ["energy,mu\n8.30,1.5\n8.31,1.6\n", "# eV; mu\n8.30;1.5;9\n\n8.31; 1.6;9\n", "  8.30   1.5\n  8.31\t1.6"]
+    "text",
+    [
+        "energy,mu\n8.30,1.5\n8.31,1.6\n",
+        "# eV; mu\n8.30;1.5;9\n\n8.31; 1.6;9\n",
+        "% keV\n8,30;1,5\n8,310;1,6",
+        "8,30\t1,5\n8,31\t1,6",
+        "8,30  1,5 9\n8,31 1,6 9",
+        "8.30, 1.5\n8.31, 1.6",
+        "  8.30   1.5\n  8.31\t1.6",
+    ],
 )
 def test_tables_of_any_manner(tmp_path: Path, text: str) -> None:
     (tmp_path / "mu.csv").write_text(text, encoding="utf-8")
@@ -45,6 +59,11 @@ def test_energies_in_ev_are_read_where_it_is_said(tmp_path: Path) -> None:
     (tmp_path / "mu.csv").write_text("8300 1\n8310 2", encoding="utf-8")
     with open_measured(tmp_path / "mu.csv", "eV", None) as table:
         np.testing.assert_allclose(table.energies, [8.3, 8.31])
+    with (
+        pytest.raises(DataError, match=r"energies from 0.0083 to 0.00831 keV cannot be; .* are keV, say --unit keV"),
+        open_measured(_text(tmp_path / "kev.csv", "8.30 1\n8.31 2"), "eV", None),
+    ):
+        pass
     with (
         pytest.raises(DataError, match="energies from 8300 to 8310 keV cannot be; where they are eV, say --unit eV"),
         open_measured(tmp_path / "mu.csv", None, None),
@@ -83,6 +102,16 @@ def test_a_series_is_of_the_range_and_regions_asked_for(tmp_path: Path) -> None:
         np.testing.assert_allclose([energy for energy, _ in series.frames], [8.33, 8.34, 8.35, 8.36])
         assert series.regions.inside.sum() == 12
         assert series.regions.around is not None and series.regions.around.sum() == 16
+    with open_series(path, Asked(region=(3, 4, 2, 3), around=(2, 5, 2, 3))) as part:
+        assert isinstance(part, Series) and part.regions.around is not None
+        np.testing.assert_array_equal(np.argwhere(part.regions.inside), [[2, 1]])
+        np.testing.assert_array_equal(np.argwhere(part.regions.around), [[1, 1], [3, 1]])  # the material is not around
+        assert [frame.shape for _, frame in part.frames] == [(5, 3)] * 11  # no more of a frame is read
+    with (
+        pytest.raises(ConfigError, match="no pixel outside of"),
+        open_series(path, Asked(region=(0, 2, 0, 2), around=(0, 1, 0, 1))),
+    ):
+        pass
     with open_series(path, Asked()) as whole:
         assert isinstance(whole, Series) and whole.regions.inside.all() and whole.regions.around is None
 
@@ -115,6 +144,10 @@ def _without(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
         (lambda c: c | {"mu": np.ones(4)}, r"mu is \(4,\), but there are 11 energies"),
         (lambda c: c | {"mu": np.full(11, np.nan)}, "mu is not a number at 11 energies"),
         (lambda c: c | {"energy": np.full(11, np.inf)}, "energy is not a number at 11"),
+        (lambda c: c | {"energy": np.full(11, b"8.3")}, "energy holds text"),
+        (lambda c: c | {"frames": np.zeros((11, 6, 8), dtype="S2")}, "frames holds text"),
+        (lambda c: c | {"mu": np.ones(11) + 1j}, "mu holds complex numbers"),
+        (lambda c: c | {"frames": np.zeros((11, 0, 8))}, r"frames are \(11, 0, 8\)"),
     ],
 )
 def test_what_is_no_such_file_is_refused(
@@ -123,6 +156,42 @@ def test_what_is_no_such_file_is_refused(
     path = _hdf5(tmp_path / "scan.h5", **change(_counts()))
     with pytest.raises(DataError, match=words), open_measured(path, None, None):
         pass
+
+
+@pytest.mark.parametrize("table", [True, False])
+def test_an_energy_that_is_there_twice_is_named(tmp_path: Path, table: bool) -> None:
+    twice = np.where(np.arange(11) == 7, ENERGIES[4], ENERGIES)
+    if table:
+        path = _text(tmp_path / "mu.csv", "\n".join(f"{e} 1" for e in twice))
+    else:
+        path = _hdf5(tmp_path / "scan.h5", **_counts() | {"energy": twice})
+    with pytest.raises(DataError, match=r"8.34 keV is there more than once; take the mean"), open_series(path, Asked()):
+        pass
+
+
+def test_a_text_that_says_nan_is_no_comment(tmp_path: Path) -> None:
+    path = _text(tmp_path / "mu.csv", "info: nanometres\n8.3 1\nnan 2\nNaN 3")
+    with pytest.raises(DataError, match="energy is not a number at 2"), open_measured(path, None, None):
+        pass
+
+
+def test_a_file_that_is_cut_short_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "scan.h5"
+    content = _counts()
+    with h5py.File(path, "w") as file:
+        for name in ("energy", "flats", "darks"):
+            file[name] = content[name]
+        file.create_dataset("frames", data=content["frames"], chunks=(1, 6, 8), compression="gzip", fletcher32=True)
+        at = file["frames"].id.get_chunk_info(9).byte_offset
+    with path.open("r+b") as raw:
+        raw.seek(at)
+        raw.write(bytes(16))
+    with open_measured(path, None, None) as found:
+        assert isinstance(found, Radiographs)
+        frames = found.line_integrals(range(11))
+        assert len([next(frames) for _ in range(9)]) == 9
+        with pytest.raises(DataError, match=r"scan.h5 cannot be read"):
+            next(frames)
 
 
 def test_other_units_missing_files_and_text_are_refused(tmp_path: Path) -> None:

@@ -25,7 +25,8 @@ def test_people_are_told_edge_line_and_best() -> None:
         "NMC811: 11 energies, 8.3000 to 8.4000 keV",
         "edge        8.3437 keV, where the absorption rises most steeply",
         "white line  8.3485 keV, the top of the absorption",
-        "best        8.4000 keV: highest contrast-to-noise of 20 a pixel (95 % of it from 8.3900 to 8.4000 keV)",
+        "best        8.4000 keV: highest contrast-to-noise of 20 a pixel, as thick as it is "
+        "(95 % of it from 8.3900 to 8.4000 keV)",
     ]
     bare = replace(FOUND, edge=replace(SEEN, white_line=None), curve=Curve(ENERGIES, ABSORPTION))
     assert lines(bare)[2:] == [
@@ -34,6 +35,12 @@ def test_people_are_told_edge_line_and_best() -> None:
     ]
     none = replace(FOUND, edge=Edge(False, "it is smooth", None, None, 0.0, 0.0))
     assert lines(none)[1] == "no edge     it is smooth"
+    dark = replace(FOUND, curve=replace(FOUND.curve, left_out=np.array([8.41, 8.42])))
+    assert lines(dark)[1] == (
+        "left out    2 energies between 8.4100 and 8.4200 keV: too little light comes through, or too few pixels have "
+        "a value"
+    )
+    assert dark.data()["n_left_out"] == 2 and FOUND.data()["n_left_out"] == 0
 
 
 def test_programs_are_told_the_same() -> None:
@@ -68,5 +75,8 @@ def test_picture_and_table_are_written_and_never_overwritten(tmp_path: Path) -> 
     assert (tmp_path / "it.csv").read_text(encoding="utf-8") == table(FOUND.curve)
     assert {path.name for path in tmp_path.iterdir()} == {"it.png", "it.csv"}
     target.unlink()
+    with pytest.raises(DataError, match=r"it.csv"):
+        write(FOUND, target)
+    assert {path.name for path in tmp_path.iterdir()} == {"it.csv"}  # nor half of it
     with pytest.raises(DataError, match=r"it.csv exists and results are never overwritten"):
         refuse_existing_results(target)

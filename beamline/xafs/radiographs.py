@@ -1,0 +1,74 @@
+"""Radiographs: frames over energies in an HDF5 file, read one by one, and of each no more than is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.errors import DataError
+from beamline.storage import hdf5
+from beamline.xafs.depth import line_integrals
+
+Reals = NDArray[np.float64]
+Part = tuple[slice, slice]
+
+EVERYTHING = (slice(None), slice(None))
+
+
+@dataclass(frozen=True, eq=False)
+class Radiographs:
+    """A file of frames over energies, open for reading.
+
+    Attributes:
+        energies: keV, [n].
+        frames: dataset [n, row, col].
+        flats: [n, row, col], or [row, col] for all energies; None where frames are line integrals.
+        darks: [row, col] or [k, row, col], of the same unit as frames; None: no dark level.
+    """
+
+    energies: Reals
+    frames: h5py.Dataset
+    flats: h5py.Dataset | None
+    darks: h5py.Dataset | None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return int(self.frames.shape[1]), int(self.frames.shape[2])
+
+    def line_integrals(self, which: Sequence[int], part: Part = EVERYTHING) -> Iterator[tuple[float, Reals]]:
+        """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each; +inf where no light
+        came through, NaN where nothing is known.
+
+        Raises:
+            DataError: the file does not give what it holds.
+        """
+        try:
+            dark = _mean(self.darks, part)
+            flat = None if self.flats is None or self.flats.ndim == 3 else _mean(self.flats, part) - dark
+            for i in which:
+                frame = reals(self.frames[i, part[0], part[1]])
+                if self.flats is not None:
+                    own = reals(self.flats[i, part[0], part[1]]) - dark if flat is None else flat
+                    frame = line_integrals(frame - dark, own)
+                yield float(self.energies[i]), frame
+        except OSError as error:  # what h5py makes of HDF5's errors
+            raise DataError(f"{self.frames.file.filename} cannot be read ({hdf5.reason(error)}).") from error
+
+
+def _mean(item: h5py.Dataset | None, part: Part) -> Reals:
+    """Of the one frame or the several that a dataset holds, one after the other; 0 where there is none."""
+    if item is None:
+        return np.zeros(1)
+    if item.ndim == 2:
+        return reals(item[part])
+    total = sum((reals(item[i, part[0], part[1]]) for i in range(item.shape[0])), start=np.zeros(1))
+    return np.asarray(total / item.shape[0])
+
+
+def reals(values: Any) -> Reals:
+    return np.asarray(values, dtype=np.float64)
