@@ -14,6 +14,9 @@ from simulators.effects.domain import Domain
 from simulators.effects.penumbra import lit
 from simulators.effects.shot import Image, Shot
 
+SEEN = 1e-3
+"""Share of the light from which on a loss counts as seen."""
+
 
 @dataclass(frozen=True)
 class NarrowField:
@@ -56,7 +59,7 @@ class NarrowField:
 
     def labels(self, shot: Shot) -> Sequence[Label]:
         rows, cols = shot.detector.shape
-        (top, below), (left, right) = (_lit_fully(light) for light in self._light(shot))
+        (top, below), (left, right) = (_lit_fully(light, SEEN) for light in self._light(shot))
         strips = [(0, rows, 0, left), (0, rows, right, cols), (0, top, 0, cols), (below, rows, 0, cols)]
         return [
             Label(self.name, strip, which)
@@ -77,7 +80,7 @@ class NarrowField:
         return np.maximum(lit(width / 2 - place, self.penumbra) + lit(width / 2 + place, self.penumbra) - 1, 0.0)
 
 
-def _lit_fully(light: NDArray[np.float64]) -> tuple[int, int]:
-    """First pixel with all the light, and the one after the last; the light falls off to both sides."""
-    full = np.flatnonzero(light >= 1)
+def _lit_fully(light: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:
+    """First pixel with all the light but `less`, and the one after the last; the light falls off to both sides."""
+    full = np.flatnonzero(light >= 1 - less)
     return (int(full[0]), int(full[-1]) + 1) if full.size else (light.size, light.size)

@@ -28,9 +28,9 @@ def labels(effect: dict[str, Any], shot: Shot) -> tuple[Label, ...]:
 
 def check_regions(effect: dict[str, Any], shot: Shot, loose: int = 1) -> bool:
     """Whether the anomaly shows; its regions hold every changed pixel, and each is at most `loose` pixels wider than
-    what changes in it."""
-    seen, found = np.abs(change(effect, shot)) > SEEN, labels(effect, shot)
-    beyond = seen.copy()
+    what changes in it. Where two parts of an anomaly meet, what neither shows by itself may add up: to 2 SEEN."""
+    changes, found = np.abs(change(effect, shot)), labels(effect, shot)
+    seen, beyond = changes > SEEN, changes > 2 * SEEN
     for label in found:
         top, below, left, right = label.region
         inside = seen[top:below, left:right]
