@@ -22,6 +22,7 @@ from simulators.light.parts import Constituent, Mixture
 from simulators.light.spectrum import Attenuation, light
 from simulators.mapping import SceneError
 from simulators.scene import load_scene
+from simulators.sensor import largest_count
 from simulators.shots import Scan
 
 Reals = NDArray[np.float64]
@@ -82,7 +83,7 @@ class EnergyScan:
         return replace(self, scan=replace(self.scan, scene=scene), sample=sample)
 
     def _counts(self, number: int, beam: bool = True, sample: bool = True) -> Reals:
-        """A frame, counts [row, col]; the stage stands."""
+        """A frame, counts [row, col], NaN where they are the most that the sensor tells; the stage stands."""
         time = number * self.scan.scene.scan.period_s
         shot = replace(
             self.scan.frame(len(self.scan) - self.scan.views).shot,
@@ -95,7 +96,9 @@ class EnergyScan:
             frame=number,
             view=0,
         )
-        return expose(self.scan.scene, shot).astype(np.float64)
+        counts = expose(self.scan.scene, shot).astype(np.float64)
+        counts[counts >= largest_count(shot.readout, shot.binning)] = np.nan
+        return counts
 
 
 def open_energy_scan(

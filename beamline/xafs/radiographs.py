@@ -42,7 +42,7 @@ class Radiographs:
 
     def line_integrals(self, which: Sequence[int], part: Part = EVERYTHING) -> Iterator[tuple[float, Reals]]:
         """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each; +inf where no light
-        came through, NaN where nothing is known.
+        came through, NaN where nothing is known, as of whole numbers that are the largest of their type.
 
         Raises:
             DataError: the file does not give what it holds.
@@ -51,9 +51,9 @@ class Radiographs:
             dark = _mean(self.darks, part)
             flat = None if self.flats is None or self.flats.ndim == 3 else _mean(self.flats, part) - dark
             for i in which:
-                frame = reals(self.frames[i, part[0], part[1]])
+                frame = _counts(self.frames[i, part[0], part[1]])
                 if self.flats is not None:
-                    own = reals(self.flats[i, part[0], part[1]]) - dark if flat is None else flat
+                    own = _counts(self.flats[i, part[0], part[1]]) - dark if flat is None else flat
                     frame = line_integrals(frame - dark, own)
                 yield float(self.energies[i]), frame
         except OSError as error:  # what h5py makes of HDF5's errors
@@ -65,10 +65,18 @@ def _mean(item: h5py.Dataset | None, part: Part) -> Reals:
     if item is None:
         return np.zeros(1)
     if item.ndim == 2:
-        return reals(item[part])
-    total = sum((reals(item[i, part[0], part[1]]) for i in range(item.shape[0])), start=np.zeros(1))
+        return _counts(item[part])
+    total = sum((_counts(item[i, part[0], part[1]]) for i in range(item.shape[0])), start=np.zeros(1))
     return np.asarray(total / item.shape[0])
 
 
 def reals(values: Any) -> Reals:
     return np.asarray(values, dtype=np.float64)
+
+
+def _counts(values: Any) -> Reals:
+    """NaN where whole numbers are the largest that their type holds: the sensor may have had more."""
+    found = reals(values)
+    if values.dtype.kind in "ui":
+        found[values == np.iinfo(values.dtype).max] = np.nan
+    return found

@@ -89,7 +89,7 @@ def left_out(curve: Curve) -> str:
     """At how many energies nothing is known of a region, and where these are."""
     e = curve.left_out
     where = f"{e[0]:.4f} keV" if e.size == 1 else f"{e.size} energies between {e[0]:.4f} and {e[-1]:.4f} keV"
-    return f"{where}: too little light comes through, or too few pixels have a value"
+    return f"{where}: too dark, too bright for the sensor, or without values"
 
 
 def table(curve: Curve) -> str:

@@ -94,7 +94,7 @@ def test_energies_at_which_nothing_comes_through_are_left_out(tmp_path: Path) ->
     must not look like the best of all contrasts."""
     bar = {"kind": "box", "edges": [0.03, 0.2, 0.03], "material": "NMC811"}
     phantom = SCENE["phantom"] | {"solids": [bar]}
-    path = _scene(tmp_path, phantom=phantom, beam=SCENE["beam"] | {"photons_per_s": 1.5e5}, effects=["photon_noise"])
+    path = _scene(tmp_path, phantom=phantom, effects=["photon_noise"])
     energies = np.arange(8.320, 8.365, 0.001)
     taken = take(open_energy_scan(path, energies).series(), lambda event: None, SystemClock(), lambda: False)
     assert taken.curve.energies.size >= 9 and taken.curve.energies.max() < 8.344
@@ -110,6 +110,13 @@ def test_noise_is_the_seed_s(tmp_path: Path) -> None:
     assert (one != other).mean() > 0.9
     first, second = (frame for _, frame in open_energy_scan(path, ENERGIES).frames(np.array([8.4, 8.4])))
     assert (first != second).mean() > 0.9  # frames of their own
+
+
+def test_a_beam_too_bright_for_the_sensor_tells_nothing(tmp_path: Path) -> None:
+    """5e4 electrons where 7000 are the most: clipped flats would put the edge 4 eV too high."""
+    path = _scene(tmp_path, beam=SCENE["beam"] | {"photons_per_s": 5e5})
+    taken = take(open_energy_scan(path, ENERGIES).series(), lambda event: None, SystemClock(), lambda: False)
+    assert (taken.curve.energies.size, taken.curve.left_out.size) == (0, 3)
 
 
 def test_harmonics_beyond_the_tables_are_refused_before_anything_is_simulated(tmp_path: Path) -> None:

@@ -86,6 +86,18 @@ def test_counts_become_line_integrals(tmp_path: Path, flat: str) -> None:
             np.testing.assert_allclose(frame, TRUE[i], rtol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["frames", "flats", "darks"])
+def test_counts_that_are_the_most_a_file_holds_are_not_known(tmp_path: Path, name: str) -> None:
+    content = {key: value.astype(np.uint16) if value.ndim > 1 else value for key, value in _counts().items()}
+    content[name][2, 3, 4] = 65535
+    with open_measured(_hdf5(tmp_path / "scan.h5", **content), None, None) as found:
+        assert isinstance(found, Radiographs)
+        frames = np.stack([frame for _, frame in found.line_integrals(range(11))])
+    lost = np.zeros((11, 6, 8), dtype=bool)
+    lost[:, 3, 4] = (np.arange(11) == 2) | (name == "darks")
+    np.testing.assert_array_equal(np.isnan(frames), lost)
+
+
 def test_line_integrals_are_taken_where_it_is_said(tmp_path: Path) -> None:
     with open_measured(_hdf5(tmp_path / "scan.h5", energy=ENERGIES, frames=TRUE), None, "line_integrals") as found:
         assert isinstance(found, Radiographs)

@@ -37,8 +37,7 @@ def test_people_are_told_edge_line_and_best() -> None:
     assert lines(none)[1] == "no edge     it is smooth"
     dark = replace(FOUND, curve=replace(FOUND.curve, left_out=np.array([8.41, 8.42])))
     assert lines(dark)[1] == (
-        "left out    2 energies between 8.4100 and 8.4200 keV: too little light comes through, or too few pixels have "
-        "a value"
+        "left out    2 energies between 8.4100 and 8.4200 keV: too dark, too bright for the sensor, or without values"
     )
     assert dark.data()["n_left_out"] == 2 and FOUND.data()["n_left_out"] == 0
 
