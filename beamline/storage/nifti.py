@@ -41,6 +41,8 @@ def read_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, flo
             return _volume(path, file)
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(f"{path} cannot be read as NIfTI ({error}).") from error
+    except (MemoryError, OverflowError, ValueError) as error:
+        raise DataError(f"{path} cannot be read as NIfTI: its header asks for more than there can be.") from error
 
 
 def _volume(path: Path, file: BinaryIO | gzip.GzipFile) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
@@ -62,8 +64,8 @@ def _volume(path: Path, file: BinaryIO | gzip.GzipFile) -> tuple[NDArray[np.gene
         raise DataError(f"{path}: lengths in unit {unit} of xyzt_units; 1, 2 and 3 (m, mm, um) are known.")
     nx, ny, nz = dims[1:4]
     dtype = np.dtype(f"{order}{DTYPES[code]}")
-    skipped, n = int(offset) - HEADER, nx * ny * nz * dtype.itemsize
-    file.read(skipped)
+    n = nx * ny * nz * dtype.itemsize
+    file.seek(int(offset))
     data = file.read(n)
     if len(data) < n:
         raise DataError(f"{path} ends after {len(data)} of the {n} bytes of its {nz} x {ny} x {nx} voxels.")
@@ -71,4 +73,5 @@ def _volume(path: Path, file: BinaryIO | gzip.GzipFile) -> tuple[NDArray[np.gene
     z, y, x = (abs(size) * LENGTHS[unit] for size in sizes[3:0:-1])
     if not math.isfinite(slope) or slope == 0 or (slope == 1 and intercept == 0):
         return values.astype(dtype.newbyteorder("=")), (z, y, x)
-    return values.astype(np.float32) * np.float32(slope) + np.float32(intercept), (z, y, x)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32 is infinite, and its user's to refuse
+        return values.astype(np.float32) * np.float32(slope) + np.float32(intercept), (z, y, x)

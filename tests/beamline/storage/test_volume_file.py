@@ -82,6 +82,9 @@ def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> N
         (nifti(offset=float("nan")), "header is damaged"),
         (nifti(offset=3.0), "header is damaged"),
         (nifti(units=5), "unit 5"),
+        (nifti(offset=3e38), "asks for more than there can be"),
+        (nifti(offset=1e12), "ends after 0 of the 48 bytes"),
+        (nifti(VALUES.astype("f8"), dim=(3, 32767, 32767, 32767, 1, 1, 1, 1)), "more than there can be|ends after"),
         (b"", "no single-file NIfTI-1"),
     ],
 )
@@ -131,6 +134,46 @@ def test_arrays_tiffs_and_hdf5_are_read(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataError, match=said):
             read_volume(tmp_path / name, dataset)
+
+
+@pytest.mark.parametrize("name", ["v.tif", "v.h5"])
+def test_a_volume_that_memory_cannot_hold_is_refused_before_it_is_read(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tifffile.imwrite(tmp_path / "v.tif", VALUES, photometric="minisblack")
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file["volume"] = VALUES
+    read_volume(tmp_path / name)
+    monkeypatch.setattr("beamline.storage.volume_file.free_memory", lambda: VALUES.nbytes - 1)
+    with pytest.raises(DataError, match=r"it says that it holds 4\.8e-08 GB, and 4\.7e-08 GB of memory are free"):
+        read_volume(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".npy", ".npz", ".h5", ".nii"])
+def test_a_file_with_a_few_wrong_bytes_is_read_or_refused(tmp_path: Path, suffix: str) -> None:
+    """Its readers raise IndexError, struct.error, SyntaxError, MemoryError and more; here it is one error."""
+    path, rng = tmp_path / f"v{suffix}", np.random.default_rng(1)
+    if suffix == ".tif":
+        tifffile.imwrite(path, VALUES, photometric="minisblack", compression="zlib")
+    elif suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file.create_dataset("volume", data=VALUES, compression="gzip")
+    elif suffix == ".nii":
+        path.write_bytes(nifti())
+    else:
+        (np.save if suffix == ".npy" else np.savez)(path, VALUES)
+    whole, refused = path.read_bytes(), 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, min(len(whole), 1000), rng.integers(1, 5)):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(bytes(damaged))
+        try:
+            assert isinstance(read_volume(path)[0], np.ndarray)
+        except DataError as error:
+            assert str(path) in str(error)
+            refused += 1
+    assert refused > 10
 
 
 @pytest.mark.parametrize("name", ["v.tif", "v.npy", "v.npz", "v.h5", "v.jpg"])
