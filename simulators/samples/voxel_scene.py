@@ -19,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.detector import Detector
+from simulators.pose import Pose
 from simulators.samples.stored import ReadVolume, Stored
 from simulators.samples.voxels import Voxels
 
+MOST_COLUMNS = 100_000
 LOOKS = 8
 """Views over half a turn among which the largest line integral is sought."""
 
@@ -129,10 +131,19 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
         return settings.attenuation_max / top
     if settings.largest_line_integral is not None:
         whole = Voxels.of(values, spacing)
-        pitch = min(spacing)
+        pitch, planes = min(spacing[1:]), values.shape[0]
         across = math.ceil(math.hypot(spacing[1] * values.shape[1], spacing[2] * values.shape[2]) / pitch) + 2
-        detector = Detector.centred((math.ceil(values.shape[0] * spacing[0] / pitch), across), pitch)
-        most = max(float(whole.line_integrals(k * math.pi / LOOKS, detector).max()) for k in range(LOOKS))
+        if across > MOST_COLUMNS:
+            raise ValueError(
+                f"voxels of {spacing[2]:g} x {spacing[1]:g} mm are too unlike for largest_line_integral; give "
+                "attenuation_max"
+            )
+        detector = Detector.centred((planes, across), pitch)
+        # Each row sees a plane of voxels, however far apart these are; between two of them no sum is larger.
+        shift = np.zeros((planes, 3))
+        shift[:, 2] = detector.v() * (1 - spacing[0] / pitch)
+        looks = (Pose.turned(k * math.pi / LOOKS, planes).shifted_by(shift) for k in range(LOOKS))
+        most = max(float(whole.line_integrals(look, detector).max()) for look in looks)
         if not most > 0:
             raise ValueError(f"largest_line_integral needs matter; the largest sum is {most:g}")
         return settings.largest_line_integral / most

@@ -45,6 +45,15 @@ def test_the_largest_line_integral_is_as_asked() -> None:
     assert max(seen) == pytest.approx(2.5, rel=1e-5)
 
 
+@pytest.mark.parametrize("tall", [1e-6, 0.3, 1e6])
+def test_the_largest_line_integral_of_tall_and_of_flat_voxels_is_that_of_a_plane(tall: float) -> None:
+    """A frame as fine as the finest of a voxel's edges would take all memory."""
+    values = np.zeros((5, 4, 20))
+    values[3] = 3.0
+    voxels = _voxels(values, voxel_mm=None, spacing=(tall, 0.1, 0.1), largest_line_integral=2.5)
+    np.testing.assert_allclose(_values(voxels).max(), 2.5 / 2.0, rtol=1e-5)
+
+
 def test_axes_and_sizes_follow_the_file() -> None:
     voxels = _voxels(axes="xyz")
     np.testing.assert_array_equal(_values(voxels), VALUES.transpose(2, 1, 0))
@@ -77,6 +86,7 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
         ({"voxel_mm": None}, "voxel_mm is missing"),
         ({"file": "flat"}, "three axes"),
         ({"file": "complex"}, "real values"),
+        ({"file": "thin", "voxel_mm": None, "largest_line_integral": 2.0}, "too unlike for largest_line_integral"),
         ({"file": "none", "largest_line_integral": 2.0}, "needs matter"),
         ({"file": "none", "attenuation_max": 2.0}, "needs a value above 0"),
     ],
@@ -84,7 +94,7 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
 def test_wrong_settings_are_refused_by_name(changed: dict[str, Any], said: str) -> None:
     def read(file: str, dataset: str | None) -> Stored:
         made = {"v": VALUES, "flat": VALUES[0], "complex": VALUES * 1j, "none": VALUES * 0}
-        return Stored(made[file])
+        return Stored(VALUES, (1.0, 1.0, 1e-9)) if file == "thin" else Stored(made[file])
 
     with pytest.raises(SceneError, match=said):
         build_sample("phantom", {"kind": "volume", "file": "v", "voxel_mm": 0.1} | changed, Beam(1e5), read)
