@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+NEAREST, FARTHEST = 1e-6, 1e9
+"""mm, of a cone's source: squares of far larger ones are no numbers, and its frames were black."""
+
 
 @dataclass(frozen=True)
 class Tube:
@@ -63,6 +66,11 @@ class Beam:
             raise ValueError("a cone needs both sod and sdd in mm; a parallel beam neither")
         if self.sod is not None and self.sdd is not None and not self.sdd >= self.sod > 0:
             raise ValueError(f"sod must be positive and sdd no less, got {self.sod} and {self.sdd} mm")
+        if self.sod is not None and self.sdd is not None and not NEAREST <= self.sod <= self.sdd <= FARTHEST:
+            raise ValueError(
+                f"sod and sdd must lie in {NEAREST:g} ... {FARTHEST:g} mm, got {self.sod} and {self.sdd}; a beam from "
+                "farther is parallel: leave both out"
+            )
         said = [name for name in ("energy_kev", "spectrum", "tube") if getattr(self, name) is not None]
         if len(said) > 1:
             raise ValueError(f"{' and '.join(said)} are different lights; name one of them")

@@ -36,6 +36,11 @@ def test_the_source_is_far_unless_it_is_said() -> None:
         ({"photons_per_s": -1}, "photons_per_s must be >= 0, got -1.0"),
         ({"sod": 5}, "a cone needs both sod and sdd"),
         ({"sod": 5, "sdd": 4}, "got 5.0 and 4.0 mm"),
+        (
+            {"sod": 1e200, "sdd": 1e201},
+            r"must lie in 1e-06 \.\.\. 1e\+09 mm, got 1e\+200 and 1e\+201; a beam from farther",
+        ),
+        ({"sod": 1e-300, "sdd": 1.0}, "must lie in"),
         ({"energy_kev": 8, "tube": {"kv": 60}}, "energy_kev and tube are different lights"),
         ({"bandwidth": 0.01}, "bandwidth belongs to an energy_kev, which is missing"),
         ({"harmonics": {3: 0.1}, "spectrum": [[8, 1]]}, "harmonics belongs to an energy_kev"),
