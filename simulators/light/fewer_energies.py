@@ -18,6 +18,9 @@ Reals = NDArray[np.float64]
 
 STEPS = 40
 """Rays are taken from the full thickness down to a 8000th of it."""
+SHARES = (0.125, 0.5, 0.875)
+"""Of the first of each pair of materials. With halves alone the light of one sample in a thousand, with an edge in each
+of two materials, was off by ten times the tolerance between them."""
 
 
 def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float) -> tuple[NDArray[np.intp], Reals]:
@@ -31,7 +34,8 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     """
     n_materials = attenuation.shape[1]
     ways = [np.eye(n_materials)]
-    ways += [(np.eye(n_materials)[list(pair)].mean(axis=0))[None] for pair in combinations(range(n_materials), 2)]
+    for pair in combinations(range(n_materials), 2):
+        ways += [share * ways[0][[pair[0]]] + (1 - share) * ways[0][[pair[1]]] for share in SHARES]
     ways.append(np.full((1, n_materials), 1 / n_materials))
     lengths = np.append(thickness * 2.0 ** (-np.arange(STEPS) / 3), 0.0)
     rays = (lengths[:, None, None] * np.concatenate(ways)).reshape(-1, n_materials)
