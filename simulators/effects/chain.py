@@ -53,6 +53,10 @@ class ImageEffect(Effect, Protocol):
         ...
 
 
+SEEN = 1e-3
+"""Share of the light from which on a change counts as seen: where labels begin and end."""
+
+
 @dataclass(frozen=True)
 class Label:
     """What a monitor should find in a frame.

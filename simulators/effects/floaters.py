@@ -9,15 +9,13 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from simulators.effects.chain import Label
+from simulators.effects.chain import SEEN, Label
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot, lasting
 from simulators.effects.views import Views, check, within
 
 MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
 """Crumbs, mm and optical depth: beyond, a frame takes seconds, or its numbers are none."""
-SEEN = 1e-3
-"""Optical depth at which a crumb ends: a tenth of a percent of the light."""
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Label
+from simulators.effects.chain import SEEN, Label
 from simulators.effects.domain import Domain
 from simulators.effects.shot import Image, Shot
-
-SEEN = 1e-3
-"""Share of the light from which on a change counts as seen."""
 
 
 @dataclass(frozen=True)
