@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 
 import h5py
@@ -12,6 +11,8 @@ from numpy.typing import NDArray
 
 from beamline.errors import ConfigError, DataError
 from beamline.pipeline import Prepared
+from beamline.storage import hdf5
+from beamline.storage.volume_file import read_volume
 from recon import metrics
 from recon.operators import data_residual
 from recon.volume import Grid, Volume
@@ -21,7 +22,8 @@ _VOLUME_PATHS = ("entry/data/data", "volume", "data")
 
 
 def read_truth(spec: str) -> NDArray[np.float32]:
-    """The volume [z, y, x] that `spec` names: FILE or FILE:first:end (slices), where FILE is .npz, .npy or HDF5.
+    """The volume [z, y, x] that `spec` names: FILE or FILE:first:end (slices), where FILE is any volume file
+    (.npz, .npy, HDF5, TIFF, NIfTI).
 
     Raises:
         ConfigError: no such file, or slices outside it.
@@ -32,8 +34,8 @@ def read_truth(spec: str) -> NDArray[np.float32]:
         raise ConfigError(f"--truth {spec}: there is no such file. Expected FILE or FILE:first:end.")
     path = Path(match["path"])
     try:
-        data = _read_hdf5(path) if h5py.is_hdf5(path) else _read_numpy(path)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        data, _ = read_volume(path, _volume_in(path))
+    except DataError as error:
         raise DataError(f"--truth {path} holds no volume that can be read: {error}") from error
     first, end = int(match["first"] or 0), int(match["end"] or data.shape[0])
     if not 0 <= first < end <= data.shape[0]:
@@ -41,28 +43,15 @@ def read_truth(spec: str) -> NDArray[np.float32]:
     return np.asarray(data[first:end], dtype=np.float32)
 
 
-def _read_hdf5(path: Path) -> NDArray[np.generic]:
-    with h5py.File(path, "r") as file:
-        found = next((p for p in _VOLUME_PATHS if p in file and getattr(file[p], "ndim", 0) == 3), None)
-        if found is None:
-            raise ValueError(f"expected a 3-D dataset at one of {', '.join(_VOLUME_PATHS)}")
-        return np.asarray(file[found][...])
-
-
-def _read_numpy(path: Path) -> NDArray[np.generic]:
-    with path.open("rb") as file:
-        if not file.read(6).startswith((b"PK", b"\x93NUMPY")):
-            raise ValueError("it is neither .npz, .npy nor HDF5")
-    loaded = np.load(path, allow_pickle=False)
-    if isinstance(loaded, np.ndarray):
-        volumes = {path.name: loaded}
-    else:
-        with loaded:
-            volumes = {name: loaded[name] for name in loaded.files}
-    volumes = {name: array for name, array in volumes.items() if array.ndim == 3}
-    if len(volumes) != 1:
-        raise ValueError(f"expected one 3-D array, found {len(volumes)}")
-    return next(iter(volumes.values()))
+def _volume_in(path: Path) -> str | None:
+    """Where an HDF5 file has its volume; None for other files. Raises DataError: none at a place that is known."""
+    if not h5py.is_hdf5(path):
+        return None
+    with hdf5.open_hdf5(path) as file:
+        found = next((p for p in _VOLUME_PATHS if getattr(file.get(p), "ndim", 0) == 3), None)
+    if found is None:
+        raise DataError(f"expected a 3-D dataset at one of {', '.join(_VOLUME_PATHS)}")
+    return found
 
 
 def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:

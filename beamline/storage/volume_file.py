@@ -36,12 +36,15 @@ def read_volume(
         raise DataError(f"There is no volume {path}.")
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
-    if not name.endswith(SUFFIXES):
+    is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)
+    if not (is_hdf5 or is_numpy or name.endswith(SUFFIXES)):
         raise DataError(f"{path} is no volume file that is known; the kinds are {', '.join(SUFFIXES)}.")
+    if name.endswith((".npz", ".npy")) and not is_numpy:
+        raise DataError(f"{path} cannot be read: it is neither an .npz nor an .npy, whatever its name says.")
     try:
         if name.endswith((".nii", ".nii.gz")):
             return read_nifti(path)
-        if name.endswith((".h5", ".hdf5", ".nxs")):
+        if is_hdf5 or name.endswith((".h5", ".hdf5", ".nxs")):
             with hdf5.open_hdf5(path) as file:
                 return _from_hdf5(path, file, dataset), None
         if name.endswith((".tif", ".tiff")):
@@ -51,6 +54,12 @@ def read_volume(
         raise
     except Exception as error:  # the readers of other people's files raise what they stumble over where one is damaged
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error}).") from error
+
+
+def _is_numpy(path: Path) -> bool:
+    """By its first bytes, whatever its name."""
+    with path.open("rb") as file:
+        return file.read(6).startswith((b"PK", b"\x93NUMPY"))
 
 
 def _from_tiff(path: Path) -> NDArray[np.generic]:
