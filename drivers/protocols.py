@@ -73,7 +73,7 @@ class StageStatus:
 
 
 class Motion(Protocol):
-    """An axis that turns: angles in radians outside, whole counts inside. Relative moves: `drivers.motion`."""
+    """An axis that turns: angles in radians outside, whole counts inside."""
 
     name: str
 

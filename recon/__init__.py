@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-from recon.geometry import Geometry
-from recon.volume import Grid, Volume
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
 
 # libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores
 # (a scan and its live reconstruction) slow each other down twentyfold.

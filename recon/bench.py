@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.kernels.footprints_cpu import HU, HV
-from recon.metrics import psnr, ssim3d
+from recon.assess.metrics import psnr, ssim3d
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.kernels.cpu.footprints import HU, HV
 from recon.reconstruction import Method, reconstruct
-from recon.splat import Active, Gradients, Room, project, render_view, view_table
-from recon.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import Active, Gradients, Room, project, render_view, view_table
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]

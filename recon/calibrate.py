@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.binning import bin_views
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
-from recon.quality import Speeds
+from recon.assess.time_model import Speeds
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
-from recon.splat import voxelize
-from recon.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
+from recon.splatting.splat import voxelize
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]

@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from recon import iterative
-from recon.fbp import Filter, fbp
-from recon.fdk import fdk
-from recon.fit import Progress
-from recon.fit_settings import FitSettings
-from recon.gaussian_fit import FitRequest, run_fit
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.initialise import Start
-from recon.masks import masked
-from recon.operators import Projector
-from recon.solvers import FistaTv, OsSirtTv
-from recon.volume import Grid, Volume
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.volume import Grid, Volume
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import Start
+from recon.splatting.optimise import Progress
+from recon.splatting.settings import FitSettings
+from recon.splatting.train import FitRequest, run_fit
+from recon.voxels import iterative
+from recon.voxels.fbp import Filter, fbp
+from recon.voxels.fdk import fdk
+from recon.voxels.projector import Projector
+from recon.voxels.solvers import FistaTv, OsSirtTv
 
 Method = Literal["r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"]
 DEFAULT_STEPS = 1000

@@ -7,16 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.density_control import DensityPolicy
-from recon.fit_settings import FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.initialise import Start
-from recon.kernels.activation import F32
-from recon.problem import Loss
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.kernels.cpu.activation import F32
 from recon.reconstruction import reconstruct
-from recon.splat import RayModel, project
-from recon.view_weights import covers_the_circle
+from recon.splatting.density_control import DensityPolicy
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import Start
+from recon.splatting.problem import Loss
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project
+from recon.voxels.view_weights import covers_the_circle
 
 _SHAPE, _VIEWS = (12, 16), 4
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels

@@ -10,8 +10,8 @@ from typing import Any, get_args
 import click
 
 from beamline.cli.told import told_as_json
-from beamline.events import Event
-from beamline.machine import machine, machine_line
+from beamline.core.events import Event
+from beamline.core.machine import machine, machine_line
 from drivers.clock import SystemClock
 from recon.bench import N_GAUSSIANS, SIDE, Timing, VolumeRow, kernel_timings, step_timing, volume_rows
 from recon.reconstruction import Method

@@ -8,9 +8,9 @@ import click
 
 from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.told import told_as_json
-from beamline.config import load
-from beamline.dry_run import dry_run, refuse_violations
-from beamline.events import Event
+from beamline.config.load import load
+from beamline.core.events import Event
+from beamline.scan.dry_run import dry_run, refuse_violations
 from drivers.clock import SystemClock
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from beamline.config import config_folder, load, resolved_yaml, schema
+from beamline.config.load import config_folder, load, resolved_yaml, schema
 
 OVERRIDE_HELP = "Override a value, such as scan.period_s=0.2; may be repeated."
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import click
 
+from beamline.cli.demo_run import run_demo
 from beamline.cli.narrate import results
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan import stop_signals
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import told_as_json
-from beamline.config import config_folder, load
-from beamline.demo import run_demo
-from beamline.events import Event
-from beamline.stop import StopRequest
-from beamline.terminal import Terminal
+from beamline.config.load import config_folder, load
+from beamline.core.events import Event
+from beamline.core.stop import StopRequest
 
 
 @click.command()

@@ -14,10 +14,10 @@ from rich.text import Text
 
 from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.told import terminated_like_interrupted, told_as_json
-from beamline.config import load
+from beamline.config.load import load
+from beamline.core.events import Event
 from beamline.doctor.check import Check, Verdict
 from beamline.doctor.examine import examine
-from beamline.events import Event
 from drivers.clock import SystemClock
 
 _STYLES = {

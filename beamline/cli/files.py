@@ -12,14 +12,14 @@ import click
 
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan_options import scan_options
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import terminated_like_interrupted, told_as_json
-from beamline.errors import DataError
-from beamline.events import Event, Sink, fan_out
+from beamline.core.errors import DataError
+from beamline.core.events import Event, Sink, fan_out
+from beamline.core.files import refuse_existing
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest as ingest_scan
-from beamline.storage.recon_file import refuse_existing
-from beamline.storage.validate import validate as findings_of
-from beamline.terminal import Terminal
+from beamline.storage.rules.validate import validate as findings_of
 from drivers.clock import Clock, SystemClock
 
 _PATH = click.Path(path_type=Path)

@@ -11,9 +11,9 @@ import click
 from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.told import terminated_like_interrupted
-from beamline.config import load
-from beamline.devices import stage_alone
-from beamline.errors import INTERRUPTED
+from beamline.config.load import load
+from beamline.core.errors import INTERRUPTED
+from beamline.instrument.connect import stage_alone
 from drivers.errors import DeviceError
 
 

@@ -14,8 +14,8 @@ from typing import Any, NoReturn
 
 import click
 
-from beamline.errors import BeamlineError, exit_code, in_words
-from beamline.version import version
+from beamline.core.errors import BeamlineError, exit_code, in_words
+from beamline.core.version import version
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import click
 from click.core import ParameterSource
 
 from beamline.cli.numbers import POSITIVE
-from recon.initialise import Start
-from recon.problem import Loss
-from recon.quality import PRESETS, parse_budget
+from recon.assess.time_model import PRESETS, parse_budget
 from recon.reconstruction import DEFAULT_STEPS
+from recon.splatting.initialise import Start
+from recon.splatting.problem import Loss
 
 _TIMED = ("steps", "seconds", "gaussians")
 _FITTED = (*_TIMED, "start", "loss", "device", "early_stop", "polish")

@@ -12,23 +12,23 @@ from typing import Any, get_args
 
 import click
 
-from beamline.checkpoints import Keeper
 from beamline.cli.method_options import SETTINGS, method_options, refuse_contradictions
 from beamline.cli.narrate import results
 from beamline.cli.numbers import NOT_NEGATIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
-from beamline.deliver import Target
-from beamline.errors import QualityError, ScanStopped
-from beamline.events import Event, fan_out
-from beamline.follow import follow as follow_scan
-from beamline.offline import run
-from beamline.recon_options import ReconOptions
-from beamline.terminal import Terminal
+from beamline.core.errors import QualityError, ScanStopped
+from beamline.core.events import Event, fan_out
+from beamline.reconstruct.checkpoints import Keeper
+from beamline.reconstruct.finished import run
+from beamline.reconstruct.follow import follow as follow_scan
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.result import Target
 from drivers.clock import SystemClock
-from recon.fbp import Filter
-from recon.quality import Quality
+from recon.assess.time_model import Quality
 from recon.reconstruction import Method
+from recon.voxels.fbp import Filter
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:

@@ -11,17 +11,17 @@ from types import FrameType
 
 import click
 
-from beamline.ask import ask_operator
 from beamline.cli.config import OVERRIDE_HELP
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import told_as_json
-from beamline.config import Config, load
-from beamline.dry_run import dry_run, refuse_violations
-from beamline.events import Event, Sink
-from beamline.live import LiveCommand, follow_command
-from beamline.run import RunResult, run_scan
-from beamline.run_folder import RECON
-from beamline.stop import StopRequest
-from beamline.terminal import Terminal
+from beamline.config.load import Config, load
+from beamline.core.events import Event, Sink
+from beamline.core.stop import StopRequest
+from beamline.instrument.operator import ask_operator
+from beamline.scan.dry_run import dry_run, refuse_violations
+from beamline.scan.live_process import LiveCommand, follow_command
+from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run_folder import RECON
 from drivers.clock import SystemClock
 
 

@@ -12,9 +12,9 @@ import click
 
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan_options import scan_options
-from beamline.recon_options import SourceOptions
-from beamline.selection import Selection
-from recon.correct import CorrectionSettings
+from beamline.projections.selection import Selection
+from beamline.reconstruct.options import SourceOptions
+from recon.prep.correct import CorrectionSettings
 
 
 def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:

@@ -11,20 +11,20 @@ from typing import Any
 
 import click
 
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
-from beamline.errors import ConfigError, ScanStopped
-from beamline.events import Event, Sink, fan_out
-from beamline.free_memory import free_memory
-from beamline.machine import machine, machine_line
-from beamline.plan_checks import size
+from beamline.core.errors import ConfigError, ScanStopped
+from beamline.core.events import Event, Sink, fan_out
+from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.free_memory import free_memory
+from beamline.core.machine import machine, machine_line
+from beamline.core.text import size
 from beamline.simulate.explained import explained, table
 from beamline.simulate.figure import sheet
 from beamline.simulate.labels import labels_path
 from beamline.simulate.scene_file import MOST_FRAMES, Scan, SceneFile, begun, open_scene, shipped_scenes, shown
 from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
 from beamline.simulate.write import Simulated, refuse, write_scan
-from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
-from beamline.terminal import Terminal
 from drivers.clock import Clock, SystemClock
 
 _OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."

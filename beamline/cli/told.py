@@ -11,8 +11,8 @@ from types import FrameType
 import click
 from click.exceptions import ClickException, Exit
 
-from beamline.errors import exit_code, in_words
-from beamline.events import Event, JsonLines, Sink
+from beamline.core.errors import exit_code, in_words
+from beamline.core.events import Event, JsonLines, Sink
 from drivers.clock import SystemClock
 
 

@@ -11,12 +11,12 @@ import click
 
 from beamline.cli.numbers import POSITIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import terminated_like_interrupted, told_as_json
-from beamline.errors import ScanStopped
-from beamline.events import fan_out
-from beamline.terminal import Terminal
-from beamline.tradeoff import TradeoffOptions, run
-from beamline.tradeoff_report import text
+from beamline.core.errors import ScanStopped
+from beamline.core.events import fan_out
+from beamline.tradeoff.report import text
+from beamline.tradeoff.run import TradeoffOptions, run
 from drivers.clock import SystemClock
 from recon.reconstruction import Method
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from beamline.cli.numbers import POSITIVE, SEED, FiniteRange
 from beamline.cli.scan import stop_signals
 from beamline.cli.scan_options import underscored
+from beamline.cli.terminal import Terminal
 from beamline.cli.told import told_as_json
-from beamline.errors import DataError, QualityError, ScanStopped
-from beamline.events import Event, fan_out
-from beamline.stop import StopRequest
-from beamline.terminal import Terminal
+from beamline.core.errors import DataError, QualityError, ScanStopped
+from beamline.core.events import Event, fan_out
+from beamline.core.stop import StopRequest
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import LEAST, find_edge
 from beamline.xafs.measured import Asked, open_series

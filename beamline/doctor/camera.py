@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from beamline.config_devices import DcamOrca
+from beamline.config.devices import DcamOrca
 from beamline.doctor.check import Check, Verdict, of_error
 from drivers import usb
 from drivers.dcam.abi import Dcam

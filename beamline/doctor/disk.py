@@ -12,10 +12,10 @@ from typing import IO, Protocol
 
 import numpy as np
 
+from beamline.core.text import size
 from beamline.doctor.check import Check, Verdict
 from beamline.doctor.needs import Needs
-from beamline.dry_run import free_bytes
-from beamline.plan_checks import size
+from beamline.scan.dry_run import free_bytes
 from drivers.clock import Clock
 
 SECONDS, MOST = 3.0, 4 << 30

@@ -7,20 +7,20 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from beamline.beam_monitors import make_beam_monitor
-from beamline.config import Config
-from beamline.config_devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
-from beamline.config_models import Storage
+from beamline.config.devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
+from beamline.config.load import Config
+from beamline.config.models import Storage
+from beamline.core.free_memory import free_memory
 from beamline.doctor import camera, disk
 from beamline.doctor.check import Check, Verdict, of_error
 from beamline.doctor.memory import memory
 from beamline.doctor.needs import Needs, needs, ring_bytes
 from beamline.doctor.ports import port, ports
-from beamline.dry_run import DryRun, dry_run
-from beamline.free_memory import free_memory
+from beamline.instrument.beam_monitors import make_beam_monitor
+from beamline.scan.dry_run import DryRun, dry_run
 from drivers.clock import Clock
 from drivers.errors import DeviceError
-from drivers.serial_ports import SerialPort, serial_ports
+from drivers.serial.ports import SerialPort, serial_ports
 
 
 def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Check]:

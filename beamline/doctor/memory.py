@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from beamline.core.text import size
 from beamline.doctor.check import Check, Verdict
 from beamline.doctor.needs import Needs
-from beamline.plan_checks import size
 
 MEMORY = "memory"
 

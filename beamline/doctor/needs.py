@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from beamline.dry_run import DryRun
-from beamline.plan import Timeline
-from beamline.plan_checks import ROOM
-from beamline.recorder import WAITING_BYTES, WAITING_FRAMES
+from beamline.plan.limits import ROOM
+from beamline.plan.plan import Timeline
+from beamline.scan.dry_run import DryRun
+from beamline.scan.recorder import WAITING_BYTES, WAITING_FRAMES
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from beamline.doctor.check import Check, Verdict
-from drivers.serial_ports import SerialPort
+from drivers.serial.ports import SerialPort
 
 CONNECT_TIMEOUT = 2.0
 """s for a TCP connection."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beamline.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
 from beamline.monitor.preview import edge_light, light, more_light
 from drivers.frame import Frame, FrameKind

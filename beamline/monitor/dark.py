@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
 from beamline.monitor.preview import thinned
 from drivers.frame import Frame, FrameKind

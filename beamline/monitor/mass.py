@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beamline.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
 from beamline.monitor.preview import edges, thinned, transmission
 from drivers.frame import Frame, FrameKind

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from beamline.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest
 from beamline.monitor.flag import Context, Flag, Level
 from drivers.frame import Frame
 

@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from beamline.config_text import read
-from beamline.errors import ConfigError
+from beamline.config.tree import read
+from beamline.core.errors import ConfigError
 from beamline.simulate.scene_file import open_scene, volumes_beside
 from beamline.xafs.contrast import Regions
 from beamline.xafs.depth import line_integrals
 from beamline.xafs.series import Series
-from simulators.exposure import expose
+from simulators.frame.mapping import SceneError
+from simulators.frame.sensor import largest_count
 from simulators.light.beam import Beam
-from simulators.light.parts import Constituent, Mixture
 from simulators.light.spectrum import Attenuation, light
-from simulators.mapping import SceneError
-from simulators.scene import load_scene
-from simulators.sensor import largest_count
-from simulators.shots import Scan
+from simulators.samples.composed.parts import Constituent, Mixture
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import load_scene
+from simulators.scenes.shots import Scan
 
 Reals = NDArray[np.float64]
 

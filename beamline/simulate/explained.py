@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from beamline.plan_checks import size
-from simulators.explain import Explained, explain
-from simulators.shots import Scan
+from beamline.core.text import size
+from simulators.scenes.explain import Explained, explain
+from simulators.scenes.shots import Scan
 
 
 def explained(scan: Scan, now: Callable[[], float]) -> Explained:

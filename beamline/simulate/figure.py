@@ -9,11 +9,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from beamline.figures import grey_window
+from beamline.report.figures import grey_window
 from drivers.frame import FrameKind
 from simulators.effects.chain import Anomaly
-from simulators.exposure import expose
-from simulators.shots import Scan
+from simulators.scenes.expose import expose
+from simulators.scenes.shots import Scan
 
 COLUMNS, PICTURES = 4, 8
 _COLOURS = ("tab:orange", "tab:cyan", "tab:pink", "tab:olive", "tab:green", "tab:red", "tab:purple")

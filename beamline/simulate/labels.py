@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beamline.storage.recon_file import named_on_failure, whole_file
+from beamline.core.files import named_on_failure, whole_file
 
 if TYPE_CHECKING:
     from simulators.effects.chain import Label

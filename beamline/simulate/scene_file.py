@@ -9,17 +9,17 @@ from pathlib import Path
 
 import yaml
 
-from beamline.config import config_folder
-from beamline.config_text import override, read
-from beamline.errors import ConfigError
+from beamline.config.load import config_folder
+from beamline.config.tree import override, read
+from beamline.core.errors import ConfigError
 from beamline.storage.volume_file import read_volume
-from simulators.effects.shot import CannotExposeError
-from simulators.exposure import expose
-from simulators.mapping import SceneError
-from simulators.samples.stored import ReadVolume, Stored
-from simulators.scene import Scene, load_scene
-from simulators.shooting import MOST_FRAMES
-from simulators.shots import Scan
+from simulators.frame.mapping import SceneError
+from simulators.frame.shot import CannotExposeError
+from simulators.samples.voxels.stored import ReadVolume, Stored
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene, load_scene
+from simulators.scenes.settings import MOST_FRAMES
+from simulators.scenes.shots import Scan
 
 __all__ = ["MOST_FRAMES", "Scan", "SceneFile", "begun", "open_scene", "shipped_scenes", "shown", "volumes_beside"]
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.files import named_on_failure, whole_file
 from beamline.storage import hdf5
-from beamline.storage.recon_file import named_on_failure, whole_file
-from recon.geometry import Geometry
-from recon.volume import Grid
-from simulators.detector import Detector
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from simulators.frame.detector import Detector
 from simulators.samples.sample import Sample
 
 LARGEST = 256

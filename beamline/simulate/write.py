@@ -11,20 +11,21 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from beamline.digest import digest
-from beamline.errors import DataError
-from beamline.events import Event, Sink
-from beamline.plan_checks import ROOM, size
+from beamline.core.errors import DataError
+from beamline.core.events import Event, Sink
+from beamline.core.files import refuse_existing
+from beamline.core.text import size
+from beamline.monitor.digest import digest
+from beamline.plan.limits import ROOM
 from beamline.simulate.labels import LabelLog, Run, labels_path, write_labels
 from beamline.simulate.scene_file import SceneFile
-from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.recon_file import refuse_existing
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from simulators.effects.chain import Label
-from simulators.exposure import expose
-from simulators.shots import Planned, Scan
+from simulators.scenes.expose import expose
+from simulators.scenes.shots import Planned, Scan
 
 PREVIEW_BIN = 4
 SAY_EVERY = 0.1  # real s between `frame` events

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from beamline.storage.angle_table import Angles
-from beamline.storage.scan_source import Quantity, ScanSource
-from beamline.storage.source import Images, open_scan
-from beamline.storage.validate import source_findings
+from beamline.storage.readers.angle_table import Angles
+from beamline.storage.readers.base import Quantity, ScanSource
+from beamline.storage.readers.open import Images, open_scan
+from beamline.storage.rules.validate import source_findings
 from drivers.frame import FrameKind
 
 

@@ -14,8 +14,7 @@ import hdf5plugin  # noqa: F401 - registers the compressors that archived scans 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.errors import DataError
-from beamline.storage.scan_source import require_real
+from beamline.core.errors import DataError
 
 DEGREE = np.pi / 180
 ANGLE_UNITS = {
@@ -162,3 +161,12 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
             stop += 1
         out[start:stop] = item[indices[start] : indices[start] + stop - start, rows]
         start = stop
+
+
+_SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "text", "S": "text", "U": "text"}
+
+
+def require_real(dtype: np.dtype[Any], what: str) -> None:
+    """DataError where pixels, keys or angles are text, complex, or anything else that is no real number."""
+    if dtype.kind not in "uif":
+        raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")

@@ -16,14 +16,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.digest import digest
-from beamline.errors import DataError, ScanStopped
+from beamline.core.errors import DataError, ScanStopped
+from beamline.monitor.digest import digest
 from beamline.storage import hdf5
-from beamline.storage import nxtomo_layout as layout
-from beamline.storage.angle_table import Angles
-from beamline.storage.exchange_view import add_exchange_view
-from beamline.storage.scan_source import Quantity, ScanSource
-from beamline.storage.source import Images, open_scan
+from beamline.storage.readers.angle_table import Angles
+from beamline.storage.readers.base import Quantity, ScanSource
+from beamline.storage.readers.open import Images, open_scan
+from beamline.storage.writers import layout
+from beamline.storage.writers.exchange_view import add_exchange_view
 from drivers.frame import FrameKind
 
 

@@ -18,7 +18,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.errors import DataError
+from beamline.core.errors import DataError
 
 HEADER = 348
 DTYPES = MappingProxyType(

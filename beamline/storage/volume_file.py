@@ -10,8 +10,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from beamline.errors import DataError
-from beamline.free_memory import free_memory
+from beamline.core.errors import DataError
+from beamline.core.free_memory import free_memory
 from beamline.storage import hdf5
 from beamline.storage.nifti import read_nifti
 

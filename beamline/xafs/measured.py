@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.errors import ConfigError, DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.storage import hdf5
-from beamline.storage.scan_source import require_real
+from beamline.storage.hdf5 import require_real
 from beamline.xafs.contrast import Curve, Regions
 from beamline.xafs.radiographs import Part, Radiographs, reals
 from beamline.xafs.series import Series

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.errors import DataError
+from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.xafs.depth import line_integrals
 

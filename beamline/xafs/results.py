@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from beamline.figures import png
-from beamline.storage.recon_file import named_on_failure, refuse_existing, whole_file
+from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.report.figures import png
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import Edge
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.events import Event, Sink
+from beamline.core.events import Event, Sink
 from beamline.xafs.contrast import Curve, Regions, curve_of, measured
 from drivers.clock import Clock
 

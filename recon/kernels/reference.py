@@ -21,7 +21,7 @@ import math
 import torch
 from torch import Tensor
 
-from recon.geometry import Geometry
+from recon.base.geometry import Geometry
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from drivers.orca_quest import BITS
-from simulators.effects.domain import Domain
-from simulators.effects.shot import CannotExposeError, Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import CannotExposeError, Image, Shot
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Moments, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Moments, Shot
 
 Reals = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import AngleAt, Shot
-from simulators.pose import Pose
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.shot import AngleAt, Shot
 
 STILL = 1e-9
 """Radians: less is no motion."""

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.chain import Label
-from simulators.effects.domain import Domain
 from simulators.effects.penumbra import lit
-from simulators.effects.shot import Image, Shot
 from simulators.effects.views import Views, check, within
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-from simulators.effects.domain import Domain
+from simulators.frame.domain import Domain
 
 
 @dataclass(frozen=True)

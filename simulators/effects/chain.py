@@ -10,10 +10,10 @@ from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.domain import Domain
 from simulators.effects.order import problem
-from simulators.effects.shot import Image, Moments, Shot
-from simulators.pose import Pose
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.shot import Image, Moments, Shot
 
 Watch: TypeAlias = Callable[[str], AbstractContextManager[object]]
 """Entered around each step of an exposure with its name: what measures the cost of effects."""

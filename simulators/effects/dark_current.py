@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot, draws
+from simulators.frame.domain import Domain
+from simulators.frame.sensor import DARK_CURRENT
+from simulators.frame.shot import Image, Shot, draws
 from simulators.pixels.noise import poisson
-from simulators.sensor import DARK_CURRENT
 
 FEW = 1.0
 """Electrons a pixel below which it is less work to scatter electrons than to ask every pixel."""

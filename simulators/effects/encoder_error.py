@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Shot, draws
 from simulators.effects.turn_waves import Wave, check, series
-from simulators.pose import Pose
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.shot import Shot, draws
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot, lasting
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot, lasting
 
 Reals = NDArray[np.float64]
 REACH = 4.0

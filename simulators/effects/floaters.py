@@ -10,9 +10,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from simulators.effects.chain import SEEN, Label
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot, lasting
 from simulators.effects.views import Views, check, within
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot, lasting
 
 MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
 """Crumbs, mm and optical depth: beyond, a frame takes seconds, or its numbers are none."""

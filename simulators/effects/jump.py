@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.chain import Label
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Shot
-from simulators.pose import Pose
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.shot import Shot
 
 SEEN_PX = 0.01
 """Pixels of a shift that a frame shows; one along the beam it does not."""

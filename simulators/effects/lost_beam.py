@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from simulators.effects.chain import Label
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
 from simulators.effects.views import Views, check, within
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Moments, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Moments, Shot
 
 LOOKS = 5
 """Times of the exposure at which the stage is asked for, so that one that turns back within it is seen to move."""

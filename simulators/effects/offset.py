@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.sensor import OFFSET
+from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
-from simulators.sensor import OFFSET
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
 
-from simulators.detector import Detector
-from simulators.effects.domain import Domain
-from simulators.effects.shot import CannotExposeError, Image, Shot
+from simulators.frame.detector import Detector
+from simulators.frame.domain import Domain
+from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged
 

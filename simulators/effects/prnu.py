@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
 
 

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 
 NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
 EFFICIENCY = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 0.46, 0.40, 0.33, 0.30, 0.20, 0.09)

@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot, draws
+from simulators.frame.domain import Domain
+from simulators.frame.sensor import READ_NOISE
+from simulators.frame.shot import Image, Shot, draws
 from simulators.pixels.noise import add_normal
 from simulators.pixels.pattern import binned, normals
-from simulators.sensor import READ_NOISE
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
-from simulators.sensor import FULL_WELL
+from simulators.frame.domain import Domain
+from simulators.frame.sensor import FULL_WELL
+from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)

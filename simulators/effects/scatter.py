@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
 

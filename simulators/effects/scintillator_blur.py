@@ -12,8 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import CannotExposeError, Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from simulators.effects.shot import Shot
+from simulators.frame.shot import Shot
 
 Views: TypeAlias = tuple[int, int]
 """First view and the one after the last. A flat counts to the view that is exposed next."""

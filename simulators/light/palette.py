@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
+from simulators.frame.mapping import SceneError, build
 from simulators.light.materials import Material, by_mass, by_volume, layered_oxide, of_formula
 from simulators.light.spectrum import Attenuation
-from simulators.mapping import SceneError, build
 
 
 def _nmc(name: str) -> Material | None:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from simulators.effects.shot import CannotExposeError
+from simulators.frame.shot import CannotExposeError
 from simulators.pixels.bands import share_rows
 from simulators.pixels.streams import STEP, begin, mix, normal
 

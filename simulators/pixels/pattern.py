@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
-from simulators.effects.shot import Image, Shot, lasting
+from simulators.frame.shot import Image, Shot, lasting
 from simulators.pixels.bands import share_rows
 from simulators.pixels.streams import STEP, begin, mix, normal
 

@@ -8,9 +8,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.volume import Grid
-from simulators.detector import Detector
-from simulators.pose import Pose
+from recon.base.volume import Grid
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
 
 
 class Sample(Protocol):

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from beamline.acquire import Acquisition
-from beamline.plan import Timeline
-from beamline.stop import StopRequest
+from beamline.core.stop import StopRequest
+from beamline.plan.plan import Timeline
+from beamline.scan.acquisition import Acquisition
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, TriggerSource
 from tests.beamline.fakes import COUNT, HOME, Instrument, seen

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamline import config, devices
-from beamline.config_models import Config
-from beamline.plan import Block
-from beamline.timeline import pass_ends
+from beamline.config import load as config
+from beamline.config.models import Config
+from beamline.instrument import connect as devices
+from beamline.plan.plan import Block
+from beamline.plan.timeline import pass_ends
 from drivers.protocols import TriggerSource
 
 # A ball off the axis and no effects: every frame is Beer-Lambert, so that its angle can be read off the picture.

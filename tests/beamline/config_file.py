@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from beamline import config
-from beamline.config_models import Config
-from beamline.errors import ConfigError
+from beamline.config import load as config
+from beamline.config.models import Config
+from beamline.core.errors import ConfigError
 
 CONFIGS = ("simulated", "instrument", "demo")
 GOOD = """\

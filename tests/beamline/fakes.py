@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.devices import Bench
-from beamline.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.timeline import work_out
+from beamline.instrument.connect import Bench
+from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
+from beamline.plan.timeline import work_out
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.frame import Frame
 from drivers.protocols import (
@@ -24,8 +24,8 @@ from drivers.protocols import (
     TriggerSource,
     TriggerTrain,
 )
-from simulators.clock import VirtualClock
-from simulators.motion import TrapezoidMove
+from simulators.devices.clock import VirtualClock
+from simulators.devices.motion import TrapezoidMove
 
 COUNTS_PER_TURN = 36000
 SHAPE = (8, 12)

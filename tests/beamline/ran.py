@@ -8,11 +8,11 @@ from pathlib import Path
 import h5py
 import pytest
 
-from beamline.config import Config, config_folder, load
-from beamline.events import Event
-from beamline.run import RunResult, run_scan
-from beamline.stop import StopRequest
-from beamline.storage.source import open_scan
+from beamline.config.load import Config, config_folder, load
+from beamline.core.events import Event
+from beamline.core.stop import StopRequest
+from beamline.scan.run import RunResult, run_scan
+from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
 from tests.beamline.fakes import COUNT, Instrument, decode
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frame import Frame, FrameKind
-from recon.volume import Grid
+from recon.base.volume import Grid
 
 DARK, BEAM = 100.0, 20000.0
 # (x, y, radius, attenuation) in pixels and 1/pixel; the second one lies inside the first and adds to it.

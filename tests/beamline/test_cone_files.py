@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.digest import digest
-from beamline.errors import ConfigError, DataError
-from beamline.pipeline import prepare
-from beamline.selection import Selection
-from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.source import open_scan
+from beamline.core.errors import ConfigError, DataError
+from beamline.monitor.digest import digest
+from beamline.projections.prepare import prepare
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
-from recon.correct import CorrectionSettings
-from recon.fdk import fdk
-from recon.volume import Grid
+from recon.base.volume import Grid
+from recon.prep.correct import CorrectionSettings
+from recon.voxels.fdk import fdk
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
 BALL, CENTRE, MU = 0.2, (0.12, -0.05, 0.06), 1.5  # mm, (x, y, z), 1/mm

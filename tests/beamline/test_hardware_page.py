@@ -11,10 +11,10 @@ import pytest
 from pydantic import BaseModel
 
 from beamline.cli.main import main
-from beamline.config import config_folder, load
-from beamline.config_devices import DcamOrca, StageOutputShutter
-from beamline.config_stages import PiGcsStageConfig, PM16CStageConfig, ZaberStageConfig
-from beamline.dry_run import dry_run
+from beamline.config.devices import DcamOrca, StageOutputShutter
+from beamline.config.load import config_folder, load
+from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, ZaberStageConfig
+from beamline.scan.dry_run import dry_run
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 DEVICES: dict[str, tuple[type[BaseModel], ...]] = {

@@ -18,12 +18,12 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from recon.geometry import Geometry
-from recon.operators import Projector
-from recon.volume import Grid
-from simulators.detector import Detector
-from simulators.samples.battery import battery
-from simulators.samples.phantom import Phantom
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.projector import Projector
+from simulators.frame.detector import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.builders.battery import battery
 
 F32 = NDArray[np.float32]
 

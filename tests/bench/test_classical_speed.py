@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from recon.fbp import fbp
-from recon.fdk import fdk
-from recon.geometry import Geometry
-from recon.iterative import Method, default_settings, solve
-from recon.metrics import psnr
-from recon.operators import Projector
-from recon.volume import Grid
-from simulators.detector import Detector
-from simulators.samples.battery import battery
-from simulators.samples.phantom import Phantom
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.fbp import fbp
+from recon.voxels.fdk import fdk
+from recon.voxels.iterative import Method, default_settings, solve
+from recon.voxels.projector import Projector
+from simulators.frame.detector import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.builders.battery import battery
 
 F32 = NDArray[np.float32]
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from recon import fit
-from recon.backend import Backend, backend_for
-from recon.fit_settings import FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import RayModel
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.splatting import optimise as fit
+from recon.splatting.backend import Backend, backend_for
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import FitSettings
 
 pytestmark = [
     pytest.mark.gpu,

@@ -4,7 +4,7 @@ Run with  pytest -m bench -s tests/bench/test_quality.py -k "teapot-50"  (some m
 and SSIM as Zha et al. 2024 take them (volumes clipped at 0, SSIM the mean over the slices of three directions), wall
 and processor seconds. FISTA-TV stands at the best of the weights tried for each case and by the time of that one run;
 R²-Gaussian has its default settings everywhere; steps and Gaussians at the start stand in the rows. A row with sweeps
-is the row before, polished (`recon.polish`), and holds the time of both.
+is the row before, polished (`recon.splatting.polish`), and holds the time of both.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.fbp import fbp
-from recon.fdk import fdk
-from recon.fit_settings import FitSettings
-from recon.iterative import solve
-from recon.metrics import psnr, ssim3d
-from recon.operators import Projector
-from recon.polish import polish
-from recon.solvers import AsdPocs, FistaTv, OsSirtTv, Sirt
+from recon.assess.metrics import psnr, ssim3d
+from recon.splatting.polish import polish
+from recon.splatting.settings import FitSettings
+from recon.voxels.fbp import fbp
+from recon.voxels.fdk import fdk
+from recon.voxels.iterative import solve
+from recon.voxels.projector import Projector
+from recon.voxels.solvers import AsdPocs, FistaTv, OsSirtTv, Sirt
 from recon.warm_up import warm_up
 from tests.bench.quality_cases import OBJECTS, Case, cone, dense_battery, walnut
 

@@ -1,4 +1,4 @@
-"""Measures the table in recon/quality.py: dB above FBP against steps, by binning and number of Gaussians.
+"""Measures the table in recon/assess/time_model.py: dB above FBP against steps, by binning and number of Gaussians.
 
 Run with  pytest -m bench -s tests/bench/test_quality_curves.py ; it prints the table as it stands in that module. It
 takes some minutes, and only its ratios of times mean something on another machine.
@@ -16,18 +16,18 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.binning import bin_views
-from recon.fbp import fbp
-from recon.geometry import Geometry
-from recon.initialise import default_count
-from recon.metrics import psnr
-from recon.quality import CURVES, Curve
-from recon.views import parse_views
-from recon.volume import Grid
+from recon.assess.metrics import psnr
+from recon.assess.time_model import CURVES, Curve
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.views import parse_views
+from recon.base.volume import Grid
+from recon.splatting.initialise import default_count
+from recon.voxels.fbp import fbp
 from recon.warm_up import warm_up
-from simulators.detector import Detector
-from simulators.samples.battery import battery
-from simulators.samples.phantom import Phantom
+from simulators.frame.detector import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.builders.battery import battery
 
 F32 = NDArray[np.float32]
 STEPS = (30, 60, 125, 250, 500, 1000)

@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.initialise import place
-from recon.splat import RayModel, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import place
+from recon.splatting.splat import project, voxelize
 
 F64 = NDArray[np.float64]
 SIDE, GAUSSIANS, STEPS = 64, 2000, 400

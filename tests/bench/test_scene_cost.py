@@ -11,15 +11,15 @@ import pytest
 import yaml
 
 from beamline.simulate.scene_file import open_scene, shipped_scenes
-from recon.volume import Grid
-from simulators.detector import Detector
+from recon.base.volume import Grid
 from simulators.effects.catalogue import CATALOGUE
-from simulators.effects.shot import Shot
-from simulators.explain import explain
-from simulators.exposure import expose
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot
 from simulators.samples.sample import Sample
-from simulators.scene import Scene
-from simulators.shots import Scan
+from simulators.scenes.explain import explain
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
+from simulators.scenes.shots import Scan
 
 SIDE = 2048
 REPEATS = 7

@@ -13,19 +13,19 @@ import numba
 import numpy as np
 import pytest
 
-from recon.volume import Grid
-from simulators.detector import Detector
+from recon.base.volume import Grid
 from simulators.effects.chain import Chain
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Image, Shot
-from simulators.exposure import expose
+from simulators.frame.detector import Detector
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.shot import Image, Shot
 from simulators.light.beam import Beam
-from simulators.pose import Pose
-from simulators.samples.battery import battery
-from simulators.samples.phantom import Phantom
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Cylinder, Ellipsoid, Octahedron, Plate, Solid, TruncatedOctahedron, Tube
+from simulators.samples.builders.battery import battery
 from simulators.samples.sample import Sample
-from simulators.samples.solids import Cylinder, Ellipsoid, Octahedron, Plate, Solid, TruncatedOctahedron, Tube
-from simulators.scene import Scene
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
 from tests.simulators import shots
 
 SIDE = 2048

@@ -22,19 +22,19 @@ import torch
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
-from recon import fit
-from recon.density_control import DensityPolicy
-from recon.fit_settings import NAMES, FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.kernels import lanes
-from recon.kernels.activation import OPTIONS, activation_backward
-from recon.kernels.adam_cpu import adam_all
-from recon.kernels.footprints_cpu import HU, HV, KV, SHEAR, K, U, V, W
-from recon.kernels.losses_cpu import ProjectionLoss, total_variation
-from recon.kernels.project_cpu import moments, render, render_layers
-from recon.splat import Active, Gradients, grid_layout, project, render_view, view_table
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.kernels.cpu import lanes
+from recon.kernels.cpu.activation import OPTIONS, activation_backward
+from recon.kernels.cpu.adam import adam_all
+from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
+from recon.kernels.cpu.losses import ProjectionLoss, total_variation
+from recon.kernels.cpu.project import moments, render, render_layers
+from recon.splatting import optimise as fit
+from recon.splatting.density_control import DensityPolicy
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import NAMES, FitSettings
+from recon.splatting.splat import Active, Gradients, grid_layout, project, render_view, view_table
 from recon.warm_up import warm_up
 
 F32 = NDArray[np.float32]

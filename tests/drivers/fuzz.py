@@ -14,7 +14,7 @@ from hypothesis.strategies import DrawFn, SearchStrategy
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError
-from simulators.wire import Wire
+from simulators.wires.wire import Wire
 
 T = TypeVar("T")
 Pieces = list[tuple[float, bytes]]

@@ -6,11 +6,11 @@ import itertools
 import math
 from typing import Any
 
-from drivers.stages.pm16c import PM16CStage
-from simulators.clock import VirtualClock
-from simulators.serial_url import register
-from simulators.trigger_line import TriggerLine
-from simulators.wires.pm16c import PM16CController
+from drivers.stages.pm16c.stage import PM16CStage
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.serial_url import register
 from tests.drivers.stage_bench import StageBench
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock
 from drivers.protocols import RotationStage, TriggerTrain
-from simulators.trigger_line import Pulse, TriggerLine
+from simulators.devices.trigger_line import Pulse, TriggerLine
 from tests.simulators.cable import emitted
 
 SPEED = math.radians(10)

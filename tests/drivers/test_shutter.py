@@ -7,7 +7,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import Shutter
 from drivers.shutter import OutputShutter
-from simulators.clock import VirtualClock
+from simulators.devices.clock import VirtualClock
 
 
 class Line:

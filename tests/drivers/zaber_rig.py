@@ -6,11 +6,11 @@ import itertools
 import math
 from typing import Any
 
-from drivers.stages.zaber import ZaberStage
-from simulators.clock import VirtualClock
-from simulators.serial_url import register
-from simulators.trigger_line import TriggerLine
-from simulators.wires.zaber import ZaberController
+from drivers.stages.zaber.stage import ZaberStage
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.serial_url import register
+from simulators.wires.zaber.wire import ZaberController
 from tests.drivers.stage_bench import StageBench
 
 NAMES = (f"zaber-test-{number}" for number in itertools.count())

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from recon.gaussians import Gaussians
+from recon.splatting.gaussians import Gaussians
 
 Make = Callable[..., Gaussians]
 

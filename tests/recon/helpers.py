@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from recon.gaussians import Gaussians
+from recon.splatting.gaussians import Gaussians
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:

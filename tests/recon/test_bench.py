@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
+from recon.base.volume import Grid, Volume
 from recon.bench import kernel_timings, spheres, standard_case, step_timing, timed, volume_rows
-from recon.operators import data_residual
-from recon.splat import project
-from recon.volume import Grid, Volume
+from recon.splatting.splat import project
+from recon.voxels.projector import data_residual
 
 
 def test_the_median_on_a_clock_of_known_ticks() -> None:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from recon import calibrate as module
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
 from recon.calibrate import calibrate
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.initialise import default_count, first_volume
-from recon.splat import project
-from recon.volume import Grid, Volume
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import default_count, first_volume
+from recon.splatting.splat import project
 
 SHAPE = (24, 60)
 TURN = np.linspace(0, 2 * np.pi, 40, endpoint=False)

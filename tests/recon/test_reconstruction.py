@@ -10,15 +10,16 @@ import pytest
 import torch
 
 import recon
-import recon.initialise
 import recon.reconstruction
-from recon.fit_settings import FitSettings
-from recon.metrics import psnr
-from recon.operators import Projector
-from recon.splat import RayModel, project, voxelize
-from simulators.detector import Detector
-from simulators.samples.phantom import Phantom
-from simulators.samples.solids import Cylinder, Ellipsoid
+import recon.splatting.initialise
+from recon.assess.metrics import psnr
+from recon.base.ray_model import RayModel
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project, voxelize
+from recon.voxels.projector import Projector
+from simulators.frame.detector import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 
 SHAPE, PITCH = (20, 40), 0.1
 ANGLES = np.linspace(0, np.pi, 24, endpoint=False)
@@ -334,7 +335,7 @@ def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phanto
 
 
 @pytest.mark.parametrize("start", ["fbp", "tv"])
-def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.initialise.Start) -> None:
+def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.initialise.Start) -> None:
     # Data of the voxel projector: nothing of the fit's own formulas.
     truth = phantom.attenuation(GRID)
     around = np.linspace(0, 2 * np.pi, 30, endpoint=False)

@@ -9,13 +9,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from recon import fit
-from recon.fit_settings import FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.losses import total_variation
-from recon.splat import Truncation, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import Truncation
+from recon.base.volume import Grid
+from recon.splatting import optimise as fit
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.losses import total_variation
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project, voxelize
 from tests.recon.helpers import in_double
 
 VOXEL = 2 / 256  # of the published field, -1 to 1 in 256 voxels

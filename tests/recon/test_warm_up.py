@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.geometry import Geometry
-from recon.view_weights import covers_the_circle
+from recon.base.geometry import Geometry
+from recon.voxels.view_weights import covers_the_circle
 from recon.warm_up import toy_of
 
 # In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
@@ -20,8 +20,8 @@ _SCRIPT = """
 import gc
 import numpy as np
 import recon
-from recon.fit_settings import FitSettings
-from recon.splat import RayModel
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import RayModel
 from recon.warm_up import warm_up
 
 def compiled():

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.chain import Label
-from simulators.effects.shot import Shot
-from simulators.exposure import expose
+from simulators.frame.shot import Shot
+from simulators.scenes.expose import expose
 from tests.simulators import shots
 
 SEEN = 1e-3

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from simulators.detector import Detector
-from simulators.pose import Pose
-from simulators.samples.packing import rotation
-from simulators.samples.solids import (
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.samples.bodies.packing import rotation
+from simulators.samples.bodies.solids import (
     Box,
     Cylinder,
     Ellipsoid,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers.clock import Clock
-from simulators.trigger_line import Pulse, TriggerLine
+from simulators.devices.trigger_line import Pulse, TriggerLine
 
 
 def emitted(line: TriggerLine, clock: Clock) -> list[Pulse]:

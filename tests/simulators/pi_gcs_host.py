@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from simulators.clock import VirtualClock
-from simulators.trigger_line import Pulse, TriggerLine
-from simulators.wires.pi_gcs import PiGcsController
-from simulators.wires.pi_gcs_axis import Build
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.wires.pi_gcs.axis import Build
+from simulators.wires.pi_gcs.wire import PiGcsController
 from tests.simulators.cable import emitted
 
 TURN = 360_000

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from simulators.clock import VirtualClock
-from simulators.trigger_line import Pulse, TriggerLine
-from simulators.wires.pm16c import PM16CController
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.wires.pm16c.wire import PM16CController
 from tests.simulators.cable import emitted
 
 TURN = 360_000

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.detector import Detector
-from simulators.effects.shot import AngleAt, Shot
-from simulators.exposure import expose
-from simulators.scene import Scene, load_scene
-from simulators.sensor import CONVERSION
+from simulators.frame.detector import Detector
+from simulators.frame.sensor import CONVERSION
+from simulators.frame.shot import AngleAt, Shot
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene, load_scene
 
 PHANTOM = {
     "kind": "solids",

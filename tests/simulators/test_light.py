@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Shot
-from simulators.scene import Scene
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Shot
+from simulators.scenes.scene import Scene
 from tests.simulators import shots
 
 DEPTH: list[Any] = [

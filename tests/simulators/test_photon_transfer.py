@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulators.scene import Scene
-from simulators.sensor import CONVERSION, OFFSET, READ_NOISE
+from simulators.frame.sensor import CONVERSION, OFFSET, READ_NOISE
+from simulators.scenes.scene import Scene
 from tests.simulators import chance, shots
 
 CHAIN = (

@@ -14,13 +14,13 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from recon.volume import Grid
-from simulators.detector import Detector
-from simulators.pose import Pose
-from simulators.samples.battery import battery
-from simulators.samples.packing import pack
-from simulators.samples.phantom import Phantom
-from simulators.samples.solids import Box, Cylinder, Polyhedron, Solid, Tube
+from recon.base.volume import Grid
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.samples.bodies.packing import pack
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Box, Cylinder, Polyhedron, Solid, Tube
+from simulators.samples.builders.battery import battery
 from tests.simulators.bodies import SOLIDS, rays
 
 ANGLES = st.floats(-7.0, 7.0)

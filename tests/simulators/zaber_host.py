@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from simulators.clock import VirtualClock
-from simulators.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber import ZaberController
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.wires.zaber.wire import ZaberController
 from tests.simulators.cable import emitted
 
 TURN = 360_000

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.geometry import Geometry
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
 from recon.kernels.gpu import require
 from recon.kernels.gpu.engine import GpuPass
-from recon.splat import RayModel
-from recon.volume import Grid
 
 
 class _Project(torch.autograd.Function):

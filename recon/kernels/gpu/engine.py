@@ -1,4 +1,4 @@
-"""A fit's operations on a GPU: the same as the CPU's in `recon.backend`, on torch tensors."""
+"""A fit's operations on a GPU: the same as the CPU's in `recon.splatting.backend`, on torch tensors."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.geometry import Geometry
-from recon.kernels.activation import F32
-from recon.kernels.footprints_cpu import INEXACT
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.kernels.cpu.activation import F32
+from recon.kernels.cpu.footprints import INEXACT
+from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
 from recon.kernels.gpu import losses, require
 from recon.kernels.gpu.footprints import HU, footprints, footprints_backward
 from recon.kernels.gpu.images import moments, render
 from recon.kernels.gpu.parameters import activate, activation_backward, adam
 from recon.kernels.gpu.rays import Rays
 from recon.kernels.gpu.voxels import fill, fill_backward, place
-from recon.kernels.losses_cpu import ABSOLUTE, DataTerm
-from recon.splat import RayModel
-from recon.volume import Grid
 
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]  # means, scales (or their logarithms), rotations, densities
 

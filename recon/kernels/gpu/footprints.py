@@ -15,8 +15,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.geometry import Geometry
-from recon.kernels.footprints_cpu import HIDDEN, INEXACT, NEAREST
+from recon.base.geometry import Geometry
+from recon.kernels.cpu.footprints import HIDDEN, INEXACT, NEAREST
 
 _BLOCK = 128
 _ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.kernels.losses_cpu import ABSOLUTE, L1, L2, RADIUS, DataTerm, gaussian_window
+from recon.kernels.cpu.losses import ABSOLUTE, L1, L2, RADIUS, DataTerm, gaussian_window
 
 _BLOCK = 256
 _R = tl.constexpr(RADIUS)

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.kernels.adam_cpu import BETA1, BETA2
+from recon.kernels.cpu.adam import BETA1, BETA2
 
 _BLOCK = 128
 _WIDEST = torch.finfo(torch.float32).max

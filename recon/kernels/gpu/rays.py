@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.geometry import Geometry
+from recon.base.geometry import Geometry
 from recon.kernels.gpu.footprints import (
     HU,
     KV,

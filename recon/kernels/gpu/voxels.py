@@ -19,9 +19,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from recon.base.volume import Grid
 from recon.kernels.gpu.footprints import add_shape, add_to, shape_of
 from recon.kernels.gpu.tiles import tile_lists
-from recon.volume import Grid
 
 _BLOCK = 128
 _EDGE = 8  # voxels a brick edge

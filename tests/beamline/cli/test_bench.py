@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from beamline.machine import machine_line
+from beamline.core.machine import machine_line
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = ("--gaussians", "200", "--side", "32", "--no-volumes")

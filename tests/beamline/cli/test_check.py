@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline import config
 from beamline.cli.main import main
+from beamline.config import load as config
 
 DEMO = str(config.config_folder() / "demo.yaml")
 REPOSITORY = Path(__file__).parents[3]

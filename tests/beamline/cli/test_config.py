@@ -9,8 +9,8 @@ import pytest
 import yaml
 from click.testing import CliRunner, Result
 
-from beamline import config
 from beamline.cli.main import main
+from beamline.config import load as config
 
 
 def run(*arguments: str, environment: dict[str, str] | None = None) -> Result:

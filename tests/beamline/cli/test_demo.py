@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from beamline.cli.demo_run import run_demo
 from beamline.cli.main import main
-from beamline.config import Config, config_folder, load
-from beamline.demo import run_demo
-from beamline.errors import ConfigError, DataError
-from beamline.events import Event
-from beamline.stop import StopRequest
-from beamline.storage.recon_file import read_reconstruction
+from beamline.config.load import Config, config_folder, load
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event
+from beamline.core.stop import StopRequest
+from beamline.storage.writers.recon_file import read_reconstruction
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -89,8 +89,8 @@ def test_a_live_volume_that_fails_leaves_the_scan_and_says_where_to_look(
 
 
 def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from beamline import demo
-    from beamline.devices import connect
+    from beamline.cli import demo_run as demo
+    from beamline.instrument.connect import connect
 
     def without_truth(config: Config) -> object:
         from dataclasses import replace

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline import config
 from beamline.cli.main import main
+from beamline.config import load as config
 from beamline.doctor import disk
 
 FOLDER = config.config_folder()

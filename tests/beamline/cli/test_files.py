@@ -13,9 +13,9 @@ import tifffile
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.digest import digest
-from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.source import open_scan
+from beamline.monitor.digest import digest
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 

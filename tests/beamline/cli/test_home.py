@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline import config
 from beamline.cli.main import main
-from drivers.stages.pm16c import PM16CStage
-from drivers.stages.zaber import ZaberStage
+from beamline.config import load as config
+from drivers.stages.pm16c.stage import PM16CStage
+from drivers.stages.zaber.stage import ZaberStage
 
 SIMULATED = str(config.config_folder() / "simulated.yaml")
 FAST = ("--set", "simulation.clock=virtual")

@@ -15,9 +15,9 @@ import h5py
 import pytest
 from click.testing import CliRunner
 
-from beamline import errors
 from beamline.cli import main as module
-from beamline.errors import in_words
+from beamline.core import errors
+from beamline.core.errors import in_words
 from drivers.errors import DeviceError, DeviceTimeout
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.cli.recon import repeated, report_beside
-from beamline.storage.recon_file import read_reconstruction
+from beamline.storage.writers.recon_file import read_reconstruction
 from recon.reconstruction import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 

@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline import budget, offline
-from beamline.storage.recon_file import read_reconstruction
-from recon import fit, reconstruction
-from recon.fbp import fbp
-from recon.fit import Progress
-from recon.quality import Speeds
+from beamline.reconstruct import budget
+from beamline.reconstruct import finished as offline
+from beamline.storage.writers.recon_file import read_reconstruction
+from recon import reconstruction
+from recon.assess.time_model import Speeds
+from recon.splatting import optimise as fit
+from recon.splatting.optimise import Progress
+from recon.voxels.fbp import fbp
 from tests.beamline.cli.small_scan import beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,7 +49,7 @@ def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPat
     def interrupted(*_: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("beamline.storage.recon_file._write_entry", interrupted)
+    monkeypatch.setattr("beamline.storage.writers.recon_file._write_entry", interrupted)
     before = signal.getsignal(signal.SIGTERM)
     result = beamline("recon", "scan.h5", "-m", "fbp", "--json")
     assert result.exit_code == 130

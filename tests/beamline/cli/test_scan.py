@@ -12,11 +12,11 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline import run as run_module
 from beamline.cli import scan as scan_module
 from beamline.cli.main import main
-from beamline.config import config_folder
-from beamline.storage.source import open_scan
+from beamline.config.load import config_folder
+from beamline.scan import run as run_module
+from beamline.storage.readers.open import open_scan
 from drivers.errors import DeviceError
 from drivers.manual import Ask, ManualShutter
 from tests.beamline.fakes import Faults, Instrument

@@ -19,11 +19,11 @@ from beamline.cli.main import main
 from beamline.simulate import figure, write
 from beamline.simulate.labels import read_labels
 from beamline.simulate.scene_file import begun, open_scene, shipped_scenes
-from beamline.storage.source import open_scan
+from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
-from recon.geometry import Geometry
-from recon.volume import Grid
-from simulators.effects.shot import CannotExposeError
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from simulators.frame.shot import CannotExposeError
 
 SCENE = """
 phantom:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline import tradeoff
 from beamline.cli.main import main
-from beamline.trials import Outcome, Trial
+from beamline.tradeoff import run as tradeoff
+from beamline.tradeoff.trials import Outcome, Trial
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import usb.core
 
-from beamline.config_devices import DcamOrca
+from beamline.config.devices import DcamOrca
 from beamline.doctor import camera
 from beamline.doctor.check import Verdict
 from drivers import usb as preflights

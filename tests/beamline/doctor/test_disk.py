@@ -21,7 +21,7 @@ from beamline.doctor.check import Verdict
 from beamline.doctor.memory import memory
 from beamline.doctor.needs import Needs
 from drivers.clock import SystemClock
-from simulators.clock import VirtualClock
+from simulators.devices.clock import VirtualClock
 
 MB, GB = 1_000_000, 1_000_000_000
 

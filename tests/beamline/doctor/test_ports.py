@@ -11,7 +11,7 @@ import pytest
 
 from beamline.doctor.check import Verdict
 from beamline.doctor.ports import port, ports
-from drivers.serial_ports import SerialPort
+from drivers.serial.ports import SerialPort
 
 ADAPTER = SerialPort("/dev/ttyUSB7", 0x0403, 0x6001, "FT1234", "FT232R")
 

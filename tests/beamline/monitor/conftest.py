@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.digest import digest
-from beamline.monitor import scan
+from beamline.monitor import watch as scan
+from beamline.monitor.digest import digest
 from beamline.monitor.flag import Context, Flag
 from drivers.frame import Frame, FrameKind
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.digest import digest
 from beamline.monitor import dark
+from beamline.monitor.digest import digest
 from beamline.monitor.flag import Context, Flag, Level
 from drivers.frame import Frame, FrameKind
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from beamline.digest import digest
-from beamline.monitor import scan
+from beamline.monitor import watch as scan
+from beamline.monitor.digest import digest
 from beamline.monitor.flag import Context, Flag, Level
 
 PERIOD = 0.1  # as the bench makes them

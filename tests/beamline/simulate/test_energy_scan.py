@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from beamline.errors import ConfigError
+from beamline.core.errors import ConfigError
 from beamline.simulate.energy_scan import open_energy_scan
 from beamline.xafs.edge import find_edge
 from beamline.xafs.series import take

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.errors import DataError
+from beamline.core.errors import DataError
 from beamline.simulate.labels import LabelLog, Run, labels_path, read_labels, write_labels
 from simulators.effects.chain import Label
 

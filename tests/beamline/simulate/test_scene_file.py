@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.config import load
-from beamline.errors import ConfigError, DataError
+from beamline.config.load import load
+from beamline.core.errors import ConfigError, DataError
+from beamline.instrument.simulated import scene_of
 from beamline.simulate.scene_file import open_scene
-from beamline.simulated import scene_of
-from recon.volume import Grid
+from recon.base.volume import Grid
 
 VOLUME = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 PHANTOM = "{kind: volume, file: data/v.npy, voxel_mm: 0.1}"

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.events import Event
-from beamline.pipeline import prepare
-from beamline.selection import Selection
+from beamline.core.events import Event
+from beamline.projections.prepare import prepare
+from beamline.projections.selection import Selection
 from beamline.simulate.scene_file import begun, open_scene
 from beamline.simulate.truth import binning_of, truth_of
 from beamline.simulate.write import write_scan
-from beamline.storage.source import open_scan
+from beamline.storage.readers.open import open_scan
 from drivers.clock import SystemClock
-from recon.correct import CorrectionSettings
-from recon.fbp import fbp
-from recon.fdk import fdk
-from recon.volume import Grid
-from simulators.detector import Detector
+from recon.base.volume import Grid
+from recon.prep.correct import CorrectionSettings
+from recon.voxels.fbp import fbp
+from recon.voxels.fdk import fdk
+from simulators.frame.detector import Detector
 
 SCENE = """
 phantom:

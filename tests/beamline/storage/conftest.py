@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.digest import digest
-from beamline.storage.nxtomo import NXtomoWriter, ScanInfo
+from beamline.monitor.digest import digest
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.frame import Frame, FrameKind
 
 SHAPE = (12, 16)

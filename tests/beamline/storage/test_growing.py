@@ -10,14 +10,13 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.digest import digest
+from beamline.monitor.digest import digest
 from beamline.storage.ingest import ingest
-from beamline.storage.nxtomo import NXtomoWriter
-from beamline.storage.source import open_scan
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
 from drivers.frame import Frame
-
-from .conftest import INFO, SHAPE, StandingClock, scan_frames
+from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock, scan_frames
 
 
 def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from beamline.digest import digest
-from beamline.errors import DataError, ScanStopped
-from beamline.storage import nxtomo_layout as layout
+from beamline.core.errors import DataError, ScanStopped
+from beamline.monitor.digest import digest
 from beamline.storage.ingest import ingest
-from beamline.storage.source import open_scan
-from beamline.storage.validate import validate
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import validate
+from beamline.storage.writers import layout
 from drivers.frame import Frame, FrameKind
 
 SHAPE = (24, 32)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from beamline.errors import DataError
+from beamline.core.errors import DataError
 from beamline.storage.volume_file import read_volume
 
 VALUES = np.arange(24, dtype=np.int16).reshape(2, 3, 4) - 5

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.errors import ConfigError, DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.xafs.contrast import Curve
 from beamline.xafs.measured import Asked, Radiographs, Table, open_measured, open_series
 from beamline.xafs.series import Series

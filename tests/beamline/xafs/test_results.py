@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.errors import DataError
+from beamline.core.errors import DataError
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import Edge
 from beamline.xafs.results import Found, lines, refuse_existing_results, table, write

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamline.events import Event
+from beamline.core.events import Event
 from beamline.xafs.contrast import Regions
 from beamline.xafs.series import Series, take
 from drivers.clock import SystemClock

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.clock import Clock, SystemClock
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
-from simulators.trigger_line import TriggerLine
+from simulators.devices.trigger_line import TriggerLine
 
 SENSOR = (48, 72)
 EXPOSURETIME, TIMING_READOUTTIME = 0x001F0110, 0x00403010

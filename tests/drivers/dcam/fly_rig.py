@@ -12,15 +12,15 @@ from types import TracebackType
 from typing import Any, Self
 from uuid import uuid4
 
-from beamline.devices import Bench
+from beamline.instrument.connect import Bench
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
 from drivers.protocols import Devices
-from drivers.stages.pm16c import PM16CStage
-from simulators.serial_url import register
-from simulators.shutter import SimulatedSampleMover, SimulatedShutter
-from simulators.trigger_line import TriggerLine
-from simulators.wires.pm16c import PM16CController
+from drivers.stages.pm16c.stage import PM16CStage
+from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.serial_url import register
 from tests.drivers.dcam.fake import World
 
 SENSOR = (64, 64)

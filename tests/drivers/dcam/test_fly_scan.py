@@ -11,10 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.config import Config, config_folder, load
-from beamline.ledger import LedgerError
-from beamline.run import RunResult, run_scan
-from beamline.storage.source import open_scan
+from beamline.config.load import Config, config_folder, load
+from beamline.scan.ledger import LedgerError
+from beamline.scan.run import RunResult, run_scan
+from beamline.storage.readers.open import open_scan
 from drivers.dcam.options import DcamOptions, TriggerPolarity
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frame import FrameKind

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from beamline.run import MESSAGES, UNSAFE, State
+from beamline.scan.run import MESSAGES, UNSAFE, State
 from drivers.errors import DeviceError
 from drivers.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, VIEWS, Rig, Scanned

@@ -21,20 +21,20 @@ import h5py
 import pytest
 import serial
 
-from beamline import run as run_module
-from beamline.config import Config, config_folder, load
-from beamline.devices import Bench, connect
-from beamline.events import Event
-from beamline.recorder import Recorder
-from beamline.run import RunResult, run_scan
-from beamline.storage.source import open_scan
+from beamline.config.load import Config, config_folder, load
+from beamline.core.events import Event
+from beamline.instrument.connect import Bench, connect
+from beamline.scan import run as run_module
+from beamline.scan.recorder import Recorder
+from beamline.scan.run import RunResult, run_scan
+from beamline.storage.readers.open import open_scan
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
-from simulators.serial_url import register
-from simulators.trigger_line import Pulse, TriggerLine
-from simulators.wires.pi_gcs import PiGcsController
-from simulators.wires.pm16c import PM16CController
-from simulators.wires.zaber import ZaberController
+from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.wires.pi_gcs.wire import PiGcsController
+from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.serial_url import register
+from simulators.wires.zaber.wire import ZaberController
 from tests.drivers.dcam.fake import World
 
 COUNTS = 360_000

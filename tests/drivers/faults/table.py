@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from beamline.errors import ConfigError
-from beamline.ledger import LedgerError
+from beamline.core.errors import ConfigError
+from beamline.scan.ledger import LedgerError
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Phase, Rig
 

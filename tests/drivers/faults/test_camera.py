@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from beamline.config_devices import DcamOrca
+from beamline.config.devices import DcamOrca
 from beamline.doctor import camera as doctor
 from beamline.doctor.check import Verdict
-from beamline.ledger import LedgerError
+from beamline.scan.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.codes import Error, Property
 from tests.drivers.dcam.fake import World

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from beamline.run import MESSAGES, UNSAFE, State
+from beamline.scan.run import MESSAGES, UNSAFE, State
 from tests.drivers.faults.table import SEEN
 
 ROOT = Path(__file__).parents[3]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.ledger import LedgerError
+from beamline.scan.ledger import LedgerError
 from drivers.frame import FrameKind
 from tests.drivers.faults import table
 from tests.drivers.faults.aftermath import (

@@ -12,7 +12,7 @@ from typing import Any
 
 from drivers.errors import DeviceError
 from drivers.protocols import RotationStage, StageStatus, TriggerTrain
-from simulators.serial_url import register
+from simulators.wires.serial_url import register
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed
 from tests.drivers.stages.rigs import NAMES, AnyRig
 

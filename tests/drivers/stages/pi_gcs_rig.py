@@ -7,12 +7,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.stages.pi_gcs import PiGcsStage
-from simulators.clock import VirtualClock
-from simulators.serial_url import register
-from simulators.trigger_line import TriggerLine
-from simulators.wires.pi_gcs import PiGcsController
-from simulators.wires.pi_gcs_axis import Build
+from drivers.stages.pi_gcs.stage import PiGcsStage
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pi_gcs.axis import Build
+from simulators.wires.pi_gcs.wire import PiGcsController
+from simulators.wires.serial_url import register
 from tests.drivers.stage_bench import StageBench
 
 NAMES = (f"pi-gcs-test-{number}" for number in itertools.count())

@@ -15,19 +15,19 @@ import pytest
 
 from drivers.clock import Clock, SystemClock
 from drivers.protocols import RotationStage
-from drivers.stages.pi_gcs import PiGcsStage
-from drivers.stages.pm16c import PM16CStage
-from drivers.stages.zaber import ZaberStage
-from simulators.clock import ScaledClock
-from simulators.serial_url import register
-from simulators.transports import serve_pty, serve_tcp
-from simulators.trigger_line import TriggerLine
-from simulators.wire import Wire
-from simulators.wires.pm16c import PM16CController
-from simulators.wires.zaber import ZaberController
+from drivers.stages.pi_gcs.stage import PiGcsStage
+from drivers.stages.pm16c.stage import PM16CStage
+from drivers.stages.zaber.stage import ZaberStage
+from simulators.devices.clock import ScaledClock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.serial_url import register
+from simulators.wires.wire import Wire
+from simulators.wires.zaber.wire import ZaberController
 from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.zaber_rig import settings_of
+from tests.simulators.wires.transports import serve_pty, serve_tcp
 
 FAST = math.radians(60)
 SOON = 10.0

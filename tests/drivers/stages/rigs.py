@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import pytest
 
 from drivers.protocols import RotationStage
-from simulators.clock import VirtualClock
-from simulators.trigger_line import TriggerLine
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import TriggerLine
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages import pi_gcs_rig

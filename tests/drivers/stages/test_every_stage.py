@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from drivers.errors import DeviceError, DeviceRefused
-from drivers.motion import start_move_by
 from drivers.protocols import TriggerTrain
-from simulators.transports import serve_pty
 from tests.drivers.stage_bench import LONG, SPEED
+from tests.drivers.stages.motion import start_move_by
 from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
+from tests.simulators.wires.transports import serve_pty
 
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
 

@@ -14,9 +14,9 @@ import serial
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError
-from drivers.motion import start_move_by
-from drivers.stages.pi_gcs import PiGcsStage
-from simulators.serial_url import SCHEME
+from drivers.stages.pi_gcs.stage import PiGcsStage
+from simulators.wires.serial_url import SCHEME
+from tests.drivers.stages.motion import start_move_by
 from tests.drivers.stages.pi_gcs_rig import USUAL
 from tests.drivers.stages.real_time import FAST, KINDS, PLUGS, SOON, TRANSPORTS, Kind, Real, Serve
 

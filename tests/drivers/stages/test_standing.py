@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.protocols import StageLimits
 from drivers.stages.standing import POLL, STOP_MARGIN, longest_stop, until_standing
-from simulators.clock import VirtualClock
+from simulators.devices.clock import VirtualClock
 
 
 @given(polls=st.integers(-10, 100), part=st.floats(0.01, 0.99), timeout=st.floats(-1, 1))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.errors import DeviceError
-from simulators.serial_url import register
+from simulators.wires.serial_url import register
 from tests.drivers.stage_bench import LONG, SPEED
 from tests.drivers.stages.rigs import NAMES, AnyRig, RigOf, every_stage
 

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import Kernel, RayModel, Truncation, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel, Truncation
+from recon.base.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import Kernel, project, voxelize
 from tests.recon.helpers import as_leaves, gradients, in_double
 
 WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and twin sum the same terms

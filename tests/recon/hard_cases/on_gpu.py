@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import RayModel
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.splatting.gaussians import Gaussians
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton and the kernels are first imported, that is, here

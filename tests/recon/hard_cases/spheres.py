@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.geometry import Geometry
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 
 # Centre (x, y, z), radius, density; in units of a detector of 48 columns and 12 rows.
 SPHERES = (

@@ -11,17 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon import fit
-from recon.correct import References, correct
-from recon.fbp import fbp
-from recon.fit_settings import FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.initialise import without_wild_pixels
-from recon.metrics import psnr
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.ray_model import Truncation
+from recon.base.volume import Grid
+from recon.prep.correct import References, correct
 from recon.reconstruction import Reconstruction, reconstruct
-from recon.splat import Truncation, project
-from recon.volume import Grid
+from recon.splatting import optimise as fit
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import without_wild_pixels
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project
+from recon.voxels.fbp import fbp
 from tests.recon.hard_cases import spheres
 
 F32 = NDArray[np.float32]

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import RayModel, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import project, voxelize
 from tests.recon.hard_cases.measure import STEP, WHOLE, bound, compare, gradient_bound
 from tests.recon.hard_cases.on_gpu import BEAMS, DEVICE, EXACT, FAR, GRID, SHAPE, at, quiet, some
 from tests.recon.helpers import as_leaves, gradients, in_double

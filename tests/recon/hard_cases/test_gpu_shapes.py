@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.kernels.footprints_cpu import KV, K, W
-from recon.splat import RayModel, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.kernels.cpu.footprints import KV, K, W
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import project, voxelize
 from tests.recon.hard_cases.measure import STEP, bound, compare, gradient_bound
 from tests.recon.hard_cases.on_gpu import BEAMS, DEVICE, EXACT, FAR, GRID, PITCH, SHAPE, Shape, quiet, some
 from tests.recon.helpers import as_leaves, gradients, in_double

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from recon import fit
-from recon.fit_settings import FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import project
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.splatting import optimise as fit
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project
 
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 12, endpoint=False), (12, 24))
 N = 40

@@ -10,10 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import RayModel, Truncation, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel, Truncation
+from recon.base.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import project, voxelize
 from tests.recon.hard_cases.measure import RECURRENCE, STEP, bound, compare, directional, gradient_bound
 from tests.recon.helpers import as_leaves, gradients
 

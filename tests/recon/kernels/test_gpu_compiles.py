@@ -30,14 +30,14 @@ _PARTS = {
 
 
 def _load_without_triton() -> None:
-    import recon.backend
-    import recon.fit
+    import recon.splatting.backend
+    import recon.splatting.optimise
 
     assert "triton" not in sys.modules
-    recon.backend.backend_for("cpu")
+    recon.splatting.backend.backend_for("cpu")
     sys.modules["triton"] = None  # type: ignore[assignment] # as if it were not installed
     with pytest.raises(ImportError, match=r"splatline\[gpu\]"):
-        recon.backend.backend_for("cuda")
+        recon.splatting.backend.backend_for("cuda")
     del sys.modules["triton"]
 
 
@@ -46,8 +46,8 @@ def _compile_all() -> None:
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
+    from recon.kernels.cpu.losses import L1, L2, POISSON
     from recon.kernels.gpu import footprints, images, losses, parameters, rays, voxels
-    from recon.kernels.losses_cpu import L1, L2, POISSON
 
     block, pixels = {"BLOCK": footprints._BLOCK}, {"BLOCK": losses._BLOCK}
     wanted = [

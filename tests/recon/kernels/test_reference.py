@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from recon.geometry import Geometry
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.kernels import reference
-from recon.volume import Grid
 
 F64 = NDArray[np.float64]
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.volume import Grid
-from simulators.detector import Detector
+from recon.base.volume import Grid
 from simulators.effects.catalogue import CATALOGUE
-from simulators.effects.shot import Shot
-from simulators.exposure import expose
-from simulators.pose import Pose
-from simulators.scene import Scene
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.frame.shot import Shot
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
 from tests.simulators import shots
 from tests.simulators.effects.parameters import entry
 

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from simulators.effects.adc import Adc
-from simulators.effects.shot import CannotExposeError
-from simulators.sensor import digitise
+from simulators.frame.sensor import digitise
+from simulators.frame.shot import CannotExposeError
 from tests.simulators import chance, shots
 
 

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators import sensor
 from simulators.effects.afterglow import Afterglow, gauss_rule
-from simulators.effects.shot import Moments
+from simulators.frame import sensor
+from simulators.frame.shot import Moments
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.clock import VirtualClock
+from simulators.devices.clock import VirtualClock
+from simulators.devices.motion import TrapezoidMove
+from simulators.devices.motor import PulseMotor
 from simulators.effects.backlash import Backlash, came_forwards
-from simulators.motion import TrapezoidMove
-from simulators.motor import PulseMotor
 from tests.simulators import shots
 
 

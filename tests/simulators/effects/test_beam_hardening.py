@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators import sensor
 from simulators.effects.beam_hardening import BeamHardening
+from simulators.frame import sensor
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators import sensor
 from simulators.effects.beam_profile import BeamProfile
+from simulators.frame import sensor
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from simulators.effects.chain import Chain, Label
-from simulators.effects.domain import Domain
 from simulators.effects.motion_blur import MotionBlur
-from simulators.effects.shot import Image, Shot
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Image, Shot
 from tests.simulators import shots
 
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simulators import sensor
-from simulators.detector import Detector
 from simulators.effects.flat_structure import FlatStructure
-from simulators.effects.shot import Shot, lasting
+from simulators.frame import sensor
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot, lasting
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

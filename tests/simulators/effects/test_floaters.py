@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulators.detector import Detector
 from simulators.effects.floaters import SEEN, Crumb, Floaters
-from simulators.effects.shot import Shot
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot
 from tests.simulators import anomalies, shots
 
 ONE = {"kind": "floaters", "distance": [0.7, 0.7], "count": 1, "size": [0.02, 0.02], "depth": 1.0, "seed": 5}

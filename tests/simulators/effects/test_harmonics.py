@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators import sensor
 from simulators.effects.harmonics import Harmonics
+from simulators.frame import sensor
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulators.detector import Detector
 from simulators.effects.chain import Label
 from simulators.effects.jump import Jump
-from simulators.effects.shot import Shot
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot
 from tests.simulators import shots
 from tests.simulators.poses import posed, seen
 

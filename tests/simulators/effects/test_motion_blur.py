@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators import sensor
-from simulators.detector import Detector
 from simulators.effects.motion_blur import MotionBlur
-from simulators.exposure import expose
+from simulators.frame import sensor
+from simulators.frame.detector import Detector
+from simulators.scenes.expose import expose
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

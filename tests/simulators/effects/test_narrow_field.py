@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.detector import Detector
 from simulators.effects.narrow_field import NarrowField
+from simulators.frame.detector import Detector
 from tests.simulators import anomalies, shots
 
 

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from simulators.effects.catalogue import CATALOGUE, load_effect
-from simulators.effects.domain import Domain
-from simulators.effects.shot import Shot, draws, lasting
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Shot, draws, lasting
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import PARAMETERS
 

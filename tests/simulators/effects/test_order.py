@@ -12,9 +12,9 @@ import pytest
 from simulators.effects.catalogue import CATALOGUE
 from simulators.effects.chain import Chain
 from simulators.effects.order import BEHIND
-from simulators.exposure import expose
-from simulators.mapping import SceneError
-from simulators.scene import Scene
+from simulators.frame.mapping import SceneError
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
 from tests.simulators import shots
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import PARAMETERS

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import fresnel
 
-from simulators.detector import Detector
 from simulators.effects.phase_fringes import HC, PhaseFringes
-from simulators.effects.shot import Shot
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot
 from tests.simulators import shots
 
 Reals = NDArray[np.float64]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simulators import sensor
 from simulators.effects.quantum_efficiency import QuantumEfficiency
+from simulators.frame import sensor
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

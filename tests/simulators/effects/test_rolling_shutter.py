@@ -7,9 +7,9 @@ import pytest
 
 from drivers import orca_quest
 from drivers.protocols import CameraSettings, TriggerSource
-from simulators import sensor
 from simulators.effects.rolling_shutter import RollingShutter
-from simulators.effects.shot import Moments
+from simulators.frame import sensor
+from simulators.frame.shot import Moments
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simulators.effects.runout import Runout
-from simulators.pose import Pose
+from simulators.frame.pose import Pose
 from tests.simulators import shots
 from tests.simulators.poses import posed, seen
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from simulators import sensor
 from simulators.effects.scatter import Scatter
+from simulators.frame import sensor
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from simulators.detector import Detector
 from simulators.effects.scintillator_blur import ScintillatorBlur, discrete_gaussian
-from simulators.effects.shot import Shot
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot
 from tests.simulators import shots
 
 SIGMA = 1 / math.sqrt(8 * math.log(2))

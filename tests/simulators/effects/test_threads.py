@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numba import config
 
-from simulators.detector import Detector
 from simulators.effects.catalogue import CATALOGUE
-from simulators.effects.shot import Shot
-from simulators.exposure import expose
-from simulators.scene import Scene
+from simulators.frame.detector import Detector
+from simulators.frame.shot import Shot
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
 from tests.simulators import shots
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import entry
@@ -29,7 +29,7 @@ FRINGES = {
 }
 AT_ONCE = """
 import threading
-from simulators.exposure import expose
+from simulators.scenes.expose import expose
 from tests.simulators.effects.test_threads import large, with_all
 
 made = []

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from simulators.effects.shot import CannotExposeError
 from simulators.effects.zingers import Zingers
+from simulators.frame.shot import CannotExposeError
 from tests.simulators import chance, shots
 
 

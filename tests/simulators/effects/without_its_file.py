@@ -40,7 +40,7 @@ def main(copy: Path, checkout: Path) -> None:
     sys.path[:0] = [str(copy), str(checkout)]
     room = on_demand()
     names = list(room.CATALOGUE)
-    home = Path(sys.modules["simulators.exposure"].__file__ or "").parent
+    home = Path(sys.modules["simulators.scenes.expose"].__file__ or "").parents[1]
     if home != copy / "simulators":
         raise SystemExit(f"the simulators came from {home} and not from the copy")
     wrong: dict[str, str] = {}

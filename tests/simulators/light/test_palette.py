@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from simulators.frame.mapping import SceneError
 from simulators.light.palette import known, palette
-from simulators.mapping import SceneError
 
 # Densities as sold or as measured on crystals, in g/cm3, to a few per cent.
 DENSITIES = {

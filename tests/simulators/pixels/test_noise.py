@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from simulators.effects.shot import CannotExposeError
+from simulators.frame.shot import CannotExposeError
 from simulators.pixels import bands
 from simulators.pixels.noise import LEAST, add_normal, expansion, poisson, searched, summed
 from tests.simulators import chance

@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from drivers.stages.zaber_train import PulseSettings
-from simulators.serial_url import register
-from simulators.transports import serve_pty
+from drivers.stages.zaber.train import PulseSettings
+from simulators.wires.serial_url import register
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.stage_bench import Build, StageBench
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.stages.rigs import AnyRig
+from tests.simulators.wires.transports import serve_pty
 
 RigOf = Callable[[dict[str, Any]], AnyRig]
 """A fresh controller for a driver with these settings."""

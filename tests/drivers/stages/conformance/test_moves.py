@@ -7,9 +7,9 @@ import math
 import pytest
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.motion import start_move_by
 from tests.drivers.stage_bench import LONG, SPEED, StageBench
 from tests.drivers.stages.conformance.benches import Kind
+from tests.drivers.stages.motion import start_move_by
 
 
 def test_it_says_who_it_is(bench: StageBench) -> None:

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
 from recon.kernels import reference
-from recon.splat import RayModel
+from recon.splatting.gaussians import Gaussians
 from tests.recon.helpers import as_leaves, gradients
 
 if not torch.cuda.is_available():

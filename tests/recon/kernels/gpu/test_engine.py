@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from recon import fit
-from recon.backend import Backend, Cpu, backend_for
-from recon.checkpoint import arrays_of, state_from
-from recon.density_control import DensityPolicy
-from recon.fit_settings import NAMES, FitSettings
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.splat import RayModel, Truncation, project, voxelize
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel, Truncation
+from recon.base.volume import Grid
+from recon.splatting import optimise as fit
+from recon.splatting.backend import Backend, Cpu, backend_for
+from recon.splatting.checkpoint import arrays_of, state_from
+from recon.splatting.density_control import DensityPolicy
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import NAMES, FitSettings
+from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, in_double
 from tests.recon.kernels.gpu.on_gpu import DEVICE, UNIT, cone, parallel

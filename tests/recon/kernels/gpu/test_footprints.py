@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
-from recon.kernels import footprints_cpu, reference
-from recon.splat import Active, RayModel, view_table
-from recon.volume import Grid
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.kernels import reference
+from recon.kernels.cpu import footprints as footprints_cpu
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import Active, view_table
 from tests.recon.conftest import Make
 from tests.recon.helpers import gradients, in_double
 from tests.recon.kernels.gpu.on_gpu import (

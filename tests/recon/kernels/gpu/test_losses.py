@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from recon.backend import Cpu, backend_for
-from recon.kernels.losses_cpu import L1, L2, POISSON, DataTerm
-from recon.losses import projection_loss
-from recon.losses import total_variation as twin_total_variation
+from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
+from recon.splatting.backend import Cpu, backend_for
+from recon.splatting.losses import projection_loss
+from recon.splatting.losses import total_variation as twin_total_variation
 from tests.recon.kernels.gpu.on_gpu import DEVICE
 
 engine = importlib.import_module("recon.kernels.gpu.engine")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from recon.base.ray_model import RayModel, Truncation
 from recon.kernels import reference
-from recon.splat import RayModel, Truncation, project
+from recon.splatting.splat import project
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, in_double
 from tests.recon.kernels.gpu.on_gpu import DEVICE, EXACT, SHAPE, UNIT, WHOLE, assert_gradients, cone, raw_of

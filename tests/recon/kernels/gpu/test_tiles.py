@@ -7,10 +7,10 @@ import importlib
 import numpy as np
 import torch
 
-from recon.gaussians import Gaussians
-from recon.geometry import Geometry
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.kernels import reference
-from recon.volume import Grid
+from recon.splatting.gaussians import Gaussians
 from tests.recon.helpers import in_double
 from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, WHOLE, raw_of, twin_view
 

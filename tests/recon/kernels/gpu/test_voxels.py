@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from recon.base.volume import Grid
 from recon.kernels import reference
-from recon.volume import Grid
 from tests.recon.conftest import Make
 from tests.recon.helpers import in_double
 from tests.recon.kernels.gpu.on_gpu import DEVICE, UNIT, WHOLE, assert_gradients, raw_of

@@ -1,0 +1,154 @@
+"""Terminal: events for the operator: a bar where a terminal is, plain lines where there is none."""
+
+from __future__ import annotations
+
+import errno
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from beamline.core.events import Event
+from beamline.core.narration import sentence
+from drivers.manual import Ask
+
+PLAIN_EVERY = 5.0
+"""Real s between progress lines where there is no terminal."""
+
+
+class Terminal:
+    """A sink; use it as a context manager, so that the bar is gone before anything else is printed.
+
+    Args:
+        stream: where it goes (stderr: results belong to stdout). A terminal gets a bar, anything else plain lines.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._console = Console(file=stream, highlight=False, markup=False, soft_wrap=True)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[note]}"),
+            console=self._console,
+            transient=True,
+            disable=not self._console.is_terminal,
+        )
+        self._tasks: dict[str, TaskID] = {}
+        self._said: dict[str, tuple[float, int]] = {}  # real s, and how far it was
+        self._last_text = ""
+        self._lock = threading.Lock()  # events come from one thread, questions from another
+        self._asking = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with _hung_up_is_no_failure():
+            self._bar.stop()
+
+    def ask(self, request: str, put: Ask) -> None:
+        """Put a request to the operator, with the bar out of the way."""
+        with self._lock:
+            self._bar.stop()
+            self._asking = True
+        try:
+            put(request)
+        finally:
+            self._asking = False
+
+    def __call__(self, event: Event) -> None:
+        with self._lock, _hung_up_is_no_failure():
+            self._take(event)
+
+    def _take(self, event: Event) -> None:
+        if event.event == "frame":
+            self._show("scan", event.data["n"], event.data["of"], rates(event.data))
+        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs"):
+            self._show("frames", event.data["n"], event.data["of"], copied(event.data))
+        elif event.event == "progress" and event.data.get("stage") == "tradeoff":
+            self._show("trials", event.data["n"], event.data["of"], trials(event.data))
+        elif event.event == "progress":
+            self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
+        elif event.event not in ("failed", "done"):  # the command has the last word
+            text = sentence(event)
+            if text and text != self._last_text:  # a snapshot of the same views takes the place of the one before
+                self._last_text = text
+                self._console.print(text)
+
+    def _show(self, what: str, done: int, total: int, note: str) -> None:
+        if self._asking:
+            return
+        if not self._bar.disable:
+            self._bar.start()
+            if what not in self._tasks:
+                self._tasks[what] = self._bar.add_task(what, note=note)
+            self._bar.update(self._tasks[what], completed=done, total=total or None, note=note)
+            return
+        now = time.monotonic()
+        last, at = self._said.get(what, (-PLAIN_EVERY, -1))
+        if done == at == total:
+            return
+        if now - last >= PLAIN_EVERY or done == total:
+            self._said[what] = now, done
+            self._console.print(f"{what}: {note}")
+
+
+@contextmanager
+def _hung_up_is_no_failure() -> Iterator[None]:
+    """A terminal that has closed takes no words; the work goes on without it."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+
+
+def rates(data: Mapping[str, Any]) -> str:
+    """n/N, frames/s, MB/s and the time left, of a `frame` event."""
+    speed = f"{data['frames_per_s']:.1f} frames/s  {data['mb_per_s']:.1f} MB/s"
+    return f"{data['n']}/{data['of']}  {speed}  {_clock_time(data['eta_s'])} left"
+
+
+def copied(data: Mapping[str, Any]) -> str:
+    """n/N, frames/s and the time left, of a `progress` event of frames that are copied, or taken at one energy each."""
+    return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
+
+
+def trials(data: Mapping[str, Any]) -> str:
+    """n/N, trials/min, the time left where it is known, and which one runs, of a trade-off's `progress` event."""
+    parts = [f"{data['n']}/{data['of']}"]
+    if data["eta_s"] is not None:
+        parts += [f"{data['per_min']:.1f} trials/min", f"{_clock_time(data['eta_s'])} left"]
+    return "  ".join([*parts, str(data["label"])])
+
+
+def fit(data: Mapping[str, Any]) -> str:
+    """n/N, rate, what there is, residuals and, where the end is known, the time left, of a `progress` event of a fit
+    (or of iterations, which have no Gaussians)."""
+    step, steps = data["step"], data["steps"]
+    word = "steps" if data["n_gaussians"] else "iterations"
+    parts = [f"{step}/{steps} {word}"] if steps else []
+    parts += [f"{data['per_s']:.3g} {word}/s"] if data.get("per_s") else []
+    parts += [f"{data['n_views']} views"]
+    parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []
+    if data["residual"] is not None:
+        parts.append(f"residual {data['residual']:.4f}")
+    unseen = data.get("held_out")  # another process's NaN comes as None
+    if unseen is not None and math.isfinite(unseen):
+        parts.append(f"held out {unseen:.4f}")
+    if data.get("eta_s") is not None:
+        parts.append(f"{_clock_time(data['eta_s'])} left")
+    return ", ".join(parts)
+
+
+def _clock_time(seconds: float) -> str:
+    left = round(seconds)
+    return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"

@@ -1,0 +1,205 @@
+"""Configuration of the devices: stage, camera, shutter, sample mover and beam monitor, real or simulated."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
+
+from beamline.config.section import Section
+from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, StageConfig
+from drivers.beam_monitors.page import url_problem
+from drivers.beam_monitors.reading import pattern_problem
+from drivers.beam_monitors.serial import PATTERN, QUERY
+
+Roi = Annotated[
+    tuple[
+        Annotated[int, Field(ge=0)],
+        Annotated[int, Field(ge=0)],
+        Annotated[int, Field(ge=1)],
+        Annotated[int, Field(ge=1)],
+    ],
+    Field(description="row0, col0, rows, cols on the sensor, all multiples of 4"),
+]
+
+
+class _Orca(Section):
+    """What the real and the simulated ORCA-Quest have in common."""
+
+    kind: str
+    roi: Roi | None = None
+    """null: the full sensor, 2304 x 4096."""
+    binning: Literal[1, 2, 4] = 1
+    readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
+    """photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."""
+    trigger_polarity: Literal["positive", "negative"] = "positive"
+    """The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here."""
+
+
+class SimulatedOrca(_Orca):
+    kind: Literal["simulated_orca"]
+
+
+class DcamOrca(_Orca):
+    kind: Literal["dcam"]
+    library: str | None = None
+    """Path of the DCAM-API library; null: the installed one."""
+    index: Annotated[int, Field(ge=0)] = 0
+    """Which camera, where DCAM finds several."""
+    link: Literal["usb3", "coaxpress"] = "usb3"
+    """USB3 carries 17.7 full frames a second, CoaXPress 120."""
+    trigger_active: Literal["edge", "level", "sync_readout"] = "edge"
+    """edge: a pulse begins an exposure of exposure_s. level: the pulse's length is the exposure; set exposure_s to it.
+    sync_readout: a pulse ends an exposure and begins the next; n pulses give n - 1 frames, which no fly scan takes."""
+    trigger_mode: Literal["normal", "start"] = "normal"
+    """start: the first pulse begins a free run, which no fly scan takes."""
+    trigger_times: Annotated[int, Field(ge=1, le=10_000)] = 1
+    """Every so many pulses make one frame; a fly scan takes 1."""
+    trigger_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """From a pulse to the exposure; the angle in the file stays that of the pulse."""
+    global_exposure: Literal["delayed", "global_reset"] = "delayed"
+    """delayed: rolling shutter. global_reset: all rows begin at once, later rows expose longer unless light is cut."""
+    hot_pixels: Literal["minimum", "standard", "aggressive"] | None = None
+    """null: counts as measured; else the camera repairs defects with this sensitivity, which alters data."""
+    exposure_tolerance: Annotated[float, Field(ge=0)] = 0.01
+    """By which fraction (and one line time) the camera may change an exposure before it is refused."""
+    cool_s: Annotated[float, Field(ge=0)] = 0.0
+    """Wait at most so long for the sensor to be cold before a scan; 0: do not wait."""
+    ring_mb: PositiveInt = 1000
+    """Most memory for the ring; a full frame has 18.9 MB."""
+    usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
+    """USB product id, for the doctor; null: any of the vendor's (which makes other things too)."""
+    usb_serial: str | None = None
+    """USB serial number, for the doctor, where there are several cameras."""
+
+
+class Simple(Section):
+    """A device with nothing to set: simulated, or manual (the operator is asked to do it)."""
+
+    kind: Literal["simulated", "manual"]
+
+
+class StageOutputShutter(Section):
+    """A shutter on a digital output of the stage's controller (pi_gcs and zaber; the PM16C has no such output)."""
+
+    kind: Literal["stage_output"]
+    output: PositiveInt
+    """Number of the output; not the one that the trigger pulses come from."""
+    open_high: bool = True
+    """A high output opens."""
+    settle_s: Annotated[float, Field(ge=0)] = 0.1
+    """How long the blade travels."""
+
+
+def _finds_a_number(pattern: str) -> str:
+    if problem := pattern_problem(pattern):
+        raise ValueError(problem)
+    return pattern
+
+
+def _is_a_page(url: str) -> str:
+    if problem := url_problem(url):
+        raise ValueError(problem)
+    return url
+
+
+Pattern = Annotated[str, AfterValidator(_finds_a_number)]
+Scale = Annotated[float, Field(gt=0)]
+
+
+class _BeamMonitor(Section):
+    """What every beam monitor has."""
+
+    unit: str
+    scale: Scale = 1.0
+    """What the number is multiplied by to be in `unit`."""
+    timeout_s: PositiveFloat = 2.0
+    period_s: PositiveFloat = 1.0
+    """Between readings while a scan runs (real time); they are kept in the scan's file."""
+
+
+class NoBeamMonitor(Section):
+    kind: Literal["none"] = "none"
+
+
+class ElectrometerConfig(_BeamMonitor):
+    """An electrometer or picoammeter on a serial port that answers a query with a line that holds a number."""
+
+    kind: Literal["electrometer"]
+    port: Annotated[str, Field(min_length=1)]
+    """A serial port, socket://host:port, or sim://electrometer."""
+    query: Annotated[str, Field(min_length=1)] = QUERY
+    pattern: Pattern = PATTERN
+    """Regular expression whose first group is the number."""
+    unit: str = "A"
+    setup: tuple[str, ...] = ()
+    """Commands without a reply, sent once at the start."""
+    line_end: Literal["crlf", "cr", "lf"] = "crlf"
+    baudrate: PositiveInt = 9600
+    transcript: str | None = None
+    """As the stage's."""
+
+    @property
+    def simulated(self) -> bool:
+        return self.port.lower().startswith("sim://")
+
+
+class RingCurrentConfig(_BeamMonitor):
+    """The ring current from a page or a text file."""
+
+    kind: Literal["ring_current"]
+    url: Annotated[str, AfterValidator(_is_a_page)]
+    """http://..., https://... or file:///..."""
+    pattern: Pattern
+    """Regular expression whose first group is the number."""
+    unit: str = "mA"
+
+
+BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig
+
+
+class DeviceSection(Section):
+    stage: Annotated[StageConfig, Field(discriminator="kind")]
+    camera: Annotated[SimulatedOrca | DcamOrca, Field(discriminator="kind")]
+    shutter: Annotated[Simple | StageOutputShutter, Field(discriminator="kind")]
+    sample_mover: Simple
+    beam_monitor: Annotated[BeamMonitorConfig, Field(discriminator="kind")] = NoBeamMonitor()
+
+    @model_validator(mode="after")
+    def _edges_agree(self) -> Self:
+        camera, high = self.camera, self.stage.active_high
+        if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
+            raise ValueError(
+                f"stage.active_high {str(high).lower()} does not go with camera.trigger_polarity "
+                f"{camera.trigger_polarity}: the simulated cable has no inverter, and every exposure would begin at "
+                f"its pulse's end; set trigger_polarity {'positive' if high else 'negative'}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _output_is_free(self) -> Self:
+        stage, shutter = self.stage, self.shutter
+        if not isinstance(shutter, StageOutputShutter):
+            return self
+        if isinstance(stage, PM16CStageConfig):
+            raise ValueError(
+                "the PM16C has no digital output for a shutter; set shutter.kind: manual, or use the output of another "
+                "controller (stage.kind pi_gcs or zaber)"
+            )
+        taken = stage.trigger_line if isinstance(stage, PiGcsStageConfig) else stage.output
+        if shutter.output == taken:
+            raise ValueError(f"shutter.output {taken} is the output that the stage's trigger pulses come from")
+        return self
+
+    def simulated_or_not(self) -> dict[str, bool]:
+        """Each device that can be simulated, and whether it is."""
+        stage, shutter = self.stage.simulated, self.shutter.kind
+        said = {
+            "stage": stage,
+            "camera": self.camera.kind == "simulated_orca",
+            "shutter": shutter == "simulated" or (shutter == "stage_output" and stage),
+            "sample_mover": self.sample_mover.kind == "simulated",
+        }
+        if isinstance(self.beam_monitor, ElectrometerConfig):
+            said["beam_monitor"] = self.beam_monitor.simulated
+        return said

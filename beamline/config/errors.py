@@ -1,0 +1,143 @@
+"""Configuration errors: what pydantic found, said with file and line, the key, what was there and what is legal."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from beamline.config.tree import KeyPath, Tree
+
+Schema = Mapping[str, Any]
+
+
+def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
+    """One line for each fault, in the order of the model's keys; one fault a key.
+
+    Args:
+        schema: the model's JSON schema, from which the legal keys and values are read.
+    """
+    faults: dict[KeyPath, str] = {}
+    for found in error.errors(include_url=False):
+        missing = found["type"] == "missing" and isinstance(found["loc"][-1], str)  # not an item that a list lacks
+        path = _path(found["loc"], tree.data, missing)
+        if found["type"].startswith("union_tag"):
+            path = (*path, found["ctx"]["discriminator"].strip("'"))
+            missing = found["type"] == "union_tag_not_found"
+        sentence = _sentence("missing" if missing else found["type"], path, found["msg"], tree.data, schema)
+        faults.setdefault(path, f"{tree.origin(path)}: {sentence}")
+    return list(faults.values())
+
+
+def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:
+    """The key path in the file: pydantic's location without the names of union members."""
+    path: list[str | int] = []
+    for at, part in enumerate(loc):
+        if _has(data, part):
+            data = data[part]
+            path.append(part)
+        elif missing and at == len(loc) - 1:
+            path.append(part)
+    return tuple(path)
+
+
+def _has(data: Any, part: str | int) -> bool:
+    if isinstance(data, list):
+        return isinstance(part, int) and part < len(data)
+    return isinstance(data, dict) and part in data
+
+
+def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema) -> str:
+    name = ".".join(map(str, path)) or "the configuration"
+    if kind == "value_error":
+        return f"{name}: {message.removeprefix('Value error, ')}"
+    if kind == "extra_forbidden":
+        keys = [key for branch in _at(schema, path[:-1], data) for key in branch.get("properties", {})]
+        return f"{name} is not a known key{_nearest(path[-1], keys)}; legal keys there: {', '.join(keys)}"
+    branches = _at(schema, path, data)
+    choices = [str(choice) for branch in branches for choice in _choices(branch)]
+    words = [_words(branch) for branch in branches if not _choices(branch)]
+    legal = " | ".join(dict.fromkeys([*choices, *words]))
+    if kind == "missing" and (not path or not _has(_value(data, path[:-1]), path[-1])):
+        return f"{name} is missing; expected {legal}"
+    data = _value(data, path)
+    return f"{name} is {_shown(data)}{_nearest(data, choices)}; expected {legal}"
+
+
+def _nearest(word: Any, legal: Sequence[str]) -> str:
+    near = difflib.get_close_matches(str(word), legal, n=1, cutoff=0.65)
+    return f" (did you mean {near[0]}?)" if near else ""
+
+
+def _value(data: Any, path: KeyPath) -> Any:
+    for part in path:
+        data = data[part] if _has(data, part) else None
+    return data
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, str):
+        text = repr(value)
+    else:
+        text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
+    """The schemas that the value at `path` may follow, given the kinds and schemes that the data chose."""
+    branches = _branches(schema, data, schema)
+    for part in path:
+        data = data[part] if _has(data, part) else None
+        children = [child for branch in branches if (child := _child(branch, part)) is not None]
+        branches = [branch for child in children for branch in _branches(child, data, schema)]
+    return branches
+
+
+def _branches(node: Schema, data: Any, root: Schema) -> list[Schema]:
+    """The alternatives of a node, none of them a reference; only the one whose tag the data names, where it does."""
+    while "$ref" in node:
+        node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
+    alternatives = node.get("anyOf") or node.get("oneOf")
+    if alternatives is None:
+        return [node]
+    branches = [branch for alternative in alternatives for branch in _branches(alternative, data, root)]
+    tag = node.get("discriminator", {}).get("propertyName")
+    if tag is None or not isinstance(data, dict):
+        return branches
+    return [b for b in branches if data.get(tag) in _choices(b["properties"][tag])] or branches
+
+
+def _child(branch: Schema, part: str | int) -> Schema | None:
+    if isinstance(part, int):
+        items: Sequence[Schema] = branch.get("prefixItems", [])
+        return items[part] if part < len(items) else None
+    extra = branch.get("additionalProperties")
+    return branch.get("properties", {}).get(part) or (extra if isinstance(extra, dict) else None)
+
+
+def _choices(branch: Schema) -> list[Any]:
+    return branch.get("enum", [branch["const"]] if "const" in branch else [])
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def _words(branch: Schema) -> str:
+    """What a value that is not one of a few choices may be."""
+    kind = str(branch.get("type"))
+    if kind in ("number", "integer"):
+        text = "a whole number" if kind == "integer" else "a number"
+        bounds = [("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<=")]
+        limits = [f"{sign} {_number(branch[name])}" for name, sign in bounds if name in branch]
+        return " ".join([text, " and ".join(limits)]).strip()
+    if kind == "array":
+        return f"a list of {branch.get('minItems')}: {branch.get('description')}"
+    if kind == "object":
+        return f"a group of keys: {', '.join(branch.get('properties', {})) or 'any'}"
+    if kind == "string":
+        return f"text of {branch['description']}" if "pattern" in branch else "text"
+    return {"boolean": "true | false"}.get(kind, kind)

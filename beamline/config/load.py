@@ -1,0 +1,176 @@
+"""Configuration: a YAML file, BEAMLINE_* variables and --set overrides make one frozen Config, or a clear refusal."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from beamline.config.checks import faults
+from beamline.config.errors import explain
+from beamline.config.models import (
+    Config,
+    Fields,
+    FileAngles,
+    GoldenAngles,
+    InterlacedAngles,
+    RandomAngles,
+    SectorAngles,
+)
+from beamline.config.tree import override, read
+from beamline.core.errors import ConfigError
+from beamline.core.version import version
+from beamline.plan import angles
+from beamline.plan.plan import FieldPlan, ScanPlan
+
+__all__ = ["Config", "config_folder", "load", "plan_of", "resolved_yaml", "scene_mapping", "schema"]
+
+
+def config_folder() -> Path:
+    """The folder of the configurations that come with the package: installed, or beside the checkout's packages."""
+    installed = Path(__file__).parents[1] / "configs"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
+
+
+def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:
+    """Read and validate a configuration file.
+
+    Later wins: defaults, the file, BEAMLINE_SECTION__KEY variables, then `section.key=value` overrides. File names in
+    the file are relative to it; those in variables and overrides, to the working directory.
+
+    Args:
+        environment: os.environ unless given.
+
+    Raises:
+        ConfigError: every fault with file, line, key, what was found and what is legal. Nothing has been started.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not UTF-8 text ({error}). Nothing was started.") from None
+    tree = read(text, str(path))
+    _locate(tree.data, path.parent)
+    tree = override(tree, overrides, os.environ if environment is None else environment)
+    _locate(tree.data, Path())
+    try:
+        config = Config.model_validate(tree.data)
+    except ValidationError as error:
+        _refuse(path, explain(error, tree, schema()))
+        raise
+    _refuse(path, [f"{tree.origin(at)}: {what}" for at, what in faults(config, config_folder())])
+    return config
+
+
+def _refuse(path: Path, found: Sequence[str]) -> None:
+    if len(found) == 1:
+        raise ConfigError(f"{found[0]}. Nothing was started.") from None
+    if found:
+        lines = "".join(f"\n  {fault}" for fault in found)
+        raise ConfigError(f"{path} has {len(found)} faults, nothing was started:{lines}") from None
+
+
+def resolved_yaml(config: Config) -> str:
+    """The whole configuration with every default filled in; the version on line one. `load` reads it back."""
+    body = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
+    return f"# splatline {version()}\n{body}"
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema of a configuration file."""
+    return Config.model_json_schema()
+
+
+def plan_of(config: Config) -> ScanPlan:
+    """The scan that a configuration asks for.
+
+    Raises:
+        ConfigError: an angle file that cannot be read, or passes that do not divide the views.
+    """
+    scan = config.scan
+    try:
+        theta = _angles(scan.angles)
+    except (ValueError, OSError) as error:
+        where = scan.angles.path if isinstance(scan.angles, FileAngles) else "scan.angles"
+        raise ConfigError(f"{where}: {error}. Nothing was started.") from None
+    return ScanPlan(
+        angles=theta,
+        mode=scan.mode,
+        exposure=scan.exposure_s,
+        period=scan.period_s,
+        settle=scan.settle_s,
+        darks=_field(scan.darks, scan.exposure_s),
+        flats=_field(scan.flats, scan.exposure_s),
+        scheme=scan.angles.scheme,
+    )
+
+
+def scene_mapping(config: Config) -> dict[str, Any]:
+    """The simulated scene as plain values, read from its file where the configuration names one.
+
+    Raises:
+        ConfigError: the file is not there, or is no group of keys.
+    """
+    scene = config.simulation.scene if config.simulation else {}
+    if isinstance(scene, dict):
+        return scene
+    path = config_folder() / scene  # an absolute path stays itself
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
+    return read(text, str(path)).data
+
+
+def _angles(plan: Any) -> NDArray[np.float64]:
+    match plan:
+        case SectorAngles():
+            return angles.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
+        case FileAngles():
+            return angles.from_text(Path(plan.path).read_text(encoding="utf-8"))
+    start, span = math.radians(plan.start_deg), math.radians(plan.span_deg)
+    match plan:
+        case RandomAngles():
+            return angles.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
+        case InterlacedAngles():
+            return angles.interlaced(plan.views, plan.passes, start, span)
+        case GoldenAngles():
+            return angles.golden(plan.views, start, span)
+    return angles.fixed(plan.views, start, span)
+
+
+def _field(fields: Fields, exposure: float) -> FieldPlan:
+    return FieldPlan(fields.count, fields.at, exposure if fields.exposure_s is None else fields.exposure_s)
+
+
+def _locate(data: Any, folder: Path) -> None:
+    """Make the file names in plain configuration values independent of the working directory, in place."""
+    if (scan := _group(data, "scan", "angles", "path")) is not None:
+        scan["path"] = str((folder / scan["path"]).resolve())
+    if (simulation := _group(data, "simulation", "scene")) is not None:
+        found, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
+        if found.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
+            simulation["scene"] = found.relative_to(shipped).as_posix()
+        elif found.is_file():  # else it is taken for one of those that come with the package
+            simulation["scene"] = str(found)
+    for key in ("file", "labels"):  # of a volume in a scene that stands in the configuration itself
+        if (phantom := _group(data, "simulation", "scene", "phantom", key)) is not None:
+            phantom[key] = str((folder / phantom[key]).resolve())
+
+
+def _group(data: Any, *path: str) -> dict[str, Any] | None:
+    """The group that holds the key at the end of `path`, where the key holds text."""
+    for name in path[:-1]:
+        data = data.get(name) if isinstance(data, dict) else None
+    return data if isinstance(data, dict) and isinstance(data.get(path[-1]), str) else None

@@ -1,0 +1,178 @@
+"""Configuration models: every key a configuration file may hold, its unit, its legal values and its default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+
+from beamline.config.devices import DeviceSection
+from beamline.config.section import Section
+from beamline.plan.plan import Mode, Place
+
+
+class Sample(Section):
+    name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)]
+    """letters, digits and _ . + - (it ends the run folder's name)"""
+    description: str = ""
+
+
+Views = Annotated[int, Field(gt=0, le=1_000_000)]
+
+
+class FixedAngles(Section):
+    """Equal steps from start_deg over span_deg; the end itself is excluded (180 views over 180 deg: 0 ... 179)."""
+
+    scheme: Literal["fixed"]
+    views: Views
+    start_deg: FiniteFloat = 0.0
+    span_deg: FiniteFloat = 180.0
+
+
+class SectorAngles(Section):
+    """Equal steps from first_deg to last_deg, both included (a limited-angle scan)."""
+
+    scheme: Literal["sector"]
+    views: Views
+    first_deg: FiniteFloat
+    last_deg: FiniteFloat
+
+
+class RandomAngles(Section):
+    """Uniformly random over span_deg, sorted; step scans only."""
+
+    scheme: Literal["random"]
+    views: Views
+    start_deg: FiniteFloat = 0.0
+    span_deg: FiniteFloat = 180.0
+    seed: int = 0
+
+
+class InterlacedAngles(Section):
+    """The fixed angles taken in several passes, each pass in the gaps that the earlier ones left."""
+
+    scheme: Literal["interlaced"]
+    views: Views
+    passes: PositiveInt
+    start_deg: FiniteFloat = 0.0
+    span_deg: FiniteFloat = 180.0
+
+
+class GoldenAngles(Section):
+    """Golden-ratio steps modulo span_deg: well spread after any number of views; step scans only."""
+
+    scheme: Literal["golden"]
+    views: Views
+    start_deg: FiniteFloat = 0.0
+    span_deg: FiniteFloat = 180.0
+
+
+class FileAngles(Section):
+    """Degrees from a text file, one a line, in the order of acquisition; # starts a comment."""
+
+    scheme: Literal["file"]
+    path: str
+    """Relative to the configuration file."""
+
+
+Angles = Annotated[
+    FixedAngles | SectorAngles | RandomAngles | InterlacedAngles | GoldenAngles | FileAngles,
+    Field(discriminator="scheme"),
+]
+
+
+class Fields(Section):
+    """Darks or flats: how many at each place, and their own exposure (null: the scan's)."""
+
+    count: Annotated[int, Field(ge=0, le=1_000_000)] = 10
+    at: Place = Place.START
+    exposure_s: PositiveFloat | None = None
+
+
+class Scan(Section):
+    mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
+    angles: Angles
+    exposure_s: PositiveFloat
+    period_s: PositiveFloat
+    """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""
+    settle_s: Annotated[float, Field(ge=0)] = 0.1
+    """Wait after each move of a step scan."""
+    darks: Fields = Fields()
+    flats: Fields = Fields()
+
+
+class Optics(Section):
+    pixel_size_um: PositiveFloat
+    """Of an unbinned pixel at the sample."""
+    energy_kev: PositiveFloat | None = None
+    distance_mm: Annotated[float, Field(ge=0)] | None = None
+    """Sample to detector."""
+    axis_col: FiniteFloat | None = None
+    """Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."""
+
+
+class Storage(Section):
+    folder: Annotated[str, Field(min_length=1)] = "runs"
+    preview_bin: PositiveInt = 4
+    flush_every: PositiveInt = 1
+
+
+class Monitor(Section):
+    on_alarm: Literal["log", "stop"] = "log"
+    thresholds: dict[str, dict[str, FiniteFloat]] = Field(default_factory=dict)
+    """Per check, the limits that differ from its defaults."""
+
+
+class Recon(Section):
+    live: bool = True
+    method: Literal["r2", "fbp"] = "r2"
+    seconds: PositiveFloat = 30.0
+    """Time for the fit after the last view."""
+    axis: Literal["auto"] | FiniteFloat = "auto"
+    seed: int = 0
+
+
+class Speed(Section):
+    speed: PositiveFloat
+    """Simulated seconds per real second."""
+
+
+class Simulation(Section):
+    """Only with simulated devices."""
+
+    scene: str | dict[str, Any] = "scenes/battery.yaml"
+    """A scene file (relative to the configuration file or to the installed configs), or the scene itself."""
+    clock: Literal["real", "virtual"] | Speed = "real"
+    seed: int = Field(0, ge=0, lt=2**63)
+
+
+class Config(Section):
+    """A whole configuration file."""
+
+    sample: Sample
+    scan: Scan
+    devices: DeviceSection
+    optics: Optics
+    storage: Storage = Storage()
+    monitor: Monitor = Monitor()
+    recon: Recon = Recon()
+    simulation: Simulation | None = None
+
+    @model_validator(mode="after")
+    def _all_simulated_or_none(self) -> Self:
+        simulated = self.devices.simulated_or_not()
+        if any(simulated.values()) and not all(simulated.values()):
+            unreal = ", ".join(name for name, value in simulated.items() if value)
+            real = ", ".join(name for name, value in simulated.items() if not value)
+            raise ValueError(
+                f"simulated devices cannot see real ones: {unreal} simulated, {real} real; make all simulated or none"
+            )
+        if any(simulated.values()) and self.simulation is None:
+            raise ValueError("simulated devices need a simulation section; `simulation: {}` takes its defaults")
+        if self.simulation is not None and not any(simulated.values()):
+            raise ValueError("the simulation section belongs to simulated devices and every device is real; remove it")
+        return self
+
+    @property
+    def simulated(self) -> bool:
+        return self.devices.stage.simulated

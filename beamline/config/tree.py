@@ -1,0 +1,132 @@
+"""Configuration text: YAML, --set and BEAMLINE_* variables as one tree, with where each value was said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from beamline.core.errors import ConfigError
+
+KeyPath = tuple[str | int, ...]
+ENVIRONMENT_PREFIX = "BEAMLINE_"
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Plain values, and for each key path where it was said ("my.yaml:12", "--set scan.period_s=0.2", ...)."""
+
+    data: dict[str, Any]
+    origins: Mapping[KeyPath, str]
+
+    def origin(self, path: KeyPath) -> str:
+        """Where the value at `path`, or the nearest group around it, was said."""
+        while path not in self.origins and path:
+            path = path[:-1]
+        return self.origins[path]
+
+
+def read(text: str, name: str) -> Tree:
+    """Parse YAML with safe types only.
+
+    Raises:
+        ConfigError: bad syntax, a key said twice, or a top level that is no group of keys; with file and line.
+    """
+    loader = yaml.SafeLoader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            raise ConfigError(
+                f"{name}: is empty; `beamline config init` prints a complete example. Nothing was started."
+            )
+        if not isinstance(node, yaml.MappingNode):
+            raise ConfigError(
+                f"{name}:1: holds no `key: value` lines; `beamline config init` prints a complete example."
+            )
+        origins: dict[KeyPath, str] = {(): f"{name}:{_line(node)}"}
+        _walk(node, (), name, origins)
+        data = loader.construct_document(node)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{name}:{mark.line + 1}" if mark else name
+        what = ", ".join(part for part in (error.context, error.problem) if part)
+        raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{name}: this is not YAML ({error}). Nothing was started.") from None
+    except RecursionError:
+        raise ConfigError(f"{name}: a value holds itself, or is nested beyond reason. Nothing was started.") from None
+    finally:
+        loader.dispose()
+    return Tree(data, origins)
+
+
+def _line(node: yaml.Node) -> int:
+    return int(node.start_mark.line) + 1
+
+
+def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
+    if isinstance(node, yaml.SequenceNode):
+        for index, child in enumerate(node.value):
+            origins[(*path, index)] = f"{name}:{_line(child)}"
+            _walk(child, (*path, index), name, origins)
+    if not isinstance(node, yaml.MappingNode):
+        return
+    seen: dict[str, int] = {}
+    for key, child in node.value:
+        word = str(key.value)
+        if word in seen:
+            full = ".".join(map(str, (*path, word)))
+            raise ConfigError(
+                f"{name}:{_line(key)}: {full} is said twice (also in line {seen[word]}); keep one. Nothing was started."
+            )
+        seen[word] = _line(key)
+        origins[(*path, word)] = f"{name}:{_line(key)}"
+        _walk(child, (*path, word), name, origins)
+
+
+def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str]) -> Tree:
+    """The tree with BEAMLINE_SECTION__KEY variables and then `section.key=value` overrides put over it.
+
+    Values are YAML. A variable without a double underscore is somebody else's and left alone.
+
+    Raises:
+        ConfigError: an override without `=`, or with a value that is not YAML.
+    """
+    changes: list[tuple[list[str], str, str]] = []
+    for name, value in sorted(environment.items()):
+        if name.startswith(ENVIRONMENT_PREFIX) and "__" in name:
+            changes.append((name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), value, name))
+    for word in overrides:
+        key, equals, value = word.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set {word}: expected section.key=value, such as --set scan.period_s=0.2")
+        changes.append((key.strip().split("."), value, f"--set {word}"))
+    data, origins = _copy(tree.data), dict(tree.origins)
+    for keys, text, origin in changes:
+        _put(data, keys, _value(text, origin))
+        path = tuple(keys)
+        origins = {known: said for known, said in origins.items() if known[: len(path)] != path} | {path: origin}
+    return Tree(data, origins)
+
+
+def _value(text: str, origin: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{origin}: the value is not YAML ({' '.join(str(error).split())})") from None
+
+
+def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:
+    for key in keys[:-1]:
+        if not isinstance(data.get(key), dict):
+            data[key] = {}
+        data = data[key]
+    data[keys[-1]] = value
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copy(child) for key, child in value.items()}
+    return value

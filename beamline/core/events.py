@@ -1,0 +1,137 @@
+"""Events: the one vocabulary of what happens in a run; terminal, events.jsonl and report are its sinks."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import SimpleQueue
+from types import MappingProxyType, TracebackType
+from typing import Any, Self, TextIO
+
+import numpy as np
+
+from drivers.clock import Clock
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened.
+
+    Attributes:
+        event: what, one word of the vocabulary below.
+        time: s since the Unix epoch.
+        data: numbers and strings that belong to it.
+
+    Vocabulary: run_started, state, block_started, frame (throttled), block_done, beam, flag, warning, snapshot,
+    progress, scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, explain, check, done,
+    failed.
+    What a live reconstruction says carries source="recon".
+    """
+
+    event: str
+    time: float
+    data: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    def to_json(self) -> str:
+        """One line of JSON; NaN and infinities become null, arrays become lists, paths strings."""
+        return json.dumps({"event": self.event, "time": round(self.time, 6), **_plain(self.data)}, allow_nan=False)
+
+
+Sink = Callable[[Event], None]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value if value is None else str(value)
+
+
+class JsonLines:
+    """A sink that writes one JSON line per event and flushes it, so that a crash loses nothing said before."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __call__(self, event: Event) -> None:
+        self._stream.write(event.to_json() + "\n")
+        self._stream.flush()
+
+
+def fan_out(*sinks: Sink) -> Sink:
+    """One sink that feeds all of `sinks`, in order."""
+
+    def send(event: Event) -> None:
+        for sink in sinks:
+            sink(event)
+
+    return send
+
+
+Emit = Callable[[str, Mapping[str, Any]], None]
+
+
+class Warnings:
+    """Collects warnings for the report while it sends them on as events."""
+
+    def __init__(self, sink: Sink, clock: Clock) -> None:
+        self._sink, self._clock = sink, clock
+        self.said: list[str] = []
+
+    def __call__(self, text: str) -> None:
+        if text not in self.said:
+            self.said.append(text)
+            self._sink(Event("warning", self._clock.now(), {"message": text}))
+
+
+class Announcer:
+    """Use as a context manager: leaving it waits until the sinks have had everything.
+
+    A sink that raises (a closed pipe, a full disk) gets nothing more; the others are told.
+    """
+
+    def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:
+        self._sinks, self._clock = list(sinks), clock
+        self._queue: SimpleQueue[Event | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._deliver, name="announcer", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._queue.put(None)
+        self._thread.join()
+
+    def __call__(self, event: str, data: Mapping[str, Any]) -> None:
+        """Say that `event` happened now. Returns at once."""
+        self._queue.put(Event(event, self._clock.now(), data))
+
+    def _deliver(self) -> None:
+        while (event := self._queue.get()) is not None:
+            self._send(event)
+
+    def _send(self, event: Event) -> None:
+        for sink in list(self._sinks):
+            if sink not in self._sinks:  # given up while the others were told of another
+                continue
+            try:
+                sink(event)
+            except Exception as error:
+                self._sinks.remove(sink)
+                message = f"an output of events was given up: {error}"
+                self._send(Event("warning", event.time, {"message": message}))

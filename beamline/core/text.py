@@ -1,0 +1,31 @@
+"""Quantities as text for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+
+def degrees(angle: float) -> str:
+    return f"{math.degrees(angle):.6g}°"
+
+
+def size(n_bytes: float) -> str:
+    """Bytes in decimal units, three digits."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if n_bytes < 999.5:
+            return f"{n_bytes:.3g} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.3g} TB"
+
+
+def spans(indices: Sequence[int], limit: int = 12) -> str:
+    """Ascending indices as readable text: `3, 7-9, 12`; more than `limit` groups end in `... (n in all)`."""
+    groups: list[tuple[int, int]] = []
+    for i in indices:
+        if groups and i == groups[-1][1] + 1:
+            groups[-1] = (groups[-1][0], i)
+        else:
+            groups.append((i, i))
+    text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in groups[:limit])
+    return text if len(groups) <= limit else f"{text}, ... ({len(indices)} in all)"

@@ -1,0 +1,72 @@
+"""Cameras: a configured real camera becomes its driver, and what it is waited for before a scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.config.devices import DcamOrca
+from drivers.clock import Clock
+
+if TYPE_CHECKING:
+    from drivers.dcam.camera import DcamCamera
+    from drivers.dcam.options import DcamOptions
+
+TELL_EVERY = 30.0
+"""s between words on a sensor that is cooling down."""
+
+
+def make_camera(config: DcamOrca, clock: Clock) -> DcamCamera:
+    """The driver of the configured camera, connected.
+
+    Raises:
+        DeviceError: no library, no camera, or it does not count its frames.
+    """
+    from drivers.dcam.camera import DcamCamera
+
+    library = None if config.library is None else Path(config.library)
+    return DcamCamera(library, config.index, clock=clock, options=options_of(config))
+
+
+def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, heed: Callable[[], None]) -> None:
+    """Wait for a cold sensor and tell the operator how cold it is.
+
+    Args:
+        seconds: at most.
+        heed: called once a second; what it raises ends the wait.
+
+    Raises:
+        DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
+    """
+    click.echo(f"Waiting for a cold sensor, at most {seconds:g} s; Ctrl-C ends it.", err=True)
+    told = -math.inf
+
+    def progress(celsius: float, status: str) -> None:
+        nonlocal told
+        heed()
+        if clock.now() - told >= TELL_EVERY:
+            told = clock.now()
+            click.echo(f"The sensor has {celsius:.1f} °C, its cooler says {status}.", err=True)
+
+    camera.wait_until_cold(seconds, progress)
+
+
+def options_of(camera: DcamOrca) -> DcamOptions:
+    """What the configuration says, as the driver takes it."""
+    from drivers.dcam import options
+
+    return options.DcamOptions(
+        trigger_active=options.TriggerActive(camera.trigger_active),
+        trigger_mode=options.TriggerMode(camera.trigger_mode),
+        trigger_polarity=options.TriggerPolarity(camera.trigger_polarity),
+        global_exposure=options.GlobalExposure(camera.global_exposure),
+        trigger_times=camera.trigger_times,
+        trigger_delay=camera.trigger_delay_s,
+        hot_pixels=None if camera.hot_pixels is None else options.HotPixels(camera.hot_pixels),
+        exposure_tolerance=camera.exposure_tolerance,
+        ring_bytes=camera.ring_mb * 1_000_000,
+    )

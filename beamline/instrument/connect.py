@@ -1,0 +1,160 @@
+"""Devices: the composition root, where a configuration becomes stage, camera, shutter, sample mover and beam monitor.
+
+Each is made by a module of its own; `simulated` makes them all where the instrument is simulated, and is the only one
+that names a simulator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from beamline.config.devices import DcamOrca, NoBeamMonitor, StageOutputShutter
+from beamline.config.load import Config
+from beamline.core.errors import ConfigError
+from beamline.instrument.beam_monitors import make_beam_monitor
+from beamline.instrument.cameras import make_camera, wait_until_cold
+from beamline.instrument.operator import ask_operator
+from beamline.instrument.simulated import Simulated, clock_of, scene_of, simulated_devices
+from beamline.instrument.stages import make_stage, output_shutter, stage_limits
+from drivers import orca_quest
+from drivers.clock import Clock, SystemClock
+from drivers.manual import Ask, ManualSampleMover, ManualShutter
+from drivers.protocols import (
+    BeamMonitor,
+    CameraSettings,
+    CameraTiming,
+    Devices,
+    RotationStage,
+    Shutter,
+    StageLimits,
+    TriggerSource,
+)
+
+if TYPE_CHECKING:
+    from recon.base.volume import Grid, Volume
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Connected devices and what goes with them; leaving a `with` block closes them.
+
+    Attributes:
+        clock: what every wait of the run goes by.
+        simulated: what the simulator knows; None at a real instrument.
+        close: frees ports and camera; a second time does nothing.
+        beam_monitor: None where none is configured.
+    """
+
+    devices: Devices
+    clock: Clock
+    simulated: Simulated | None
+    close: Callable[[], None]
+    beam_monitor: BeamMonitor | None = None
+
+    @property
+    def truth(self) -> Callable[[Grid], Volume] | None:
+        """See Simulated.truth; None at a real instrument."""
+        return None if self.simulated is None else self.simulated.truth
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def connect(
+    config: Config, clock: Clock | None = None, ask: Ask | None = None, heed: Callable[[], None] = lambda: None
+) -> Bench:
+    """Open every device that the configuration names. Nothing moves.
+
+    Args:
+        clock: takes the place of the configured one.
+        ask: puts a request to the operator (manual shutter and sample mover); the terminal unless given.
+        heed: called again and again while there is something to wait for; what it raises ends that.
+
+    Raises:
+        DeviceError: a device does not answer; those opened before it are closed again.
+        ConfigError: the simulated scene is wrong.
+    """
+    with ExitStack() as opened:
+        if config.simulation is None:
+            clock, simulated = clock or SystemClock(), None
+            devices = _instrument(config, clock, ask or ask_operator, heed, opened)
+        else:
+            clock = clock or clock_of(config.simulation.clock)
+            devices, simulated = simulated_devices(config, config.simulation, clock, opened)
+        monitor = None
+        if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
+            monitor = make_beam_monitor(config.devices.beam_monitor, clock)
+            opened.callback(monitor.close)
+        return Bench(devices, clock, simulated, opened.pop_all().close, monitor)
+
+
+@contextmanager
+def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
+    """The configured stage without the rest of the instrument. Nothing moves.
+
+    Raises:
+        DeviceError: it does not answer.
+    """
+    if config.simulation is not None:
+        with connect(config, clock) as bench:
+            yield bench.devices.stage
+        return
+    with closing(make_stage(config.devices.stage, config.devices.stage.port, clock or SystemClock())) as stage:
+        yield stage
+
+
+def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:
+    """What the devices will say once connected, from the configuration and the data sheet alone: for dry runs.
+
+    A simulated scene is read too, so that what is wrong with it is said now.
+
+    Returns:
+        the stage's limits, the camera's timing with the views' exposure, and the stage's radians to whole counts.
+
+    Raises:
+        ConfigError: settings that a device would refuse, or a scene that is wrong.
+    """
+    stage = config.devices.stage
+    if config.simulation is not None:
+        scene_of(config)
+    try:
+        limits = stage_limits(stage)
+    except ValueError as error:
+        raise ConfigError(f"devices.stage: {error}. Nothing was started.") from None
+    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
+    link = config.devices.camera.link if isinstance(config.devices.camera, DcamOrca) else "usb3"
+    try:
+        timing = orca_quest.timing(settings, link)
+    except ValueError as error:
+        raise ConfigError(f"devices.camera: {error}. Nothing was started.") from None
+    return limits, timing, lambda angle: round(angle * stage.counts_per_turn / (2 * math.pi))
+
+
+def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
+    """The configured region, binning and readout with an exposure (s) and a trigger source."""
+    camera = config.devices.camera
+    return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
+
+
+def _instrument(config: Config, clock: Clock, ask: Ask, heed: Callable[[], None], opened: ExitStack) -> Devices:
+    chosen, wanted = config.devices.camera, config.devices.shutter
+    if not isinstance(chosen, DcamOrca):
+        raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
+    stage = make_stage(config.devices.stage, config.devices.stage.port, clock)
+    opened.callback(stage.close)
+    camera = make_camera(chosen, clock)
+    opened.callback(camera.close)
+    if chosen.cool_s:
+        wait_until_cold(camera, chosen.cool_s, clock, heed)
+    shutter: Shutter = ManualShutter(ask)
+    if isinstance(wanted, StageOutputShutter):
+        shutter = output_shutter(config.devices.stage, wanted, stage, clock)
+    return Devices(stage, camera, shutter, ManualSampleMover(ask))

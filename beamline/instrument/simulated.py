@@ -1,0 +1,218 @@
+"""Simulated instrument: the stand-ins that take the devices' places, behind the same drivers where there are any.
+
+Simulators are imported where they are needed, so that an instrument loads none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+from uuid import uuid4
+
+from beamline.config.devices import StageOutputShutter
+from beamline.config.load import Config, config_folder, scene_mapping
+from beamline.config.models import Simulation, Speed
+from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
+from beamline.core.errors import ConfigError
+from beamline.instrument.stages import make_stage, output_shutter
+from drivers import orca_quest
+from drivers.clock import Clock, SystemClock
+from drivers.protocols import Devices, Shutter
+
+if TYPE_CHECKING:
+    from recon.base.volume import Grid, Volume
+    from simulators.devices.camera import SimulatedOrcaQuest
+    from simulators.devices.shutter import BeamGate
+    from simulators.devices.trigger_line import TriggerLine
+    from simulators.effects.chain import Label
+    from simulators.scenes.scene import Scene
+    from simulators.wires.wire import Wire
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What a simulator knows and an instrument does not.
+
+    Attributes:
+        truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
+            camera's rows.
+        cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
+        labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch).
+        rehearse: makes a frame with the camera's present settings; ConfigError where the scene cannot be exposed so.
+    """
+
+    truth: Callable[[Grid], Volume]
+    cone: tuple[float, float] | None
+    labels: Callable[[float], Sequence[Label]]
+    rehearse: Callable[[], None]
+
+
+def simulated_devices(
+    config: Config, simulation: Simulation, clock: Clock, opened: ExitStack
+) -> tuple[Devices, Simulated]:
+    """Every device of the configuration, connected, and what is known of them.
+
+    Args:
+        opened: takes what closes them.
+
+    Raises:
+        ConfigError: the scene is wrong, or the simulated controller has no such output.
+    """
+    from simulators.devices.camera import SimulatedOrcaQuest
+    from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter, WiredShutter
+    from simulators.devices.trigger_line import TriggerLine
+    from simulators.wires.serial_url import register
+
+    scene = scene_of(config)
+    line = TriggerLine(clock)
+    settings, wanted = config.devices.stage, config.devices.shutter
+    try:
+        wire, high = _wire(settings, clock, line)
+    except LookupError as error:
+        key = "output" if isinstance(settings, ZaberStageConfig) else "trigger_line"
+        raise ConfigError(
+            f"devices.stage.{key}: the simulated {settings.kind} controller has no such digital output; set 1 for a "
+            "simulation. Nothing was started."
+        ) from error
+    # A name of its own for every bench: two in one process must not share a controller.
+    stage = make_stage(settings, register(f"{settings.kind}-{uuid4().hex}", wire), clock)
+    opened.callback(stage.close)
+    shutter: Shutter = SimulatedShutter()
+    blade: BeamGate = shutter
+    if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
+        output = wanted.output
+        shutter = output_shutter(settings, wanted, stage, clock)
+        blade = WiredShutter(lambda: high(output), wanted.open_high)
+    sample = SimulatedSampleMover()
+    pitch = config.optics.pixel_size_um * 1e-3
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
+    opened.callback(camera.close)
+    known = Simulated(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
+    return Devices(stage, camera, shutter, sample), known
+
+
+def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, Callable[[int], bool]]:
+    """The simulated controller, built as the configuration says of the real one, and the levels of its outputs."""
+    counts = config.counts_per_turn
+    match config:
+        case PM16CStageConfig():
+            from simulators.wires.pm16c.wire import PM16CController
+
+            at_start = config.first_pulse == "at_start"
+            pm16c = PM16CController(
+                clock, line, channel=config.channel, counts_per_turn=counts, fires_at_start=at_start
+            )
+            return pm16c, lambda number: False
+        case PiGcsStageConfig():
+            from simulators.wires.pi_gcs.axis import Build
+            from simulators.wires.pi_gcs.trigger import FirstPulse
+            from simulators.wires.pi_gcs.wire import PiGcsController
+
+            build = Build(
+                counts_per_turn=counts,
+                low=config.low_deg - 1,
+                high=config.high_deg + 1,
+                first_pulse=FirstPulse(config.first_pulse),
+                pulse_width=config.firmware_pulse_s,
+                rising=config.active_high,
+                max_velocity=config.max_speed_deg_s,
+                max_acceleration=config.acceleration_deg_s2,
+            )
+            pi = PiGcsController(clock, line, axis=config.axis, output=config.trigger_line, build=build)
+            return pi, lambda number: pi.box.levels.get(number, False)
+        case ZaberStageConfig():
+            from simulators.wires.zaber.wire import ZaberController
+
+            zaber = ZaberController(
+                clock,
+                line,
+                counts_per_turn=counts,
+                output=config.output,
+                active_high=config.active_high,
+                address=config.device,
+                can_schedule=not config.toggle,
+                can_chain=config.chained,
+                fires_when_enabled=config.fires_when_enabled,
+            )
+            return zaber, lambda number: bool(zaber.device.triggers.outputs[number - 1])
+
+
+def scene_of(config: Config) -> Scene:
+    """The simulated scene. Raises ConfigError: it is wrong; DataError: a volume that it names cannot be read."""
+    from beamline.simulate.scene_file import volumes_beside
+    from simulators.frame.mapping import SceneError
+    from simulators.scenes.scene import load_scene
+
+    said = config.simulation.scene if config.simulation else {}
+    # Paths in a scene that stands in the configuration itself are full ones by now.
+    folder = config_folder() if isinstance(said, dict) else (config_folder() / said).parent
+    try:
+        scene = load_scene(scene_mapping(config), volumes_beside(folder))
+    except SceneError as error:
+        raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
+    if _cone(scene) is not None:
+        _refuse_untold(config, scene)
+    return scene
+
+
+def _refuse_untold(config: Config, scene: Scene) -> None:
+    """Raises ConfigError where the file of a cone's scan could not be reconstructed: what it has no words for."""
+    camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
+    row0, col0, rows, _ = camera.roi or (0, 0, height, width)
+    if 2 * row0 + rows != height:
+        raise ConfigError(
+            f"devices.camera.roi: the scene is a cone beam, whose central ray meets the middle of the sensor's rows; "
+            f"{rows} of them begin at {(height - rows) // 2} then, not at {row0}. Nothing was started."
+        )
+    if config.optics.axis_col is None:
+        axis_col = ((width - camera.binning) / 2 + scene.axis_offset_px - col0) / camera.binning
+        raise ConfigError(
+            "optics.axis_col: the scene is a cone beam, whose rotation axis is not searched; set its column, here "
+            f"{axis_col:g}. Nothing was started."
+        )
+
+
+def _cone(scene: Scene) -> tuple[float, float] | None:
+    beam = scene.beam
+    return None if beam.sod is None or beam.sdd is None else (beam.sod, beam.sdd)
+
+
+def _rehearse(camera: SimulatedOrcaQuest) -> None:
+    from simulators.frame.shot import CannotExposeError
+
+    try:
+        camera.rehearse()
+    except CannotExposeError as error:
+        raise ConfigError(f"simulation.scene cannot be exposed: {error}. Nothing was started.") from error
+
+
+def clock_of(kind: str | Speed) -> Clock:
+    """The simulation's clock: real, virtual or faster."""
+    from simulators.devices.clock import ScaledClock, VirtualClock
+
+    if isinstance(kind, Speed):
+        return ScaledClock(SystemClock(), kind.speed)
+    return VirtualClock() if kind == "virtual" else SystemClock()
+
+
+def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
+    from recon.base.volume import Volume
+
+    def truth(grid: Grid) -> Volume:
+        # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
+        detector = camera.detector
+        up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
+        z, y, x = grid.centre
+        return Volume(scene.sample.attenuation(replace(grid, centre=(z + up, y, x))), grid)
+
+    return truth
+
+
+def simulated_electrometer(clock: Clock, end: bytes) -> str:
+    """The url of an electrometer that shows a steady current; its lines end with `end`."""
+    from simulators.wires.electrometer import ElectrometerWire
+    from simulators.wires.serial_url import register
+
+    return register(f"electrometer-{uuid4().hex}", ElectrometerWire(clock, end=end))

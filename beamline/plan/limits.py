@@ -1,0 +1,190 @@
+"""Plan checks: every limit that a worked-out plan breaks, and what the operator should know though it breaks none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from beamline.core.text import degrees, size
+from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan
+from beamline.plan.triggers import Flight
+from drivers.protocols import CameraTiming, StageLimits
+from drivers.stages.travel import least_interval
+
+ROOM = 1.1
+"""Free disk asked for, times pixels and previews: per-frame values and what else grows meanwhile."""
+MARGIN = 1.01
+"""Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """A plan and what has been worked out of it: what the checks look at."""
+
+    plan: ScanPlan
+    views: Block
+    flight: Flight | None
+    stage: StageLimits
+    camera: CameraTiming
+    axis_col: float | None
+    reach: tuple[float, float]
+    blur_px: float
+    skew_px: float
+    total_bytes: int
+    free_bytes: int | None
+
+
+def violations(facts: Facts) -> Iterator[str]:
+    """One sentence for each broken limit."""
+    plan = facts.plan
+    if plan.mode is Mode.FLY:
+        yield from _timing(facts)
+        yield from _speed(facts)
+        if not facts.stage.trigger_output:
+            yield "the stage has no trigger output, which a fly scan needs; use scan.mode: step"
+        elif facts.flight:
+            yield from _spacing(facts.flight.interval, facts.stage)
+    yield from _limits(facts)
+    cols = facts.camera.shape[1]
+    if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
+        yield (
+            f"optics.axis_col {facts.axis_col:g} lies outside the frame's columns 0 ... {cols - 1}; it counts "
+            "columns of the region that is read, after binning"
+        )
+    for name, field in (("flats", plan.flats), ("darks", plan.darks)):
+        if field.at is not Place.NONE and field.count == 0:
+            yield f"no {name}: scan.{name}.count is 0; take at least one, or say at: none where that is meant"
+    if facts.free_bytes is not None and facts.total_bytes * ROOM > facts.free_bytes:
+        yield (
+            f"the file needs {size(facts.total_bytes)} and a tenth more, the disk has {size(facts.free_bytes)} free; "
+            "free some, choose another storage.folder, or reduce views, roi or binning"
+        )
+
+
+def remarks(facts: Facts) -> Iterator[str]:
+    """One sentence for each thing worth knowing."""
+    plan, camera = facts.plan, facts.camera
+    yield from _rounding(facts)
+    period = facts.views.period
+    if facts.flight and abs(period - plan.period) > 1e-3 * plan.period:
+        yield (
+            f"period_s {plan.period:g} would be {facts.flight.interval / plan.period:.6g} counts/s of the stage; it "
+            f"turns at {facts.flight.interval / period:.6g}, so that views come every {period:.6g} s"
+        )
+    if plan.mode is Mode.FLY and camera.min_period <= period < MARGIN * camera.min_period:
+        yield (
+            f"a trigger every {period:.6g} s leaves less than 1 % over the camera's least "
+            f"{camera.min_period:.6g} s; a pulse that comes early is ignored without a word"
+        )
+    if facts.blur_px > 1:
+        exposure = plan.exposure / facts.blur_px
+        yield (
+            f"motion blur is {facts.blur_px:.2f} px at the detector's edge; exposure_s <= {exposure:.3g} or a longer "
+            f"period_s (now {plan.period:g}) keeps it under 1 px"
+        )
+    if facts.skew_px > 1:
+        yield (
+            f"the rolling shutter skews a point at the edge by {facts.skew_px:.2f} px between the first and the last "
+            "row; turn slower, or read fewer rows"
+        )
+    criterion = math.ceil(math.pi / 2 * camera.shape[1])
+    if plan.angles.size < criterion:
+        yield (
+            f"{plan.angles.size} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: "
+            "filtered back-projection will show streaks towards the edge"
+        )
+    yield from _reference("flats", plan.flats, plan.exposure, "their light will be scaled")
+    yield from _reference("darks", plan.darks, plan.exposure, "their hot pixels and dark current are not the views'")
+
+
+def _timing(facts: Facts) -> Iterator[str]:
+    plan, camera, period = facts.plan, facts.camera, facts.views.period
+    if plan.exposure > period:
+        yield (
+            f"exposure_s {plan.exposure:g} is longer than period_s {period:.4g}; "
+            "shorten the exposure or lengthen the period"
+        )
+    if period < camera.min_period:
+        rows, cols = camera.shape
+        yield (
+            f"period_s {period:.4g} is below the camera's least {camera.min_period:.6g} s between triggers "
+            f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= "
+            f"{_up(camera.min_period * MARGIN):g}, expose shorter or read fewer pixels"
+        )
+
+
+def _speed(facts: Facts) -> Iterator[str]:
+    if facts.flight and facts.flight.interval / facts.plan.period < 0.5:
+        slowest = facts.flight.interval
+        yield (
+            f"a view every {facts.plan.period:g} s is less than a count a second of the stage; "
+            f"set scan.period_s <= {slowest:g}, take fewer views, or use scan.mode: step"
+        )
+    if facts.views.speed > facts.stage.max_speed * (1 + 1e-9):
+        period = facts.plan.period * facts.views.speed / facts.stage.max_speed
+        yield (
+            f"the scan needs {degrees(facts.views.speed)}/s, the stage turns at most "
+            f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {_up(period):g} or take more views"
+        )
+
+
+def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
+    """The trigger output must be able to tell the pulses apart, whatever the speed at which a train is passed."""
+    least, unit = least_interval(stage), stage.interval_unit
+    if interval % unit:
+        yield (
+            f"views are {interval} counts of the stage apart, and a trigger output that is toggled needs a multiple of "
+            f"{unit}; take another number of views, devices.stage.toggle: false where the firmware can, or "
+            "scan.mode: step"
+        )
+    elif interval < least:
+        fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
+        yield (
+            f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
+            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s; take fewer views, a shorter "
+            f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {_down(fastest):g}"
+        )
+
+
+def _limits(facts: Facts) -> Iterator[str]:
+    low, high = facts.reach
+    slack = math.pi / facts.stage.counts_per_turn
+    if low < facts.stage.low - slack or high > facts.stage.high + slack:
+        taxi = f" (with {degrees(facts.views.taxi)} of taxi at each end)" if facts.views.taxi else ""
+        yield (
+            f"the stage would go from {degrees(low)} to {degrees(high)}{taxi}, its limits are "
+            f"{degrees(facts.stage.low)} ... {degrees(facts.stage.high)}; move or narrow the angles"
+            + (", or turn slower for less taxi" if facts.views.taxi else "")
+        )
+
+
+def _rounding(facts: Facts) -> Iterator[str]:
+    flight, stage = facts.flight, facts.stage
+    if flight is None or flight.drift <= 1.01 * math.pi / stage.counts_per_turn:
+        return
+    count = 2 * math.pi / stage.counts_per_turn
+    yield (
+        f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; triggers fall on whole counts, so "
+        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, which moves views by up to "
+        f"{degrees(flight.drift)}; the file holds the angles that were triggered"
+    )
+
+
+def _reference(name: str, field: FieldPlan, exposure: float, otherwise: str) -> Iterator[str]:
+    if field.at is Place.NONE:
+        yield f"no {name} will be taken (scan.{name}.at: none)"
+    elif field.exposure != exposure:
+        yield f"{name} are exposed for {field.exposure:g} s and views for {exposure:g} s; {otherwise}"
+
+
+def _up(seconds: float) -> float:
+    """Rounded up to three digits: advice that works when it is followed."""
+    unit = 10.0 ** (math.floor(math.log10(seconds)) - 2)
+    return math.ceil(seconds / unit - 1e-9) * unit
+
+
+def _down(value: float) -> float:
+    """Rounded down to three digits, as `_up`."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return math.floor(value / unit + 1e-9) * unit

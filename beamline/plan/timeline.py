@@ -1,0 +1,247 @@
+"""Timeline: a plan worked out for one stage and one camera, as values and as lines for the operator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import degrees, size
+from beamline.monitor.digest import preview_shape
+from beamline.plan.limits import Facts, remarks, violations
+from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
+from beamline.plan.triggers import Flight, Scale, plan_flight
+from drivers.frame import FrameKind
+from drivers.protocols import CameraTiming, StageLimits
+
+BYTES_PER_PIXEL, BYTES_PER_BLOCK = 2, 4  # uint16 frames, float32 previews
+
+
+def work_out(
+    plan: ScanPlan,
+    stage: StageLimits,
+    to_counts: Callable[[float], int],
+    camera: CameraTiming,
+    *,
+    axis_col: float | None = None,
+    preview_bin: int = 4,
+    free_bytes: int | None = None,
+) -> Timeline:
+    """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
+
+    Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, rounded to whole
+    counts a second (the views' block has the period that comes of it); it starts far enough before the first pulse to
+    reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return
+    at full speed between them. The duration is that of a stage that stands at its zero and goes back there at the end,
+    without shutter and sample moves.
+
+    Args:
+        to_counts: the stage's conversion of radians to whole counts.
+        camera: its timing with the views' exposure.
+        axis_col: column of the rotation axis (None: the middle), for blur and skew at the farther edge.
+        preview_bin: pixels per side of the previews that the file holds beside the frames.
+        free_bytes: of the disk; None leaves it unchecked.
+    """
+    scale = Scale.of(to_counts)
+    broken: list[str] = []
+    flight: Flight | None = None
+    if plan.mode is Mode.FLY:
+        try:
+            flight = plan_flight(plan.angles, to_counts)
+        except ValueError as error:
+            broken.append(str(error))
+    blocks = tuple(_blocks(plan, flight, scale, stage, camera))
+    views = next(block for block in blocks if block.kind is FrameKind.PROJECTION)
+    speed = views.speed * _half_width(camera, axis_col)
+    frame_bytes = camera.shape[0] * camera.shape[1] * BYTES_PER_PIXEL
+    preview_bytes = math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
+    facts = Facts(
+        plan=plan,
+        views=views,
+        flight=flight,
+        stage=stage,
+        camera=camera,
+        axis_col=axis_col,
+        reach=_reach(views),
+        blur_px=speed * plan.exposure,
+        skew_px=speed * camera.row_period * (camera.shape[0] - 1),
+        total_bytes=(frame_bytes + preview_bytes) * sum(block.n for block in blocks),
+        free_bytes=free_bytes,
+    )
+    step_counts = flight.interval if flight else 0
+    return Timeline(
+        blocks=blocks,
+        duration=sum(block_seconds(block, stage, camera, plan.settle) for block in blocks) + _return(views, stage),
+        frame_bytes=frame_bytes,
+        total_bytes=facts.total_bytes,
+        step_counts=step_counts,
+        step=step_counts * abs(scale.per_count),
+        blur_px=facts.blur_px,
+        skew_px=facts.skew_px,
+        violations=(*broken, *violations(facts)),
+        remarks=tuple(remarks(facts)),
+    )
+
+
+def taxi_angle(speed: float, acceleration: float, step: float) -> float:
+    """Run-up in radians: whole angular steps, at least half a one more than it takes to reach `speed`.
+
+    ceil(accel distance / step + 0.5) steps, as tomoscan plans it; so the speed is steady at the first pulse.
+    """
+    return math.ceil(speed**2 / (2 * acceleration) / step + 0.5) * step
+
+
+def move_seconds(distance: float, speed: float, acceleration: float) -> float:
+    """Time of a move with a trapezoid velocity profile (a triangle where the top speed is not reached)."""
+    distance = abs(distance)
+    if distance < speed**2 / acceleration:
+        return 2 * math.sqrt(distance / acceleration)
+    return distance / speed + speed / acceleration
+
+
+def pass_ends(block: Block) -> list[tuple[float, float]]:
+    """Where each pass of a fly block starts and stops: its first and last angle, `taxi` further out. Radians."""
+    ends, at = [], 0
+    for train in block.trains:
+        first, last = float(block.angles[at]), float(block.angles[at + train.n - 1])
+        out = math.copysign(block.taxi, last - first)
+        ends.append((first - out, last + out))
+        at += train.n
+    return ends
+
+
+def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float) -> float:
+    """How long a block takes, with its moves; the views' block begins with the stage at its zero."""
+    tail = block.exposure + camera.readout
+    if block.mode is Mode.STATIC or (block.mode is Mode.FLY and not block.trains):
+        return (block.n - 1) * block.period + tail
+    seconds, at = 0.0, 0.0
+    if block.mode is Mode.FLY:
+        for start, stop in pass_ends(block):
+            seconds += move_seconds(start - at, stage.max_speed, stage.acceleration)
+            seconds += move_seconds(stop - start, block.speed, stage.acceleration)
+            at = stop
+        return seconds + tail
+    for i, angle in enumerate(block.angles.tolist()):
+        ready = move_seconds(angle - at, stage.max_speed, stage.acceleration) + settle
+        seconds += max(block.period, camera.min_period, tail + ready) if i else ready
+        at = angle
+    return seconds + tail
+
+
+def _blocks(
+    plan: ScanPlan, flight: Flight | None, scale: Scale, stage: StageLimits, camera: CameraTiming
+) -> Iterable[Block]:
+    row = 0
+    before = [(FrameKind.DARK, plan.darks), (FrameKind.FLAT, plan.flats)]
+    for kind, field in before:
+        if field.count and field.at in (Place.START, Place.BOTH):
+            yield _static(kind, field, row, plan, camera)
+            row += field.count
+    views = _views(plan, flight, row, scale, stage)
+    yield views
+    row += views.n
+    for kind, field in reversed(before):
+        if field.count and field.at in (Place.END, Place.BOTH):
+            yield _static(kind, field, row, plan, camera)
+            row += field.count
+
+
+def _static(kind: FrameKind, field: FieldPlan, row: int, plan: ScanPlan, camera: CameraTiming) -> Block:
+    """References follow one another as fast as the camera can: its overhead per frame, on their own exposure."""
+    overhead = max(camera.min_period - plan.exposure, camera.readout)
+    return Block(kind, Mode.STATIC, row, np.full(field.count, np.nan), field.exposure, field.exposure + overhead)
+
+
+def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage: StageLimits) -> Block:
+    counts = flight.counts() if flight else np.rint((plan.angles - scale.origin) / scale.per_count).astype(np.int64)
+    angles = scale.angles(counts)
+    if flight is None:
+        return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period)
+    # A pulse generator's speed is a whole number of counts a second, so the period becomes one that this gives.
+    rate = max(1, round(flight.interval / plan.period))
+    speed, period = rate * abs(scale.per_count), flight.interval / rate
+    step, before = (n * abs(scale.per_count) for n in (flight.step, stage.run_up * flight.interval + flight.step))
+    taxi = max(taxi_angle(speed, stage.acceleration, step), before)
+    return Block(
+        FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, period, flight.trains, speed=speed, taxi=taxi
+    )
+
+
+def _half_width(camera: CameraTiming, axis_col: float | None) -> float:
+    cols = camera.shape[1]
+    return cols / 2 if axis_col is None else max(axis_col + 0.5, cols - 0.5 - axis_col)
+
+
+def _reach(views: Block) -> tuple[float, float]:
+    """The smallest and the largest angle that the stage would be sent to."""
+    ends = np.array(pass_ends(views)).ravel() if views.trains else views.angles
+    return float(ends.min()), float(ends.max())
+
+
+def _return(views: Block, stage: StageLimits) -> float:
+    last = pass_ends(views)[-1][1] if views.trains else float(views.angles[-1])
+    return move_seconds(last, stage.max_speed, stage.acceleration)
+
+
+def describe(
+    plan: ScanPlan,
+    timeline: Timeline,
+    stage: StageLimits,
+    camera: CameraTiming,
+    *,
+    free_bytes: int | None = None,
+) -> list[str]:
+    """The timeline for a human: what `check` and `scan --dry-run` print."""
+    lines = [
+        f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
+    ]
+    for block in timeline.blocks:
+        last = block.first_row + block.n - 1
+        seconds = block_seconds(block, stage, camera, plan.settle)
+        lines.append(
+            f"{block.first_row:>6}-{last:<6}  {block.kind.name.lower():<10}  {block.n:>6}  {block.mode:<6}  "
+            f"{block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  {_angles(block.angles)}"
+        )
+    views = timeline.views
+    rows, cols = camera.shape
+    facts = [("views", f"{views.n}, {plan.scheme} angles, {plan.mode} scan")]
+    if views.trains:
+        passes = f" in each of {len(views.trains)} passes" if len(views.trains) > 1 else ""
+        facts += [
+            ("step", f"{degrees(timeline.step)} = {timeline.step_counts} counts of {degrees(_count(stage))}{passes}"),
+            ("speed", f"{degrees(views.speed)}/s (the stage's most {degrees(stage.max_speed)}/s)"),
+            ("taxi", f"{degrees(views.taxi)} before the first and after the last trigger"),
+            ("blur", f"{timeline.blur_px:.3g} px at the detector's edge during an exposure"),
+            ("skew", f"{timeline.skew_px:.3g} px there between the first and the last row (rolling shutter)"),
+        ]
+    else:
+        facts.append(("moves", f"at {degrees(stage.max_speed)}/s, then {plan.settle:g} s to settle"))
+    total = size(timeline.total_bytes)
+    free = "" if free_bytes is None else f"; {size(free_bytes)} free"
+    facts += [
+        ("camera", f"{rows} x {cols} px of {camera.bits} bits, least time between triggers {camera.min_period:.6g} s"),
+        ("duration", f"{_clock(timeline.duration)} (without shutter and sample moves)"),
+        ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} and previews = {total}{free}"),
+    ]
+    lines += ["", *(f"{name:<10}{text}" for name, text in facts)]
+    lines += [f"{'remark':<10}{text}" for text in timeline.remarks]
+    lines += [f"{'VIOLATION':<10}{text}" for text in timeline.violations]
+    return lines
+
+
+def _count(stage: StageLimits) -> float:
+    return 2 * math.pi / stage.counts_per_turn
+
+
+def _angles(angles: NDArray[np.float64]) -> str:
+    if np.isnan(angles).any():
+        return "-"
+    return f"{degrees(float(angles[0]))} ... {degrees(float(angles[-1]))}"
+
+
+def _clock(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02} = {seconds:.1f} s"

@@ -1,0 +1,196 @@
+"""From the frames of a scan to line integrals and their geometry: only the views and rows asked for are ever held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.projections.correction import Corrector, Warn
+from beamline.projections.selection import (
+    Selection,
+    check_axis,
+    choose_views,
+    cone_of,
+    geometry_of,
+    pixel_size,
+    unbinned,
+)
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.validate import beam_present, quantity_said, references_present, source_findings
+from drivers.frame import FrameKind
+from recon.base.geometry import Geometry
+from recon.prep.align import AxisEstimate, find_axis
+from recon.prep.correct import Projections
+
+_AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
+_AXIS_ROWS = 64
+_HELD_OUT_VIEWS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Line integrals ready for reconstruction.
+
+    Attributes:
+        projections: of the views used; view_ids are their rows in the file.
+        geometry: of these views, binned; mm, or px where the pixel size is unknown.
+        axis_col: rotation axis in columns of the full detector.
+        axis: how it was found; None where it was given.
+        held_out: line integrals of some views that are not used, and their geometry; None where all are used.
+        n_projections: how many views the scan has.
+        length_unit: "mm" or "px".
+        quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
+    """
+
+    projections: Projections
+    geometry: Geometry
+    axis_col: float
+    axis: AxisEstimate | None
+    held_out: tuple[NDArray[np.float32], Geometry] | None
+    n_projections: int
+    length_unit: str
+    quantity: str
+
+
+def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
+    """Read, correct and align what `selection` asks for.
+
+    Args:
+        source: a finished scan.
+        selection: what to use.
+        warn: is told, in a sentence, of everything that is not as it should be though work goes on.
+
+    Raises:
+        DataError: the scan cannot be reconstructed; the message says why and what to do.
+        ConfigError: the selection does not fit the scan.
+    """
+    findings = source_findings(source)
+    refuse(source, findings)
+    for finding in findings:
+        if finding.severity == "warning":
+            warn(finding.message)
+    scan_frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
+    corrector = Corrector(source, selection, warn)
+    axis_col, axis = selection.axis_col, None
+    if axis_col is None:
+        if cone_of(source, selection) is not None:
+            axis_col = stated_axis(source)
+        else:
+            axis_col, axis = locate_axis(source, corrector, scan_frames, warn)
+    check_axis(source, axis_col)
+    period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
+    chosen = choose_views(source, scan_frames, selection, period)
+    projections = corrector.line_integrals(scan_frames[chosen])
+    report_defects(projections, warn)
+    if projections.view_ids.size < 2:
+        raise DataError(
+            f"{source.path}: only {projections.view_ids.size} of the views chosen can be used, 2 are needed."
+        )
+    if not projections.data.any():
+        raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
+    rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
+    held_out = None
+    if rest.size:
+        others = corrector.line_integrals(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
+        held_out = others.data, geometry_of(source, selection, axis_col, source.angles[others.view_ids])
+    return Prepared(
+        projections=projections,
+        geometry=geometry_of(source, selection, axis_col, source.angles[projections.view_ids]),
+        axis_col=axis_col,
+        axis=axis,
+        held_out=held_out,
+        n_projections=int(scan_frames.size),
+        length_unit="px" if pixel_size(source, selection) is None else "mm",
+        quantity=source.quantity,
+    )
+
+
+def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
+    """Raises DataError for the first error among the findings, with what to do about it."""
+    for finding in findings:
+        if finding.severity != "error":
+            continue
+        raise DataError(f"{source.path} cannot be reconstructed. {finding.message}")
+
+
+def correction_blockers(source: ScanSource) -> list[Finding]:
+    """Why the frames of a scan that is still growing cannot be corrected."""
+    return [finding for rule in (quantity_said, references_present, beam_present) for finding in rule(source)]
+
+
+def stated_axis(source: ScanSource) -> float:
+    """The rotation axis that the file states; that of a cone beam is not searched, for its opposite views differ.
+
+    Raises:
+        DataError: it states none.
+    """
+    if source.axis_col is None:
+        raise DataError(
+            f"{source.path} does not say where the rotation axis is, and that of a cone beam is not searched. Give it "
+            "with --axis COLUMN (0 is the centre of the first column)."
+        )
+    return source.axis_col
+
+
+def locate_axis(
+    source: ScanSource, corrector: Corrector, frames: NDArray[np.int64], warn: Warn
+) -> tuple[float, AxisEstimate]:
+    """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
+
+    An estimate without a clear optimum gives way to what the file states, if it states it.
+
+    Raises:
+        DataError: no axis in the search range explains the views.
+    """
+    height = (corrector.rows.stop - corrector.rows.start) // corrector.binning
+    start = max(0, (height - _AXIS_ROWS) // 2)
+    frames = frames[_spread(np.arange(frames.size), _AXIS_VIEWS)]
+    band = corrector.line_integrals(frames, slice(start, min(height, start + _AXIS_ROWS)))
+    try:
+        estimate = find_axis(band.data, source.angles[band.view_ids])
+    except ValueError as error:
+        raise DataError(
+            f"{source.path}: the rotation axis was not found: {error}. Give it with --axis COLUMN (0 is the centre of "
+            "the first column)."
+        ) from error
+    found = unbinned(estimate.value, corrector.binning)
+    if estimate.confident:
+        return found, estimate
+    if source.axis_col is not None:
+        warn(
+            f"The rotation axis found, column {found:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
+            "used. Check the slices, or give --axis COLUMN."
+        )
+        return source.axis_col, estimate
+    warn(
+        f"The rotation axis found, column {found:.2f}, is not a clear optimum. Check the slices for doubled edges, or "
+        "give --axis COLUMN."
+    )
+    return found, estimate
+
+
+def report_defects(projections: Projections, warn: Warn) -> None:
+    """Tell of what correction had to repair, where it is more than a stray pixel in a thousand."""
+    masked = float(projections.masked.mean())
+    if masked > 1e-3:
+        warn(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours.")
+    if projections.replaced > 1e-3:
+        warn(f"{projections.replaced:.1%} of the pixels were zingers or not finite: filled from their neighbours.")
+    if projections.floored > 1e-3:
+        warn(
+            f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
+            "least what the volume says."
+        )
+
+
+def _spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """At most `n` of the items, evenly spread, with the first and the last."""
+    if items.size <= n:
+        return items
+    return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]

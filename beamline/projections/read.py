@@ -1,0 +1,92 @@
+"""Reading: pixels of a scan, binned while they are read, and the means of its reference frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage.readers.base import ScanSource
+from drivers.frame import FrameKind
+from recon.prep.correct import References
+
+_BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
+
+
+def read_binned(source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int) -> NDArray[Any]:
+    """Frames [frame, row, col], binned by averaging while they are read; NaN stays out of the averages.
+
+    Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
+    columns that do not fill a bin go.
+    """
+    height, width = (rows.stop - rows.start) // binning, source.shape[1] // binning
+    whole = binning == 1 and source.dtype.kind in "ui"
+    out = np.empty((len(frames), height, width), source.dtype.newbyteorder("=") if whole else np.float32)
+    frame_bytes = (rows.stop - rows.start) * source.shape[1] * source.dtype.itemsize
+    batch = max(1, _BATCH_BYTES // max(1, frame_bytes))
+    for start in range(0, len(frames), batch):
+        raw = source.read(frames[start : start + batch], rows)
+        if binning > 1:
+            raw = _mean_bins(raw[:, : height * binning, : width * binning].astype(np.float32), binning)
+        out[start : start + batch] = raw
+    return out
+
+
+def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+    k, rows, cols = raw.shape
+    blocks = raw.reshape(k, rows // n, n, cols // n, n)
+    finite = np.isfinite(blocks)
+    if finite.all():
+        return blocks.mean(axis=(2, 4), dtype=np.float32)
+    count = finite.sum(axis=(2, 4))
+    total = np.where(finite, blocks, 0).sum(axis=(2, 4), dtype=np.float32)
+    return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
+
+
+def read_references(source: ScanSource, rows: slice, binning: int) -> References:
+    """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
+
+    The light of flats with an exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat,
+    where both are known. The dark is one for all: the file's rules tell where it was exposed otherwise.
+    """
+    dark_frames = np.flatnonzero(source.image_key == FrameKind.DARK)
+    flat_frames = np.flatnonzero(source.image_key == FrameKind.FLAT)
+    dark = _mean(source, dark_frames, rows, binning)
+    scale = light_scale(source.image_key, source.exposures)
+    # Flats with no projection between them were taken together.
+    views_before = np.cumsum(source.image_key == FrameKind.PROJECTION)[flat_frames]
+    groups = np.split(flat_frames, np.flatnonzero(np.diff(views_before)) + 1)
+    flats = []
+    for group in groups:
+        mean = _mean(source, group, rows, binning, scale[group])
+        flats.append((float(group.mean()), (mean + (1 - scale[group].mean()) * dark).astype(np.float32)))
+    return References(dark.astype(np.float32), tuple(flats))
+
+
+def light_scale(image_key: NDArray[np.int32], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+    """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
+
+    Args:
+        exposures: [frame] s, NaN where unknown. Of projections that differ the median counts.
+    """
+    views = exposures[image_key == FrameKind.PROJECTION]
+    views = views[np.isfinite(views)]
+    if views.size == 0:
+        return np.ones(exposures.size)
+    return np.where(np.isfinite(exposures), np.median(views) / exposures, 1.0)
+
+
+def _mean(
+    source: ScanSource,
+    frames: NDArray[np.int64],
+    rows: slice,
+    binning: int,
+    weights: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Mean of the frames, each times its weight; float64 [row, col], binned."""
+    total = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64)
+    for i, frame in enumerate(frames):
+        image = read_binned(source, np.array([frame]), rows, binning)[0]
+        total += image if weights is None else weights[i] * image
+    return total / frames.size

@@ -1,0 +1,122 @@
+"""Selection: which part of a scan is used, and what that means for its views, rows, rotation axis and geometry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError
+from beamline.storage.readers.base import ScanSource
+from recon.base.geometry import Geometry
+from recon.base.views import parse_views
+from recon.prep.correct import CorrectionSettings
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which part of a scan to use, and how.
+
+    Attributes:
+        views: a view selection, see recon.base.views.parse_views.
+        rows: (first, end) detector rows; None is all.
+        binning: pixels averaged per side.
+        axis_col: rotation axis in columns of the full detector; None finds it.
+        pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
+        cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
+        correction: of counts to line integrals.
+        seed: of random view selections.
+    """
+
+    views: str = "all"
+    rows: tuple[int, int] | None = None
+    binning: int = 1
+    axis_col: float | None = None
+    pixel_size_mm: float | None = None
+    cone: tuple[float, float] | None = None
+    correction: CorrectionSettings = field(default_factory=CorrectionSettings)
+    seed: int = 0
+
+
+def choose_views(
+    source: ScanSource, frames: NDArray[np.int64], selection: Selection, period: float = math.pi
+) -> NDArray[np.int64]:
+    """Indices into `frames` of the views that the selection names; at least two.
+
+    Args:
+        period: radians after which views see the same rays, see `Geometry.period`.
+
+    Raises:
+        ConfigError: the selection is not legal, or leaves fewer than two views.
+    """
+    try:
+        chosen = parse_views(selection.views, source.angles[frames], selection.seed, period=period)
+    except ValueError as error:
+        raise ConfigError(f"--views: {error}") from error
+    if chosen.size < 2:
+        raise ConfigError(
+            f"--views {selection.views} leaves {chosen.size} of the {frames.size} views of {source.path}; a volume "
+            "needs at least 2."
+        )
+    return chosen
+
+
+def rows_of(source: ScanSource, selection: Selection) -> slice:
+    """The detector rows to read, cut to whole bins.
+
+    Raises:
+        ConfigError: rows outside the detector, or bins larger than what is left.
+    """
+    height, width = source.shape
+    first, end = selection.rows or (0, height)
+    if not 0 <= first < end <= height:
+        raise ConfigError(f"--rows {first}:{end} do not lie in the detector's 0:{height}.")
+    n = selection.binning
+    if not 1 <= n <= min(end - first, width):
+        raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
+    return slice(first, first + (end - first) // n * n)
+
+
+def check_axis(source: ScanSource, axis_col: float) -> None:
+    """Raises ConfigError where the axis lies outside the detector."""
+    if not -0.5 <= axis_col <= source.shape[1] - 0.5:
+        raise ConfigError(
+            f"The rotation axis, column {axis_col:g}, lies outside the detector's columns 0 to {source.shape[1] - 1}."
+        )
+
+
+def unbinned(column: float, binning: int) -> float:
+    """A binned column in columns of the full detector."""
+    return column * binning + (binning - 1) / 2
+
+
+def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
+    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 where it is not known.
+
+    Raises:
+        ConfigError: a cone beam's pixel size is not known.
+    """
+    rows = rows_of(source, selection)
+    full = (rows.stop - rows.start, source.shape[1])
+    pitch = pixel_size(source, selection)
+    if (cone := cone_of(source, selection)) is not None:
+        if pitch is None:
+            raise ConfigError(
+                f"{source.path} does not say its pixel size, which a cone beam needs: give --pixel-size-um (on the "
+                "detector)."
+            )
+        # The central ray meets the middle of the detector, whatever rows are read.
+        axis_row = (source.shape[0] - 1) / 2 - rows.start
+        return Geometry.cone(angles, full, pitch, *cone, axis_col, axis_row=axis_row).binned(selection.binning)
+    return Geometry.parallel(angles, full, 1.0 if pitch is None else pitch, axis_col).binned(selection.binning)
+
+
+def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | None:
+    """(sod, sdd) in mm; None for a parallel beam."""
+    return source.cone if selection.cone is None else selection.cone
+
+
+def pixel_size(source: ScanSource, selection: Selection) -> float | None:
+    return source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm

@@ -1,0 +1,156 @@
+"""Reconstruction within a time: measure this machine on this scan, choose settings, and end when the time is over."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+import recon
+from beamline.projections.correction import Warn
+from beamline.projections.held_out import with_held_out
+from beamline.projections.prepare import Prepared
+from recon.assess.time_model import CURVES, Choice, Speeds, choose, parts_of
+from recon.base.binning import bin_views
+from recon.base.volume import Grid
+from recon.calibrate import calibrate
+from recon.reconstruction import Reconstruction
+from recon.splatting.initialise import default_count, place
+from recon.splatting.optimise import Progress
+from recon.splatting.splat import voxelize
+from recon.voxels.fbp import Filter
+from recon.voxels.fdk import has_direct_method
+
+Now = Callable[[], float]
+
+_GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
+_RESERVE = 0.02  # of the budget, for what no part has measured
+_SLAB = 16  # slices
+
+
+@dataclass(frozen=True, eq=False)
+class Budgeted:
+    """A reconstruction that was given a time.
+
+    Attributes:
+        result: what came out.
+        prepared: the views it was made from, joined where the choice says so.
+        choice, speeds: what was chosen, and the measurements behind it.
+        seconds: of everything, calibration included.
+        placed: Gaussians at the start.
+    """
+
+    result: Reconstruction
+    prepared: Prepared
+    choice: Choice
+    speeds: Speeds
+    seconds: float
+    placed: int = 0
+
+    def settings(self, budget: float) -> dict[str, Any]:
+        """For the record."""
+        c, s = self.choice, self.speeds
+        return {
+            "budget": budget,
+            "budget_used": self.seconds,
+            "chosen_method": c.method,
+            "chosen_binning": c.binning,
+            "chosen_share": c.share,
+            "expected_steps": c.steps,
+            "expected_gain_db": c.gain,
+            "measured_fbp_s": s.fbp,
+            "measured_start_s": s.start,
+            "measured_step_s": s.step,
+            "measured_fill_s": s.fill,
+        }
+
+    def said(self, budget: float) -> str:
+        """What was chosen, in a line."""
+        fit = ""
+        if self.choice.method == "r2":
+            fit = f", {self.result.history[-1].step} steps from {self.placed} Gaussians"
+        return f"{_named(self.choice, fit)}: {parts_of(self.seconds)} of {parts_of(budget)}"
+
+
+def within(
+    budget: float,
+    prepared: Prepared,
+    seed: int,
+    filter: Filter,
+    now: Now,
+    on_progress: Callable[[Progress], None],
+    stopped: Callable[[], bool],
+    warn: Warn,
+) -> Budgeted:
+    """Reconstruct within `budget` seconds by `now`, the measuring included.
+
+    Placing is run and timed before the fit gets what is left, and filling is timed on a slab of what was placed: only
+    the choice rests on predictions. Where even the cheapest choice will be late, `warn` is told so before the work.
+
+    Raises:
+        ValueError: the views cannot be reconstructed.
+    """
+    begin = now()
+    data, geometry = prepared.projections.data, prepared.geometry
+    speeds = calibrate(data, geometry, Grid.matching(geometry), now)
+    unbinned = default_count(Grid.of_field(geometry, geometry.sample_pitch))  # the curves count in these
+    spent = now() - begin
+    # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
+    choice = choose(max(budget - spent, sys.float_info.min), speeds, min(geometry.detector_shape))
+    if choice.method == "fbp" and not has_direct_method(geometry):
+        # There is only the volume that Gaussians are placed by; the fewest of them, and a step, are the next best.
+        choice = replace(choice, method="r2", share=min(curve.share for curve in CURVES) / choice.binning**3)
+    late = spent + _least(choice, speeds) - budget
+    if late > 0:
+        warn(
+            f"{parts_of(budget)} are too few for this scan: measuring this machine took {parts_of(spent)}, and the "
+            f"cheapest choice, {_named(choice)}, will be about {parts_of(late)} late."
+        )
+    prepared = joined(prepared, choice.binning)
+    data, geometry = prepared.projections.data, prepared.geometry
+    grid = Grid.matching(geometry)
+    if choice.method == "fbp":
+        result = recon.reconstruct(data, geometry, grid, "fbp", filter=filter, now=now)
+        return Budgeted(result, prepared, choice, speeds, now() - begin)
+    field = Grid.of_field(geometry, geometry.sample_pitch)
+    placed = place(data, geometry, field, max(1, round(choice.share * unbinned)), np.random.default_rng(seed))
+    before = now()
+    slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
+    voxelize(placed, slab)
+    fill = (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
+    end = begin + budget * (1 - _RESERVE) - fill
+    data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
+    result = recon.reconstruct(
+        data, geometry, grid, seconds=max(0.0, end - now()), gaussians=placed, seed=seed, held_out=held_out,
+        on_progress=on_progress, should_stop=lambda: stopped() or now() >= end, now=now,
+    )  # fmt: skip
+    return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
+
+
+def _named(choice: Choice, fit: str = "") -> str:
+    joined = f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else ""
+    return f"{choice.method}{fit}{joined}"
+
+
+def _least(choice: Choice, speeds: Speeds) -> float:
+    """Seconds that a choice takes at the least: for a fit placing, a step and filling; as `choose` counts them."""
+    first = speeds.fbp / choice.binning**3
+    if choice.method == "fbp":
+        return first
+    return first + (speeds.start + speeds.fill) * choice.share + speeds.step / choice.binning**2
+
+
+def joined(prepared: Prepared, factor: int) -> Prepared:
+    """The same views with factor x factor pixels joined: means of line integrals."""
+    if factor == 1:
+        return prepared
+    held = prepared.held_out
+    return replace(
+        prepared,
+        projections=replace(prepared.projections, data=bin_views(prepared.projections.data, factor)),
+        geometry=prepared.geometry.binned(factor),
+        held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
+    )

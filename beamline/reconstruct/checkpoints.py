@@ -1,0 +1,161 @@
+"""Checkpoints of a fit: what it was made from, whether that is still the same, and keeping its state as it goes on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import refuse_existing
+from beamline.projections.correction import Warn
+from beamline.projections.prepare import Prepared
+from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from beamline.storage.writers.recon_file import Value
+from recon.base.geometry import Geometry
+from recon.splatting.checkpoint import state_from
+from recon.splatting.optimise import FitState
+from recon.splatting.settings import FitSettings
+
+_SHOWN = 40  # characters of a value that is told
+
+
+def made_from(prepared: Prepared, settings: FitSettings, others: Mapping[str, Value]) -> dict[str, Value]:
+    """Everything that decides what a step does: data (by a checksum), geometry and settings.
+
+    Args:
+        prepared: line integrals and geometry; those of views held out judge and decide nothing.
+        settings: of the fit.
+        others: seed, start and the like, by name.
+    """
+    data = np.ascontiguousarray(prepared.projections.data, np.float32)
+    out: dict[str, Value] = {
+        "projections": hashlib.sha256(data.data).hexdigest(),
+        "n_views": prepared.geometry.n_views,
+        "length_unit": prepared.length_unit,
+    }
+    out |= {f.name: np.asarray(getattr(prepared.geometry, f.name)) for f in fields(Geometry)}
+    out |= {f"setting {name}": str(value) for name, value in asdict(settings).items()}
+    return out | {f"setting {name}": value for name, value in others.items()}
+
+
+def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[str]:
+    """What differs between two of `made_from`, in words."""
+    out = []
+    for name in dict.fromkeys([*now, *before]):
+        one, other = now.get(name), before.get(name)
+        if one is None or other is None:
+            out.append(f"{name} is known of one of them only")
+        elif not np.array_equal(np.asarray(one), np.asarray(other)):
+            out.append(f"{name.removeprefix('setting ')} {_told(one, other)}")
+    return out
+
+
+def _told(one: Value, other: Value) -> str:
+    a, b = np.asarray(one), np.asarray(other)
+    if a.shape != b.shape:
+        return f"({a.size} values, {b.size} in the checkpoint)"
+    if a.size > 3:
+        return f"({int((a != b).sum())} of {a.size} values)"
+    words = [str(v.tolist()) for v in (a, b)]
+    if max(map(len, words)) > _SHOWN:
+        return "(other content)"
+    return f"({words[0]}, {words[1]} in the checkpoint)"
+
+
+@dataclass(frozen=True)
+class Keeper:
+    """Where a fit's state is kept and where it comes from.
+
+    Attributes:
+        path: to write to; None keeps nothing.
+        resume: to begin from; None begins anew.
+    """
+
+    path: Path | None = None
+    resume: Path | None = None
+
+    @property
+    def wanted(self) -> bool:
+        return self.path is not None or self.resume is not None
+
+    def refuse_existing(self) -> None:
+        """Raises DataError before any work: a file in the way of the checkpoint, or none to begin from.
+
+        The checkpoint may take the place of the one it begins from.
+        """
+        if self.resume is not None:
+            _whole(self.resume)
+        if self.path is not None and not (self.resume is not None and self.path.resolve() == self.resume.resolve()):
+            refuse_existing(self.path)
+
+    def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:
+        """The state to go on from; None where a fit begins anew.
+
+        Args:
+            origin: what the fit is made from.
+            steps: planned; 0 where a time is.
+            warn: is told where the plan is another, so that the volume is not that of a fit without a break.
+
+        Raises:
+            ConfigError: the fit has more steps behind it than planned.
+            DataError: the checkpoint was made from something else.
+        """
+        if self.resume is None:
+            return None
+        kept, reached = _whole(self.resume)
+        others = differences(origin, kept.made_from)
+        if others:
+            raise DataError(
+                f"{self.resume} is of another fit: {_listed(others)}. Give the options that it was made with, or start "
+                "anew without --resume."
+            )
+        if 0 < steps < reached.step:
+            raise ConfigError(
+                f"--resume {self.resume} has {reached.step} steps behind it, more than the {steps} wanted: give at "
+                f"least {reached.step} with --steps, or start anew without --resume."
+            )
+        if steps != kept.steps or steps == 0:
+            was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
+            plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
+            warn(f"The checkpoint is of a fit {plans}: its learning rates go on where the new plan has them.")
+        return kept.state
+
+    def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> None:
+        """Keep the state; where the disk refuses, that is told and the fit goes on."""
+        if self.path is None:
+            return
+        try:
+            write_checkpoint(self.path, Checkpoint(state, origin, steps))
+        except DataError as error:
+            warn(f"A checkpoint was left out: {error}")
+
+
+def _whole(path: Path) -> tuple[Checkpoint, FitState]:
+    """The checkpoint, and the state in it.
+
+    Raises:
+        DataError: there is none, or it holds no state to go on from.
+    """
+    kept = read_checkpoint(path)
+    try:
+        reached = state_from(kept.state)
+        for name, values in kept.state.items():
+            # The last loss may be none yet, and so may the best of views held out.
+            if name not in ("scalars", "watch") and not np.isfinite(values).all():
+                raise ValueError(f"{name} of the checkpoint holds values that are not finite")
+        if not (np.isfinite(reached.unit) and reached.unit > 0):
+            raise ValueError(f"the density unit of the checkpoint is {reached.unit}")
+    except ValueError as error:
+        raise DataError(f"The checkpoint {path} is damaged: {error}. Resume from another, or start anew.") from error
+    return kept, reached
+
+
+def _listed(differences: Sequence[str]) -> str:
+    shown = "; ".join(differences[:6])
+    return f"{shown}; and {len(differences) - 6} more" if len(differences) > 6 else shown

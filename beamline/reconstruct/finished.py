@@ -1,0 +1,228 @@
+"""Offline reconstruction: a finished scan file in, a volume with its report out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import recon
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event, Sink, Warnings
+from beamline.core.stop import Heeded, Stoppable, never_stopped
+from beamline.projections.held_out import keep_back, with_held_out
+from beamline.projections.prepare import Prepared, prepare
+from beamline.reconstruct.budget import within
+from beamline.reconstruct.checkpoints import made_from
+from beamline.reconstruct.measure import fit_truth, read_truth
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.progress import progress_events
+from beamline.reconstruct.recon_report import Context, Made, facts_of
+from beamline.reconstruct.result import deliver
+from drivers.clock import Clock
+from recon.assess.time_model import PRESETS
+from recon.base.volume import Grid
+from recon.reconstruction import DEFAULT_STEPS
+from recon.splatting.backend import backend_for
+from recon.splatting.initialise import default_count
+from recon.splatting.optimise import Progress
+from recon.splatting.settings import FitSettings
+from recon.warm_up import warm_up
+
+
+def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = never_stopped) -> dict[str, float]:
+    """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
+
+    A fit that is stopped within `stoppable` delivers what it has, marked `ended_early`.
+
+    Raises:
+        ConfigError, DataError: with nothing written.
+    """
+    started = clock.now()
+    options.target.refuse_existing()
+    options.keeper.refuse_existing()
+    check_device(options.device)
+    wanted = None if options.truth is None else read_truth(options.truth)
+    warn = Warnings(sink, clock)
+    with options.source.open() as source:
+        if not source.finished:
+            n = source.image_key.size
+            if not options.unfinished:
+                raise DataError(
+                    f"{source.path} is still being written, or its scan died. Follow it with --follow, or take the {n} "
+                    "frames that are there with --unfinished."
+                )
+            warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
+        facts = facts_of(source)
+        prepared = prepare(source, options.selection, warn)
+    selection = options.selection
+    if options.early_stop and prepared.held_out is None:
+        prepared = keep_back(prepared)
+        n = prepared.projections.view_ids.size
+        message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
+        sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
+    if wanted is not None:  # before the work, not after it
+        fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
+    announce(options, prepared, sink, clock)
+    with stoppable() as stopped:
+        work = _Work(options, prepared, sink, clock, Heeded(stopped), warn)
+        if options.budget is not None:
+            made, prepared, factor = _spend(work, options.budget)
+            selection = replace(selection, binning=selection.binning * factor)
+        else:
+            made = _fit(work) if options.method == "r2" else _by_voxels(work)
+    truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
+    context = Context(facts, selection, options.command, options.seed, warn.said, started)
+    return deliver(made, prepared, truth, options.target, context, sink, clock)
+
+
+def announce(options: ReconOptions, prepared: Prepared, sink: Sink, clock: Clock) -> None:
+    """Say what is about to be reconstructed."""
+    data = {
+        "file": options.source.path,
+        "method": options.method,
+        "n_views": prepared.geometry.n_views,
+        "n_projections": prepared.n_projections,
+        "detector": prepared.geometry.detector_shape,
+        "axis_col": prepared.axis_col,
+        "axis_confident": None if prepared.axis is None else prepared.axis.confident,
+    }
+    sink(Event("recon_started", clock.now(), data))
+
+
+def check_device(device: str) -> None:
+    """Raises ConfigError where a fit cannot compute there."""
+    try:
+        backend_for(device)
+    except (ImportError, RuntimeError, ValueError) as error:
+        raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What a reconstruction is made of and with."""
+
+    options: ReconOptions
+    prepared: Prepared
+    sink: Sink
+    clock: Clock
+    heeded: Heeded
+    warn: Warnings
+
+    @property
+    def grid(self) -> Grid:
+        return Grid.matching(self.prepared.geometry)
+
+    def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
+        return progress_events(self.sink, self.clock, seconds)
+
+    @contextmanager
+    def refused(self, by: str = "") -> Iterator[None]:
+        """What the data do not allow, as a DataError that names the file."""
+        try:
+            yield
+        except ValueError as error:
+            raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
+
+    def made(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> Made:
+        """The result with what it was made with: its own settings, `settings`, and whether it ended early."""
+        return Made(
+            volume=result.volume,
+            method=result.method,
+            seconds=result.seconds,
+            history=result.history,
+            settings={**result.settings, **settings, **({"ended_early": True} if early else {})},
+            filter=self.options.filter,
+            chosen=chosen,
+        )
+
+
+def _by_voxels(work: _Work) -> Made:
+    """By FBP or an iterative method."""
+    options, prepared = work.options, work.prepared
+    own: dict[str, Any] = {"filter": options.filter} if options.method == "fbp" else {}
+    with work.refused(f" by {options.method}"):
+        result = recon.reconstruct(
+            prepared.projections.data,
+            prepared.geometry,
+            work.grid,
+            method=options.method,
+            seed=options.seed,
+            **own,
+            iterations=options.iterations,
+            tv_weight=options.tv_weight,
+            on_progress=work.listener(),
+            should_stop=work.heeded,
+            now=work.clock.now,
+        )
+    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
+    return work.made(result, work.heeded.cut(reached, planned))
+
+
+def _fit(work: _Work) -> Made:
+    """Fit Gaussians, by steps, by seconds or by a preset; keeping its state and taking it up where that is wanted."""
+    options, prepared, grid = work.options, work.prepared, work.grid
+    steps, gaussians, polish, said = options.steps, options.gaussians, options.polish, ""
+    if options.quality is not None:
+        preset = PRESETS[options.quality]
+        steps, polish = preset.steps, preset.polish
+        gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
+    if steps is None and options.seconds is None:
+        steps = DEFAULT_STEPS
+    settings, keeper = FitSettings(loss=options.loss), options.keeper
+    origin, resume = {}, None
+    if keeper.wanted:
+        others = {"seed": options.seed, "start": options.start, "gaussians": gaussians or 0}
+        origin = made_from(prepared, settings, others)
+        resume = keeper.begin(origin, steps or 0, work.warn)
+    # So that the fit's time, and the time it says is left, hold no compilation.
+    warm_up(options.device, options.loss, prepared.geometry, rays=settings.rays, start=options.start)
+    data, geometry, held_out = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
+    with work.refused(" by r2"):
+        result = recon.reconstruct(
+            data,
+            geometry,
+            grid,
+            steps=steps,
+            gaussians=gaussians,
+            seed=options.seed,
+            settings=settings,
+            seconds=options.seconds,
+            start=options.start,
+            held_out=held_out,
+            early_stop=options.early_stop,
+            resume=resume,
+            device=options.device,
+            polish=polish,
+            on_progress=work.listener(options.seconds),
+            should_stop=work.heeded,
+            on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, work.warn),
+            now=work.clock.now,
+        )
+    if result.checkpoint is not None:
+        keeper.write(origin, steps or 0, work.warn, result.checkpoint)
+    begun = int(result.settings["gaussians_at_start"])
+    if options.quality is not None:
+        said = f"{options.quality}: {steps} steps from {begun} Gaussians"
+        said += f", {polish} sweeps on voxels" if polish else ""
+    if options.gaussians is not None and resume is None and begun < options.gaussians:
+        work.warn(f"The fit started from {begun} Gaussians, not from {options.gaussians}: there is no matter for more.")
+    told = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
+    # Sweeps come after the last step, and end early as well.
+    early = work.heeded.told if polish else work.heeded.cut(result.history[-1].step, steps or 0)
+    resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
+    return work.made(told, early, said, **resumed)
+
+
+def _spend(work: _Work, budget: float) -> tuple[Made, Prepared, int]:
+    """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
+    warm_up(geometry=work.prepared.geometry)  # compilation happens once on a machine; no budget pays for it
+    with work.refused():
+        done = within(
+            budget, work.prepared, work.options.seed, work.options.filter, work.clock.now, work.listener(budget),
+            work.heeded, work.warn,
+        )  # fmt: skip
+    made = work.made(done.result, work.heeded.told, done.said(budget), **done.settings(budget))
+    return replace(made, seconds=done.seconds, method=done.choice.method), done.prepared, done.choice.binning

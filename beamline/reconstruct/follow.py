@@ -1,0 +1,123 @@
+"""Following a scan: the volume grows while the file does, and is finished when the scan is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event, Sink, Warnings
+from beamline.core.stop import Stoppable, never_stopped
+from beamline.projections.prepare import prepare
+from beamline.reconstruct.growing import Growing
+from beamline.reconstruct.measure import fit_truth, read_truth
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.recon_report import Context, facts_of
+from beamline.reconstruct.result import deliver
+from beamline.storage.readers.open import NotReadyError, ScanSource
+from drivers.clock import Clock
+from recon.warm_up import warm_up
+
+DEFAULT_SECONDS = 20.0  # of the last round
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """How a scan is followed; all in s.
+
+    Attributes:
+        poll: between looks at the file while there is nothing to fit.
+        slice: of fitting between looks at the file.
+        snapshot: between intermediate volumes.
+        patience: without a new frame in an unfinished file, before the scan is given up.
+    """
+
+    poll: float = 0.1
+    slice: float = 0.5
+    snapshot: float = 5.0
+    patience: float = 120.0
+
+
+def follow(
+    options: ReconOptions,
+    sink: Sink,
+    clock: Clock,
+    rhythm: Rhythm | None = None,
+    stoppable: Stoppable = never_stopped,
+) -> dict[str, float]:
+    """Reconstruct a scan while it runs (or one that has ended). Returns the metrics; the event `done` says the rest.
+
+    Intermediate volumes stand in `<output>.snapshot.h5`, each replacing the last in one step; a failure leaves the
+    newest one, success none.
+
+    Raises:
+        ConfigError: a method or selection that needs the whole scan.
+        DataError: no scan, or one that stopped growing without being finished.
+    """
+    rhythm = rhythm or Rhythm()
+    if options.method != "r2":
+        raise ConfigError(
+            f"--follow grows an r2 volume; for {options.method} run without --follow when the scan has ended."
+        )
+    if options.selection.views != "all" or options.steps is not None:
+        raise ConfigError(
+            "--follow takes every view as it comes, for --seconds after the end: leave out --views and --steps."
+        )
+    options.target.refuse_existing()
+    wanted = None if options.truth is None else read_truth(options.truth)
+    started = clock.now()
+    warn = Warnings(sink, clock)
+    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    warm_up()
+    with _open(options, sink, clock, rhythm) as source:
+        growing = Growing(options, source, sink, clock, warn)
+        _watch(growing, clock, rhythm)
+        with stoppable() as stopped:
+            made = growing.finish(options.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
+        facts = facts_of(source)
+        # All flats are there now; the geometry stays the one that the volume has grown in.
+        prepared = prepare(source, replace(options.selection, axis_col=growing.axis_col), warn)
+        prepared = replace(prepared, axis=growing.axis)
+    truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
+    context = Context(facts, options.selection, options.command, options.seed, warn.said, started)
+    metrics = deliver(made, prepared, truth, options.target, context, sink, clock)
+    growing.snapshot_path.unlink(missing_ok=True)
+    return metrics
+
+
+def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm) -> ScanSource:
+    """Wait for the file to be there and readable."""
+    begin = clock.now()
+    told = False
+    while True:
+        try:
+            return options.source.open(follow=True)
+        except NotReadyError as error:
+            if clock.now() - begin > rhythm.patience:
+                raise DataError(f"No scan began in {options.source.path} within {rhythm.patience:.0f} s.") from error
+            if not told:
+                sink(Event("state", clock.now(), {"state": "waiting", "message": f"Waiting for {options.source.path}"}))
+                told = True
+            clock.sleep(rhythm.poll)
+
+
+def _watch(growing: Growing, clock: Clock, rhythm: Rhythm) -> None:
+    """Take views and fit, in turns, until the scan has ended."""
+    last_frame = last_snapshot = clock.now()
+    while True:
+        ended = growing.source.finished  # asked before the frames, so that none can slip in between
+        if growing.take_new_frames(ended):
+            last_frame = clock.now()
+        if ended:
+            if growing.waiting == 0:
+                return
+            continue
+        if clock.now() - last_frame > rhythm.patience:
+            raise DataError(
+                f"{growing.source.path} has not grown for {rhythm.patience:.0f} s and is not finished: the scan died. "
+                f"Run without --follow and with --unfinished to use the {growing.n_views} views that are there."
+            )
+        if not growing.advance(rhythm.slice):
+            clock.sleep(rhythm.poll)
+        elif clock.now() - last_snapshot >= rhythm.snapshot:
+            growing.write_snapshot()
+            last_snapshot = clock.now()

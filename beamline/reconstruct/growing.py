@@ -1,0 +1,219 @@
+"""A growing scan: what of its file has been taken, the axis as far as the views tell it, and the fit that they feed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.events import Event, Sink, Warnings
+from beamline.core.stop import Heeded
+from beamline.projections.correction import Corrector
+from beamline.projections.prepare import correction_blockers, locate_axis, refuse, stated_axis
+from beamline.projections.selection import check_axis, cone_of, geometry_of
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.progress import progress_events
+from beamline.reconstruct.recon_report import Made
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.validate import reconstruction_blockers
+from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
+from drivers.clock import Clock
+from drivers.frame import FrameKind
+from recon.prep.align import AxisEstimate
+from recon.splatting.optimise import Progress
+from recon.splatting.stream import StreamingFit
+
+_FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
+_BATCH = 32  # views corrected before the fit goes on
+_AXIS_MOVES = 0.3  # px by which a better axis makes the fit begin anew
+
+
+class Growing:
+    """A scan's file and the volume that grows with it. Who follows it says when to look, to fit and to finish."""
+
+    def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
+        given = options.selection.axis_col
+        self.source, self.axis_col = source, source.axis_col if given is None else given
+        self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
+        self.axis: AxisEstimate | None = None  # how the axis was found; None where it was given or stated
+        self._corrector: Corrector | None = None
+        self._late = False  # darks or flats come after the views
+        self._fit: StreamingFit | None = None
+        self._frames = 0
+        self._taken = 0  # frames that the fit has, or that are no views
+        self._axis_settled = self.axis_col is not None
+        self._next_axis = _FIRST_AXIS_VIEWS
+        self._history: list[Progress] = []
+        self._begin = clock.now()
+        output = options.target.output
+        self.snapshot_path: Path = output.with_name(f"{output.stem}.snapshot.h5")
+
+    @property
+    def n_views(self) -> int:
+        return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
+
+    @property
+    def waiting(self) -> int:
+        """Frames that are there and not taken yet."""
+        return self._frames - self._taken
+
+    def take_new_frames(self, ended: bool) -> bool:
+        """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
+        n = self.source.refresh()
+        grown, self._frames = n > self._frames, n
+        views = np.flatnonzero(self.source.image_key == FrameKind.PROJECTION)
+        if views.size == 0:
+            self._taken = n
+            return grown
+        if self._corrector is None:
+            blockers = correction_blockers(self.source)
+            if not ended and (self._late or any(finding.rule == "references" for finding in blockers)):
+                self._wait_for_references()
+                return grown
+            refuse(self.source, blockers)
+            self._corrector = Corrector(self.source, self._options.selection, self._warn)
+        if not self._axis_settled:
+            self._settle_axis(self._corrector, views, ended)
+        if self.axis_col is None:
+            return grown
+        if self._fit is None:
+            self._fit = self._new_fit(self.axis_col)
+        new = views[views >= self._taken]
+        batch = new[:_BATCH]
+        if batch.size:
+            corrected = self._corrector.line_integrals(batch)
+            self._fit.add_views(corrected.data, self.source.angles[corrected.view_ids])
+        self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
+        return grown
+
+    def _wait_for_references(self) -> None:
+        """Darks or flats that come after the views: all of them are there when the scan has ended, not before."""
+        if not self._late:
+            message = "No darks or no flats before the views: the volume begins when the scan has ended"
+            self._sink(Event("state", self._clock.now(), {"state": "waiting", "message": message}))
+        self._late = True
+
+    def _settle_axis(self, corrector: Corrector, views: NDArray[np.int64], ended: bool) -> None:
+        """Look for the axis each time the views have grown by half, and once more when all are there.
+
+        While views come only a clear optimum counts. Where it moves by much, the fit begins anew with all views; by
+        little, it goes on.
+        """
+        if cone_of(self.source, self._options.selection) is not None:
+            self.axis_col, self._axis_settled = stated_axis(self.source), True
+            return
+        if views.size < self._next_axis and not ended:
+            return
+        self._next_axis, self._axis_settled = views.size + views.size // 2, ended
+        last_chance = ended and self.axis_col is None
+        try:
+            found, estimate = locate_axis(self.source, corrector, views, self._warn if last_chance else _quiet)
+        except DataError:
+            if last_chance:
+                raise
+            return  # the views do not cover enough angles yet
+        if not (estimate.confident or last_chance):
+            return
+        if self.axis_col is None or abs(found - self.axis_col) > _AXIS_MOVES:
+            self._fit, self._taken = None, 0
+        elif self._fit is not None:
+            self._fit.move_axis(self._binned(found))
+        self.axis_col, self.axis = found, estimate
+
+    def _binned(self, axis_col: float) -> float:
+        return geometry_of(self.source, self._options.selection, axis_col, np.zeros(1)).axis_col
+
+    def _new_fit(self, axis_col: float) -> StreamingFit:
+        check_axis(self.source, axis_col)
+        template = geometry_of(self.source, self._options.selection, axis_col, np.zeros(1))
+        data = {
+            "file": self.source.path,
+            "method": "r2",
+            "n_views": self.n_views,
+            "axis_col": axis_col,
+            "again": bool(self._history),
+        }
+        self._sink(Event("recon_started", self._clock.now(), data))
+        options = self._options
+        return StreamingFit(template, seed=options.seed, gaussians=options.gaussians, now=self._clock.now)
+
+    def advance(self, seconds: float) -> bool:
+        """Fit for a while; False where there is nothing to fit yet."""
+        if self._fit is None:
+            return False
+        progress = self._fit.advance(seconds)
+        if not self._fit.started:
+            return False
+        self._say(progress)
+        return True
+
+    def _say(self, progress: Progress) -> None:
+        # A fit that begins anew counts from its own beginning; the history has one time, that of the snapshots.
+        progress = replace(progress, seconds=self._clock.now() - self._begin)
+        self._history.append(progress)
+        progress_events(self._sink, self._clock)(progress)
+
+    def write_snapshot(self) -> None:
+        """The volume as it stands, in place of the last snapshot."""
+        assert self._fit is not None
+        record = ReconRecord(
+            volume=self._fit.snapshot(),
+            length_unit="mm" if self.source.pixel_size_mm or self._options.selection.pixel_size_mm else "px",
+            raw_file=str(self.source.path.resolve()),
+            title=f"Snapshot from {self._fit.n_views} views",
+            sample=str(self.source.attributes.get("sample", "not stated")),
+            time=self._clock.now(),
+            parameters={"axis_col": float(self.axis_col or 0.0), "n_views": self._fit.n_views},
+        )
+        try:
+            write_reconstruction(self.snapshot_path, record, replace=True)
+        except DataError as error:
+            # Windows does not replace a file that a viewer holds open: the next snapshot will.
+            self._warn(f"A snapshot was left out: {error}")
+            return
+        seconds = self._clock.now() - self._begin
+        data = {"path": self.snapshot_path, "n_views": self._fit.n_views, "seconds": seconds}
+        self._sink(Event("snapshot", self._clock.now(), data))
+
+    def finish(self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]) -> Made:
+        """The last round over all views in `seconds` or until `stopped`, with snapshots, and the volume."""
+        refuse(self.source, reconstruction_blockers(self.source))
+        assert self._fit is not None  # two views are there, and the axis was settled with them
+        self._sink(
+            Event(
+                "state",
+                self._clock.now(),
+                {"state": "finishing", "message": "The last round of the fit, over all views"},
+            )
+        )
+
+        last, heeded = self._clock.now(), Heeded(stopped)
+
+        def listen(progress: Progress) -> bool:
+            nonlocal last
+            self._say(progress)
+            if self._clock.now() - last >= snapshot_every:
+                self.write_snapshot()
+                last = self._clock.now()
+            return heeded()
+
+        try:
+            self._say(self._fit.finish(seconds, listen))
+        except ValueError as error:
+            raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
+        volume = self._fit.snapshot()
+        settings: dict[str, object] = {
+            **asdict(self._fit.settings),
+            "seconds_after_scan": seconds,
+            "gaussians": self._history[-1].n_gaussians,
+            **({"ended_early": True} if heeded.told else {}),
+        }
+        return Made(volume, "r2", self._clock.now() - self._begin, self._history, settings, self._options.filter)
+
+
+def _quiet(text: str) -> None:
+    """For an axis that will be looked for again."""

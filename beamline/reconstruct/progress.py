@@ -1,0 +1,38 @@
+"""Progress of a fit or of iterations as events: how far, how fast, and when it will be done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+
+from beamline.core.events import Event, Sink
+from drivers.clock import Clock
+from recon.splatting.optimise import Progress
+
+
+def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> Callable[[Progress], None]:
+    """A listener that passes progress on as events, with `per_s` (steps) and `eta_s`; None where they are not known.
+
+    Args:
+        sink: is told.
+        clock: that events are stamped by.
+        seconds: that the fit may take, where no number of steps is planned.
+    """
+    first: Progress | None = None
+    step = 0
+
+    def listen(progress: Progress) -> None:
+        nonlocal first, step
+        if first is None or progress.step < step:  # a followed scan's fit may begin anew
+            first = progress
+        step = progress.step
+        made, spent = progress.step - first.step, progress.seconds - first.seconds
+        rate = made / spent if made > 0 and spent > 0 else None
+        left = None
+        if progress.steps and rate:
+            left = (progress.steps - progress.step) / rate
+        elif seconds is not None and not progress.steps:
+            left = max(0.0, seconds - spent)
+        sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress), "per_s": rate, "eta_s": left}))
+
+    return listen

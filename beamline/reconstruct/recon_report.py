@@ -1,0 +1,261 @@
+"""What the report on a reconstruction says: the scan, the settings, the figures of merit and the pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamline.projections.prepare import Prepared
+from beamline.projections.selection import Selection
+from beamline.report import figures
+from beamline.report.html import METRICS, Picture, Report, formatted
+from beamline.report.record import history_arrays, judged_by
+from beamline.storage.readers.open import ScanSource
+from beamline.storage.writers.recon_file import Value
+from drivers.frame import FrameKind
+from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
+from recon.base.volume import Volume
+from recon.splatting.optimise import Progress
+from recon.splatting.settings import FitSettings
+from recon.voxels.fbp import Filter
+
+METHOD_NAMES: Mapping[str, str] = {
+    "r2": "R²-Gaussian", "fbp": "FBP", "sirt": "SIRT", "sart": "SART", "cgls": "CGLS", "asd-pocs": "ASD-POCS",
+    "fista-tv": "FISTA-TV", "os-sirt-tv": "OS-SIRT-TV",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """What a report says of the scan itself.
+
+    Attributes:
+        path, name: of the file.
+        sample: its name, where the file tells.
+        table: facts for people, by name.
+        frames: frames there are of those triggered, e.g. "110/110".
+        remarks: what the file says went wrong while it was taken.
+    """
+
+    path: Path
+    name: str
+    sample: str
+    table: Mapping[str, str]
+    frames: str
+    remarks: Sequence[str] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A reconstruction and how it was made.
+
+    Attributes:
+        volume, method: of recon.reconstruct.
+        seconds: of reconstruction alone.
+        history: of the fit or the iterations; empty for FBP.
+        settings: every setting of the reconstructor, by name.
+        filter: of the FBP (also of the one it is compared with).
+        psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
+        chosen: what a budget or a preset chose, in a line; empty where the settings were given.
+    """
+
+    volume: Volume
+    method: str
+    seconds: float
+    history: Sequence[Progress]
+    settings: Mapping[str, Any]
+    filter: Filter = "hann"
+    psnr: Sequence[tuple[float, float]] = ()
+    chosen: str = ""
+
+    @property
+    def next_decibel(self) -> NextDecibel | None:
+        """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
+
+        None for a direct method, while views still came, for a resumed fit, whose whole time is not known, and for one
+        with other rates than the fits that were measured, such as one that followed a scan.
+        """
+        judged = judged_by(history_arrays(self.history))
+        if judged is None or _grew(self) or "resumed_from" in self.settings:
+            return None
+        if self.method == "r2":
+            if self.settings.get("pace") != FitSettings().pace:
+                return None
+            return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)
+        return next_decibel(judged.seconds, judged.residuals)
+
+    @property
+    def next_decibel_said(self) -> str:
+        """The same in words; empty where there is nothing to say."""
+        found, judged = self.next_decibel, judged_by(history_arrays(self.history))
+        if found is None or judged is None:
+            return ""
+        by_others = found.of == "volume"
+        if not found.measurable:
+            of_what = "reach of what was measured" if by_others else f"the residual of {judged.views}"
+            return f"none {'in' if by_others else 'measurable in'} {of_what}"
+        high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
+        span = f"{parts_of(found.low)} {high}"
+        source = "as longer fits gained on two other scans"
+        if not by_others:
+            source = f"from the residual of {judged.views} as it fell"
+        return f"about {parts_of(found.seconds)} more ({span}), {source}"
+
+
+@dataclass(frozen=True)
+class Context:
+    """What surrounds a reconstruction: the scan, the selection, the command, and what was warned of so far."""
+
+    facts: ScanFacts
+    selection: Selection
+    command: str
+    seed: int
+    warnings: Sequence[str] = ()
+    started: float = 0.0
+    scan_flags: Sequence[str] = field(default_factory=tuple)
+
+
+def facts_of(source: ScanSource) -> ScanFacts:
+    """Facts of an open scan."""
+    counts = {kind: int(np.sum(source.image_key == kind)) for kind in FrameKind}
+    attributes = dict(source.attributes)
+    sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
+    pitch, energy = source.pixel_size_mm, source.energy_kev
+    missing, flagged = (int(attributes.get(name, 0)) for name in ("missing_triggers", "flagged_frames"))
+    table = {
+        "file": source.path.name,
+        "format": source.format,
+        "sample": sample or "not stated",
+        "projections": str(counts[FrameKind.PROJECTION]),
+        "flats, darks": f"{counts[FrameKind.FLAT]}, {counts[FrameKind.DARK]}",
+        "detector (rows × columns)": f"{source.shape[0]} × {source.shape[1]}",
+        "pixel size": "not known" if pitch is None else f"{pitch * 1e3:.4g} µm",
+        "energy": "not known" if energy is None else f"{energy:g} keV",
+        "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
+    }
+    table |= {str(k): _text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
+    n = int(source.image_key.size)
+    remarks = [f"The monitor flagged {flagged} frames while they were taken."] if flagged else []
+    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks)
+
+
+def compose(
+    made: Made,
+    prepared: Prepared,
+    truth: Volume | None,
+    volumes: Mapping[str, Volume],
+    metrics: Mapping[str, Mapping[str, float]],
+    parameters: Mapping[str, Value],
+    context: Context,
+) -> Report:
+    """The report on a reconstruction."""
+    name, geometry = METHOD_NAMES[made.method], prepared.geometry
+    best = "psnr" if truth is not None else "residual"
+    own = metrics[made.method]
+    summary = (
+        f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
+        f"{prepared.n_projections} views in {made.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
+    )
+    if "fbp" in metrics and made.method != "fbp":
+        summary += f" (FBP of the same views: {formatted(best, metrics['fbp'][best])})"
+    if made.chosen:
+        summary += f". Chosen: {made.chosen}"
+    if made.next_decibel_said:
+        summary += f". The next dB: {made.next_decibel_said}"
+    settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
+    footnotes = [
+        "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
+        f"SNR, CNR: between the two classes that k-means makes of {'the truth' if truth else 'this volume'}'s values.",
+    ]
+    if _grew(made):
+        footnotes.append(
+            "Time of R²-Gaussian: from the first look at the growing file to the volume, the scan included."
+        )
+    if "resumed_from" in made.settings:
+        footnotes.append(f"Time of {name}: since the fit was resumed; what went before is not in it.")
+    if truth is not None:
+        footnotes.append(
+            "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
+        )
+    return Report(
+        title=f"{context.facts.sample or context.facts.name}: {name}",
+        summary=summary + ".",
+        scan=context.facts.table,
+        settings=settings,
+        metrics={METHOD_NAMES[method]: values for method, values in metrics.items()},
+        frames=context.facts.frames,
+        flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
+        pictures=_pictures(made, prepared, truth, volumes),
+        command=context.command,
+        footnotes=footnotes,
+    )
+
+
+def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:
+    data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
+    row = geometry.detector_shape[0] // 2
+    shown = {"Truth": truth} if truth is not None else {}
+    shown |= {METHOD_NAMES[method]: volume for method, volume in volumes.items()}
+    pictures = [
+        Picture(
+            "Slices",
+            "Three orthogonal slices through the middle of what is bright, all in one grey window (1st to 99.5th "
+            "percentile of what is shown).",
+            figures.orthogonal_slices(shown, unit),
+        )
+    ]
+    if made.history:
+        pictures.append(
+            Picture(
+                "Quality against time",
+                _told_by_history(made),
+                figures.quality_against_time(history_arrays(made.history), made.psnr, made.next_decibel),
+            )
+        )
+    pictures += [
+        Picture(
+            "Projection",
+            "One view after correction: the line integral of the attenuation along each ray.",
+            figures.projection(data, geometry, 0, unit),
+        ),
+        Picture("Sinogram", "The middle detector row in all views used.", figures.sinogram(data, geometry, row)),
+    ]
+    if prepared.axis is not None:
+        axis = prepared.axis
+        pictures.append(
+            Picture(
+                "Rotation axis",
+                f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 is perfect "
+                "agreement, about 1 is none. Columns as reconstructed, after binning.",
+                figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
+            )
+        )
+    return pictures
+
+
+def _grew(made: Made) -> bool:
+    """The views came while the volume was fitted."""
+    return len({progress.n_views for progress in made.history}) > 1
+
+
+def _told_by_history(made: Made) -> str:
+    gaussians = {progress.n_gaussians for progress in made.history}
+    growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
+    parts = ["Misfit to the views it had"]
+    if (judged := judged_by(history_arrays(made.history))) is not None:
+        parts.append(f"the residual of {judged.views} as dB below the data")
+    parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
+    parts += [f"how many {' and '.join(growing)} there were"] if growing else []
+    return f"{', '.join(parts)}, in the time since {'the file was first seen' if _grew(made) else 'it began'}."
+
+
+def _text(value: object) -> str:
+    """A value as people read it; the file keeps it exactly."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)

@@ -1,0 +1,171 @@
+"""Delivery: a volume becomes a file, figures of merit and a report; everything or nothing, and it says so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamline.core.events import Event, Sink
+from beamline.core.files import refuse_existing
+from beamline.projections.prepare import Prepared
+from beamline.reconstruct.measure import measure, regions
+from beamline.reconstruct.recon_report import METHOD_NAMES, Context, Made, compose
+from beamline.report.html import write_report
+from beamline.report.record import history_arrays
+from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
+from drivers.clock import Clock
+from recon.base.volume import Volume
+from recon.prep.align import AxisEstimate
+from recon.voxels.fbp import fbp
+from recon.voxels.fdk import fdk, has_direct_method
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results."""
+
+    output: Path
+    report: Path | None
+    replace: bool = False
+
+    def refuse_existing(self) -> None:
+        """Raise DataError before any work where a result is in the way."""
+        if not self.replace:
+            refuse_existing(self.output)
+            if self.report is not None:
+                refuse_existing(self.report)
+
+
+def deliver(
+    made: Made, prepared: Prepared, truth: Volume | None, target: Target, context: Context, sink: Sink, clock: Clock
+) -> dict[str, float]:
+    """Measure the volume, write its file and the report, and send the event `done`. Returns the metrics.
+
+    Raises:
+        DataError: a result could not be written; neither is left where one fails.
+    """
+    mask = regions(truth or made.volume, context.seed)
+
+    def judged(volume: Volume, seconds: float) -> dict[str, float]:
+        return {**measure(volume, prepared, truth, mask), "seconds": seconds}
+
+    metrics = {made.method: judged(made.volume, made.seconds)}
+    volumes = {made.method: made.volume}
+    if made.method != "fbp" and target.report is not None and has_direct_method(prepared.geometry):
+        before = clock.now()
+        direct = fdk if prepared.geometry.is_cone else fbp
+        data = direct(prepared.projections.data, prepared.geometry, made.volume.grid, made.filter)
+        volumes = {"fbp": Volume(data, made.volume.grid), **volumes}
+        metrics = {"fbp": judged(volumes["fbp"], clock.now() - before), **metrics}
+    own = metrics[made.method]
+    parameters = parameters_of(made, prepared, context)
+    record = ReconRecord(
+        volume=made.volume,
+        length_unit=prepared.length_unit,
+        raw_file=str(context.facts.path.resolve()),
+        title=f"{METHOD_NAMES[made.method]} reconstruction of {context.facts.name}",
+        sample=context.facts.sample or "not stated",
+        time=clock.now(),
+        parameters=parameters,
+        metrics=own,
+        history=history_arrays(made.history),
+    )
+    write_reconstruction(target.output, record, replace=target.replace)
+    if target.report is not None:
+        page = compose(made, prepared, truth, volumes, metrics, parameters, context)
+        try:
+            write_report(target.report, page, replace=target.replace)
+        except BaseException:
+            target.output.unlink(missing_ok=True)
+            raise
+    summary: dict[str, Any] = {
+        "output": target.output,
+        "report": target.report,
+        "method": made.method,
+        "axis_col": prepared.axis_col,
+        "n_views": prepared.geometry.n_views,
+        "shape": made.volume.grid.shape,
+        "units": f"1/{prepared.length_unit}",
+        "elapsed": clock.now() - context.started,
+        **own,
+    }
+    summary |= {name: made.settings[name] for name in ("ended_early", "resumed_from") if name in made.settings}
+    if made.chosen:
+        summary["chosen"] = made.chosen
+    if (further := made.next_decibel) is not None:
+        summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_said}
+    if len(metrics) > 1:
+        summary["fbp"] = metrics["fbp"]
+    sink(Event("done", clock.now(), summary))
+    return own
+
+
+def parameters_of(made: Made, prepared: Prepared, context: Context) -> dict[str, Value]:
+    """Everything that the volume depends on, by name."""
+    selection, geometry = context.selection, prepared.geometry
+    rows = selection.rows
+    corrected = prepared.quantity == "counts"
+    return {
+        "method": made.method,
+        "axis_col": prepared.axis_col,
+        **_axis_parameters(prepared.axis),
+        "views": selection.views,
+        "view_frames": prepared.projections.view_ids,
+        "view_angles_deg": np.degrees(geometry.angles),
+        "n_views": geometry.n_views,
+        "n_projections": prepared.n_projections,
+        "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
+        "binning": selection.binning,
+        "pixel_pitch": geometry.pixel_pitch,
+        "pixel_pitch_unit": prepared.length_unit,
+        "quantity": prepared.quantity,
+        **(_flat("correction", asdict(selection.correction)) if corrected else {}),
+        "floored_fraction": float(prepared.projections.floored),
+        "masked_fraction": float(prepared.projections.masked.mean()),
+        "replaced_fraction": float(prepared.projections.replaced),
+        "filter": made.filter,
+        "seed": context.seed,
+        **_flat("", made.settings),
+        "command": context.command,
+    }
+
+
+def _flat(prefix: str, values: Mapping[str, Any]) -> dict[str, Value]:
+    """Nested settings by joined names; what HDF5 has no type for becomes text."""
+    out: dict[str, Value] = {}
+    for key, value in values.items():
+        name = f"{prefix}_{key}" if prefix else key
+        if isinstance(value, Mapping):
+            out |= _flat(name, value)
+        else:
+            out[name] = value if isinstance(value, str | int | float | np.ndarray) else str(value)
+    return out
+
+
+def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
+    if axis is None:
+        return {"axis_source": "given, or stated in the file"}
+    return {
+        "axis_source": axis.method,
+        "axis_confident": axis.confident,
+        "axis_binned": axis.value,
+        "axis_candidates": axis.candidates,
+        "axis_curve": axis.curve,
+    }
+
+
+def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
+    """How the axis was found, from the parameters of a reconstruction; None where it was given."""
+    if "axis_curve" not in parameters:
+        return None
+    return AxisEstimate(
+        value=float(str(parameters["axis_binned"])),
+        candidates=np.asarray(parameters["axis_candidates"]),
+        curve=np.asarray(parameters["axis_curve"]),
+        confident=bool(parameters["axis_confident"]),
+        method=str(parameters["axis_source"]),
+    )

@@ -1,0 +1,291 @@
+"""Exposures: a block of frames taken from camera and stage, flying, stepping or standing, each with its true angle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import InstrumentError
+from beamline.core.events import Emit
+from beamline.core.stop import ScanAborted, StopRequest
+from beamline.plan.plan import Block
+from beamline.plan.timeline import move_seconds, pass_ends
+from beamline.scan.ledger import EXTRA, Account, Ledger, Train, assign, settle
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceTimeout
+from drivers.frame import Frame, FrameKind
+from drivers.protocols import CameraFrame, CameraSettings, Devices, TriggerSource
+
+SLICE = 0.5  # s: the longest wait for a frame before the stop request is looked at again
+POLL = 0.02  # s between looks at a moving stage
+PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera is silent; at least
+PATIENCE_PERIODS = 10  # so many trigger periods
+RAMP_TOLERANCE = 0.1  # of what the acceleration adds to the time of the first pulse
+SILENT_EXPOSURES = 3  # software triggers in a row without a frame
+
+
+@dataclass
+class Taken:
+    """What became of a block, filled in while it is taken.
+
+    Attributes:
+        frames: delivered, with and without a trigger.
+        missing: triggers, counted within the block, that gave no frame though one was waited for.
+        lost, ignored: of these, as far as it is known.
+        extra: frames that no trigger made.
+        shift: triggers by which the angles of a pass may be wrong (see ledger.Account).
+    """
+
+    frames: int = 0
+    missing: list[int] = field(default_factory=list)
+    lost: int = 0
+    ignored: int = 0
+    extra: int = 0
+    shift: int = 0
+
+    def enter(self, account: Account, first: int) -> None:
+        """Add a pass that began at trigger `first`."""
+        self.missing += [first + i for i in account.missing]
+        self.lost += account.lost
+        self.ignored += account.ignored
+        self.extra += len(account.extra)
+        self.shift = max(self.shift, account.shift)
+
+
+@dataclass
+class _Pass:
+    """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes.
+
+    `braked`: when the stage was told to stop on the way.
+    """
+
+    ledger: Ledger
+    first: int
+    seconds: float
+    braked: float = math.inf
+
+    def enter(self, frame: CameraFrame) -> tuple[CameraFrame, int, float]:
+        """The frame with its trigger within the block (or EXTRA) and its angle."""
+        steady = frame.time < self.braked
+        self.ledger, entry = assign(self.ledger, frame.framestamp, frame.time, steady)
+        return frame, EXTRA if entry.trigger == EXTRA else self.first + entry.trigger, entry.angle
+
+
+class Exposures:
+    """Takes blocks from a camera and a stage; shutter and sample are somebody else's business.
+
+    Args:
+        camera_settings: roi, binning and readout for all blocks; exposure and trigger are each block's own.
+        settle: s to wait after each move of a step scan.
+        emit: where warnings go.
+    """
+
+    def __init__(
+        self,
+        devices: Devices,
+        camera_settings: CameraSettings,
+        settle: float,
+        clock: Clock,
+        stop: StopRequest,
+        emit: Emit,
+    ) -> None:
+        self._stage, self._camera = devices.stage, devices.camera
+        self._settings, self._settle = camera_settings, settle
+        self._clock, self._stop, self._emit = clock, stop, emit
+
+    def take(self, block: Block, first_row: int, taken: Taken) -> Iterator[Frame]:
+        """The block's frames, numbered from `first_row`; `taken` tells what is missing.
+
+        A stop that comes while they are taken ends them early. A block begun after the stop is taken whole.
+
+        Raises:
+            ScanAborted: abort was asked for; the stage may still be moving.
+            InstrumentError: the camera is silent.
+            DeviceError: a device failed.
+        """
+        source = TriggerSource.EXTERNAL if block.trains else TriggerSource.SOFTWARE
+        accepted = self._camera.configure(
+            CameraSettings(block.exposure, source, self._settings.roi, self._settings.binning, self._settings.readout)
+        )
+        frames = self._fly(block, taken) if block.trains else self._one_by_one(block, taken)
+        for row, (frame, trigger, angle) in enumerate(frames, first_row):
+            taken.frames += 1
+            kind = FrameKind.INVALID if trigger == EXTRA else block.kind
+            yield Frame(frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure)
+
+    def go(self, angle: float) -> bool:
+        """Move to `angle` at full speed and wait; False where a stop cut the move short."""
+        limits = self._stage.limits
+        distance = angle - self._stage.position()
+        self._stage.start_move(angle, limits.max_speed)
+        return self._wait(move_seconds(distance, limits.max_speed, limits.acceleration))
+
+    def go_home(self, angle: float) -> None:
+        """Move to `angle` although a stop was asked for; only an abort ends this move early."""
+        limits = self._stage.limits
+        seconds = move_seconds(angle - self._stage.position(), limits.max_speed, limits.acceleration)
+        self._stage.start_move(angle, limits.max_speed)
+        self._wait(seconds, heed_stop=False)
+
+    def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
+        first = 0
+        for train, (start, end) in zip(block.trains, pass_ends(block), strict=True):
+            if self._stop.stopping or not self.go(start):
+                return
+            angles = block.angles[first : first + train.n]
+            self._camera.arm(train.n)
+            self._stage.arm(train)
+            before = self._clock.now()
+            self._stage.start_move(end, block.speed)
+            seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
+            flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), first, seconds)
+            cut_short = True
+            try:
+                yield from self._until_standing(block, flight)
+                cut_short = self._stop.stopping
+            finally:
+                taken.enter(settle(flight.ledger, cut_short), first)
+            self._stage.disarm()
+            self._camera.disarm()
+            if flight.ledger.last < 0 and not self._stop.stopping:
+                raise InstrumentError(
+                    f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned from "
+                    f"{math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Check the trigger cable, its polarity "
+                    "and the stage's trigger output. What was taken before is in the file."
+                )
+            first += train.n
+
+    def _expected(self, block: Block, angles: NDArray[np.float64], before: float, after: float) -> Train:
+        """When the pulses should come: taxi at constant acceleration, then constant speed.
+
+        The stage may have begun at any time between `before` and `after`, and its acceleration is only nearly constant.
+        """
+        ramp = block.speed / (2 * self._stage.limits.acceleration)
+        first = (before + after) / 2 + block.taxi / block.speed + ramp
+        return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
+
+    def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
+        """Frames while the stage turns; after a stop, those that are on their way.
+
+        Waits on the progress of frames, not on the stage: a camera that falls silent is noticed at once.
+        """
+        tail = block.exposure + self._camera.timing.readout
+        patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
+        first_pulse = flight.ledger.train.first or 0.0
+        wait = patience + max(0.0, first_pulse - self._clock.now())
+        braking = False
+        while not flight.ledger.complete:
+            if self._stop.stopping and not braking:
+                flight.braked = self._clock.now()
+                self._stage.stop()
+                braking = True
+            frame = self._next_frame(tail + 2 * block.period if braking else wait, heed_stop=not braking)
+            if frame is not None:
+                wait = patience
+                yield flight.enter(frame)
+            elif braking or not self._stop.stopping:
+                if not self._stage.moving():
+                    break
+                if not braking:
+                    raise InstrumentError(
+                        f"{self._camera.name}: no frame for {wait:.3g} s while the stage turned. Check the trigger "
+                        "cable and the camera. What was taken before is in the file."
+                    )
+        if not braking:
+            self._wait(flight.seconds)
+        while (frame := self._next_frame(0.0, heed_stop=False)) is not None:
+            yield flight.enter(frame)  # no trigger is left: the ledger calls these extra
+
+    def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
+        """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats."""
+        self._camera.arm(block.n)
+        period = max(block.period, self._camera.timing.min_period)
+        patience = PATIENCE + block.exposure + self._camera.timing.readout
+        position = self._stage.position()
+        triggered, silent = -math.inf, 0
+        owed = self._stop.stopping
+        for i, angle in enumerate(block.angles):
+            if self._stop.stopping and not owed:
+                break
+            if math.isfinite(angle):
+                if not self.go(float(angle)):
+                    break
+                self._clock.sleep(self._settle)
+                position = self._stage.position()
+            self._clock.sleep(triggered + period - self._clock.now())
+            self._camera.software_trigger()
+            triggered = self._clock.now()  # after the call: when in it the camera fired is not known
+            frame = self._next_frame(patience, heed_stop=False)
+            if frame is not None:
+                silent = 0
+                yield frame, i, position
+                continue
+            taken.missing.append(i)
+            silent += 1
+            if silent == SILENT_EXPOSURES:
+                raise InstrumentError(
+                    f"{self._camera.name}: {silent} triggers in a row gave no frame within {patience:.3g} s each. "
+                    "Check the camera. What was taken before is in the file."
+                )
+            # A frame that comes late must not be taken for the next one: arming anew forgets it.
+            self._camera.disarm()
+            self._camera.arm(block.n - i)
+        self._camera.disarm()
+
+    def _next_frame(self, timeout: float, heed_stop: bool) -> CameraFrame | None:
+        """The next frame, or None after `timeout` s (or, with `heed_stop`, when a stop is asked for).
+
+        A camera may report an error once and go on (frames lost from its ring show as missing); twice is a failure.
+        """
+        deadline = self._clock.now() + timeout
+        failed = False
+        while True:
+            self._heed_abort()
+            remaining = deadline - self._clock.now()
+            try:
+                return self._camera.next_frame(max(0.0, min(SLICE, remaining)))
+            except DeviceTimeout:
+                if remaining <= SLICE or (heed_stop and self._stop.stopping):
+                    return None
+            except DeviceError as error:
+                if failed:
+                    raise
+                failed = True
+                self._emit("warning", {"message": str(error)})
+
+    def _wait(self, seconds: float, heed_stop: bool = True) -> bool:
+        """Wait for a move that should take `seconds`; False where a stop cut it short."""
+        deadline = self._clock.now() + 2 * seconds + 5.0
+        while self._stage.moving():
+            self._heed_abort()
+            if heed_stop and self._stop.stopping:
+                self.stand()
+                return False
+            if self._clock.now() > deadline:
+                break
+            self._clock.sleep(POLL)
+        self._stage.wait(timeout=POLL)  # raises where the stage still moves or stopped short
+        return True
+
+    def stand(self) -> None:
+        """Slow down and wait until the stage stands.
+
+        Raises:
+            InstrumentError: it does not.
+        """
+        limits = self._stage.limits
+        deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
+        self._stage.stop()
+        while self._stage.moving():
+            self._heed_abort()
+            if self._clock.now() > deadline:
+                raise InstrumentError(f"{self._stage.name}: it still moves after a stop. Use its emergency stop.")
+            self._clock.sleep(POLL)
+
+    def _heed_abort(self) -> None:
+        if self._stop.aborting:
+            raise ScanAborted(f"Aborted: {self._stop.reason}.")

@@ -1,0 +1,234 @@
+"""Ledger: which trigger exposed which frame, worked out from framestamps and times, so that no angle is ever guessed.
+
+A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost on the way. A
+trigger that comes too early is ignored without a word: framestamps stay contiguous and only the time shows a gap of two
+periods. While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame
+is the nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict
+& Bordner 1962). All functions are pure; a Ledger is a value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+
+FREE = 0.35  # periods by which a frame may miss its place on the train; further off, no trigger made it
+PHASE_GAIN, PERIOD_GAIN = 0.3, 0.05
+PERIOD_RANGE = 0.2  # the true period may differ from the planned one by this fraction
+
+EXTRA = -1  # the trigger of a frame that no trigger made
+
+
+class LedgerError(DataError):
+    """Triggers and frames do not agree; `missing` are the planned rows that have no frame."""
+
+    def __init__(self, message: str, missing: Sequence[int]) -> None:
+        super().__init__(message)
+        self.missing = tuple(missing)
+
+
+@dataclass(frozen=True, eq=False)
+class Train:
+    """The triggers to expect.
+
+    Attributes:
+        angles: float64 [trigger] radians.
+        period: s between triggers.
+        first: time of trigger 0, s since the Unix epoch; None where it is not known.
+        tolerance: s by which `first` may be wrong.
+    """
+
+    angles: NDArray[np.float64]
+    period: float
+    first: float | None = None
+    tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.angles.ndim != 1 or self.angles.size == 0:
+            raise ValueError(f"a train needs at least one angle, got shape {self.angles.shape}")
+        if not (math.isfinite(self.period) and self.period > 0):
+            raise ValueError(f"the period must be positive, got {self.period} s")
+
+    @property
+    def n(self) -> int:
+        return int(self.angles.size)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the ledger says about a frame: its trigger (EXTRA: none made it) and the angle in radians at that time."""
+
+    trigger: int
+    angle: float
+
+
+@dataclass(frozen=True, eq=False)
+class Ledger:
+    """The account so far. Make it with `Ledger(train)`, carry it on with `assign`, end it with `settle`.
+
+    Attributes:
+        train: what was expected.
+        last: the trigger of the last matched frame, -1 before the first.
+        exposed: framestamp of the last frame, matched or not, -1 before the first.
+        unmatched: exposures since the last matched frame, delivered or not.
+        phase, period: when the last matched trigger is believed to have been, and the period, both in s.
+        first: the first matched frame: framestamp, trigger, and periods since the believed time of trigger 0.
+        missing: triggers up to `last` without a frame.
+        lost: of these, frames that were exposed but never delivered.
+        ignored: of these, triggers that exposed nothing.
+        extra: framestamps of frames that no trigger made.
+    """
+
+    train: Train
+    last: int = -1
+    exposed: int = -1
+    unmatched: int = 0
+    phase: float = math.nan
+    period: float = math.nan
+    first: tuple[int, int, float] = (-1, -1, math.nan)
+    missing: tuple[int, ...] = ()
+    lost: int = 0
+    ignored: int = 0
+    extra: tuple[int, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """The last trigger has its frame: nothing more will come."""
+        return self.last == self.train.n - 1
+
+
+@dataclass(frozen=True)
+class Account:
+    """A settled ledger: nothing is missing or extra where every trigger has its frame and every frame its trigger.
+
+    Attributes:
+        missing: triggers without a frame, ascending.
+        lost: of these, exposed but not delivered (framestamp gap).
+        ignored: of these, not exposed (time gap). The remaining ones came after the last frame, and nobody can tell.
+        extra: framestamps of the frames that no trigger made.
+        shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
+            missing at the other; 0 where nothing is missing there or the time of the first trigger was known.
+    """
+
+    missing: tuple[int, ...]
+    lost: int
+    ignored: int
+    extra: tuple[int, ...]
+    shift: int
+
+
+def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
+    """Enter a received frame: the ledger with it, and the trigger and angle that it has.
+
+    Frames come in the order in which they were exposed.
+
+    Args:
+        time: the frame's trigger time in s.
+        steady: the stage turned at constant speed. While it brakes, times say nothing, but the triggers come ever
+            later, so none is ignored and the framestamps alone count them.
+    """
+    train = ledger.train
+    new_exposures = framestamp - ledger.exposed
+    exposures = ledger.unmatched + new_exposures
+    if not steady:
+        steps, residual = exposures, 0.0
+        trigger = ledger.last + steps
+        position = float(trigger)
+    elif ledger.last < 0:
+        position, trigger, residual = _first_place(train, framestamp, time)
+        steps = trigger + 1
+    else:
+        position = ledger.last + (time - ledger.phase) / ledger.period
+        trigger = round(position)
+        steps, residual = trigger - ledger.last, position - trigger
+    if new_exposures < 1 or steps < 1 or trigger >= train.n or abs(residual) > FREE:
+        angle = float(np.interp(position, np.arange(train.n), train.angles))
+        extra = (*ledger.extra, framestamp)
+        exposed = max(framestamp, ledger.exposed)
+        # An extra frame is accounted for: it takes no part in the count of exposures between two triggers.
+        unmatched = ledger.unmatched + max(new_exposures - 1, 0)
+        return replace(ledger, exposed=exposed, unmatched=unmatched, extra=extra), Entry(EXTRA, angle)
+    lost = min(exposures, steps) - 1
+    matched = replace(
+        ledger,
+        last=trigger,
+        exposed=framestamp,
+        unmatched=0,
+        missing=(*ledger.missing, *range(ledger.last + 1, trigger)),
+        lost=ledger.lost + lost,
+        ignored=ledger.ignored + steps - 1 - lost,
+    )
+    if ledger.last < 0:
+        matched = replace(matched, phase=time, period=train.period, first=(framestamp, trigger, position))
+    else:
+        matched = _follow(ledger, matched, time, steps, residual)
+    return matched, Entry(trigger, float(train.angles[trigger]))
+
+
+def settle(ledger: Ledger, cut_short: bool = False) -> Account:
+    """Close the account: every trigger after the last frame is missing.
+
+    Args:
+        cut_short: triggers after the last frame were not waited for: they were not taken, rather than missed.
+    """
+    at_the_end = range(0 if cut_short else ledger.last + 1, 0 if cut_short else ledger.train.n)
+    return Account(
+        missing=(*ledger.missing, *at_the_end),
+        lost=ledger.lost,
+        ignored=ledger.ignored,
+        extra=ledger.extra,
+        shift=_shift(ledger, None if cut_short else len(at_the_end)),
+    )
+
+
+def _window(train: Train) -> float:
+    """Periods by which the first frame may differ from where it is expected."""
+    return math.inf if train.first is None else max(0.5, train.tolerance / train.period)
+
+
+def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int, float]:
+    """Position in periods, trigger, and distance between the two, of the first frame.
+
+    Where the expected time leaves it open, framestamps decide: no trigger was ignored before the first frame, for a
+    camera that was armed and idle has no reason to ignore one.
+    """
+    if train.first is None:
+        return float(framestamp), framestamp, 0.0
+    position = (time - train.first) / train.period
+    trigger = framestamp if abs(position - framestamp) <= _window(train) else round(position)
+    # The uncertainty of the expected time is not the frame's fault.
+    return position, trigger, max(0.0, abs(position - trigger) - train.tolerance / train.period)
+
+
+def _shift(ledger: Ledger, at_the_end: int | None) -> int:
+    """The largest shift of all angles that the time of the first frame allows.
+
+    Args:
+        at_the_end: triggers without a frame there; None where it is not known, and only as many count as the first
+            frame's time speaks for.
+    """
+    if ledger.last < 0:
+        return 0
+    framestamp, trigger, position = ledger.first
+    window = _window(ledger.train)
+    if at_the_end is None:
+        at_the_end = max(0, round(position - trigger))
+    shifts = range(framestamp - trigger, at_the_end + 1)
+    if math.isinf(window):
+        return max((abs(j) for j in shifts), default=0)
+    return max((abs(j) for j in shifts if abs(position - trigger - j) <= window), default=0)
+
+
+def _follow(before: Ledger, after: Ledger, time: float, steps: int, residual: float) -> Ledger:
+    """Let phase and period follow the frames slowly enough that jitter averages out."""
+    nominal = after.train.period
+    error = residual * before.period
+    low, high = nominal * (1 - PERIOD_RANGE), nominal * (1 + PERIOD_RANGE)
+    period = min(max(before.period + PERIOD_GAIN * error / steps, low), high)
+    return replace(after, phase=time - (1 - PHASE_GAIN) * error, period=period)

@@ -1,0 +1,197 @@
+"""Recorder: the thread that digests, checks and writes every frame, so that taking frames never waits for the disk."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from queue import Full, Queue
+from typing import Any, Protocol
+
+import numpy as np
+
+from beamline.core.errors import BeamlineError, DataError, in_words
+from beamline.core.events import Emit
+from beamline.core.stop import StopRequest
+from beamline.monitor import watch as monitor
+from beamline.monitor.digest import FrameDigest, digest
+from beamline.monitor.flag import Flag, Level
+from beamline.plan.plan import Timeline
+from drivers.frame import Frame
+
+WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
+WAITING_FRAMES = (4, 128)  # at least and at most
+STALL = 60.0  # real s without a frame written, after which the disk is taken for dead
+SAY_EVERY = 0.1  # real s between `frame` events
+RATE_FRAMES = 20  # the rate is that of the last so many frames
+
+
+class Writer(Protocol):
+    """What takes the rows: NXtomoWriter."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def committed(self) -> int: ...
+    def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None: ...
+
+
+class Recorder:
+    """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
+
+    Nothing is ever dropped: where the disk is behind, `put` waits.
+
+    Args:
+        stop_on_alarm: an alarm asks for a stop.
+
+    Attributes:
+        n_frames: written so far.
+        flagged: frames flagged so far, by check.
+    """
+
+    def __init__(
+        self,
+        writer: Writer,
+        watch: monitor.Watch,
+        timeline: Timeline,
+        *,
+        preview_bin: int,
+        emit: Emit,
+        stop: StopRequest,
+        stop_on_alarm: bool,
+    ) -> None:
+        self._writer, self._watch, self._preview_bin = writer, watch, preview_bin
+        self._emit, self._stop, self._stop_on_alarm = emit, stop, stop_on_alarm
+        self._progress = _Progress(timeline)
+        self._active: set[tuple[str, Level]] = set()
+        self._blind = False
+        self.n_frames = 0
+        self.flagged: Counter[str] = Counter()
+        self._failure: Exception | None = None
+        low, high = WAITING_FRAMES
+        self._waiting: Queue[Frame | None] = Queue(min(max(WAITING_BYTES // timeline.frame_bytes, low), high))
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def put(self, frame: Frame) -> None:
+        """Hand a frame over; waits while the disk is far behind.
+
+        Raises:
+            DataError: it could not be, or a frame before it could not be written.
+        """
+        self._hand_over(frame)
+        self._heed_failure()
+
+    def finish(self) -> None:
+        """Wait until every frame that was put is written.
+
+        Raises:
+            DataError: one could not be.
+        """
+        self._hand_over(None)
+        written = -1
+        while self._thread.is_alive() and written != self.n_frames:
+            written = self.n_frames
+            self._thread.join(STALL)
+        if self._thread.is_alive():
+            raise self._stalled()
+        self._heed_failure()
+
+    @property
+    def hangs(self) -> bool:
+        """A frame is still being written: after `finish`, a disk that does not answer."""
+        return self._thread.is_alive()
+
+    def _hand_over(self, item: Frame | None) -> None:
+        """A frame, or None as the last."""
+        try:
+            self._waiting.put(item, timeout=STALL)
+        except Full:
+            raise self._stalled() from None
+
+    def _stalled(self) -> DataError:
+        return DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
+
+    def _heed_failure(self) -> None:
+        cause = self._failure
+        if isinstance(cause, BeamlineError):
+            raise cause
+        if cause is not None:
+            raise DataError(f"A frame could not be written: {in_words(cause).rstrip('.')}. {self._safe()}") from cause
+
+    def _safe(self) -> str:
+        return f"The first {self._writer.committed} frames are safe in {self._writer.path}."
+
+    def _run(self) -> None:
+        while (frame := self._waiting.get()) is not None:
+            if self._failure is not None:
+                continue  # frames after a failure are only taken, so that nobody waits for room
+            try:
+                self._record(frame)
+            except Exception as error:
+                self._failure = error
+
+    def _record(self, frame: Frame) -> None:
+        found = digest(frame.counts, self._watch.context.saturation, self._preview_bin)
+        flags = self._look(frame, found)
+        self._writer.append(frame, found, monitor.bitmask(flags))
+        self.n_frames += 1
+        self._tell(flags)
+        data = self._progress.update(frame, self.n_frames)
+        if data is not None:
+            self._emit("frame", {**data, "mean": found.mean})
+
+    def _look(self, frame: Frame, found: FrameDigest) -> tuple[Flag, ...]:
+        """The monitor's flags. A defect of the monitor must not cost a frame: it is said, and the monitor is off."""
+        if self._blind:
+            return ()
+        try:
+            self._watch, flags = monitor.watch(self._watch, frame, found)
+        except Exception as error:
+            self._blind = True
+            self._emit("warning", {"message": f"the monitor failed at row {frame.index} and is off: {error!r}"})
+            return ()
+        return flags
+
+    def _tell(self, flags: tuple[Flag, ...]) -> None:
+        """A `flag` event where a check begins to flag (or gets worse), not for every frame that it goes on."""
+        self.flagged.update(flag.check for flag in flags)
+        active = {(flag.check, flag.level) for flag in flags}
+        for flag in flags:
+            if (flag.check, flag.level) not in self._active:
+                self._emit("flag", asdict(flag))
+            if flag.level is Level.ALARM and self._stop_on_alarm and not self._stop.stopping:
+                self._stop.stop(f"the monitor's {flag.check} check raised an alarm: {flag.advice.rstrip('.')}")
+        self._active = active
+
+
+class _Progress:
+    """How far, how fast, how long still; None where it was said a moment ago."""
+
+    def __init__(self, timeline: Timeline) -> None:
+        self._total, self._bytes = timeline.n_frames, timeline.frame_bytes
+        # Moves are spread over the frames: the figure may creep, but it always falls, also after a wait for a hand.
+        periods = np.concatenate([np.full(block.n, block.period) for block in timeline.blocks])
+        self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
+        self._times: deque[float] = deque(maxlen=RATE_FRAMES)
+        self._said = -SAY_EVERY
+
+    def update(self, frame: Frame, n: int) -> Mapping[str, Any] | None:
+        self._times.append(frame.time)
+        now = time.monotonic()
+        if now - self._said < SAY_EVERY and n < self._total:
+            return None
+        self._said = now
+        span = self._times[-1] - self._times[0]
+        rate = (len(self._times) - 1) / span if span > 0 else 0.0
+        return {
+            "n": n,
+            "of": self._total,
+            "kind": frame.kind.name.lower(),
+            "frames_per_s": rate,
+            "mb_per_s": rate * self._bytes / 1e6,
+            "eta_s": float(self._ahead[min(n, self._total)]),
+        }

@@ -1,0 +1,291 @@
+"""Run: one scan from configuration to file, in a folder of its own, told as events, and closed whatever happens."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from beamline.config.devices import NoBeamMonitor
+from beamline.config.load import Config, resolved_yaml
+from beamline.core.errors import DataError, ScanStopped, exit_code, in_words
+from beamline.core.events import Announcer, Emit, JsonLines, Sink
+from beamline.core.narration import UserLog
+from beamline.core.stop import ScanAborted, StopRequest
+from beamline.instrument.connect import Bench, connect
+from beamline.scan.acquisition import Acquisition
+from beamline.scan.beam_log import BeamLog
+from beamline.scan.ledger import LedgerError
+from beamline.scan.live_process import LiveCommand, LiveReconstruction
+from beamline.scan.preflight import Prepared, prepare
+from beamline.scan.recorder import Recorder
+from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
+from beamline.simulate.labels import LabelLog, labels_path, write_labels
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.clock import SystemClock
+from drivers.manual import Ask
+
+
+class State(StrEnum):
+    """What a run is doing, in this order; any but `done` may be followed by `failed`."""
+
+    PREPARING = "preparing"
+    ACQUIRING = "acquiring"
+    STOPPING = "stopping"
+    DONE = "done"
+    FAILED = "failed"
+
+
+MESSAGES: Mapping[State, str] = {
+    State.PREPARING: "Preparing",
+    State.ACQUIRING: "Acquiring",
+    State.STOPPING: "Stage stopped, shutter closed; the last frames are being written",
+    State.DONE: "Finished",
+    State.FAILED: "Ended early",
+}
+
+
+UNSAFE = (
+    "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
+    "the last frames are being written"
+)
+"""What `stopping` says where making the instrument safe failed; the warnings or the error say what of it."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished scan.
+
+    Attributes:
+        path: the scan file; its folder holds everything else.
+        n_frames: rows of the file.
+        missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
+        flags: frames that each of the monitor's checks flagged.
+        seconds: real time of the whole run.
+        bytes: size of the scan file.
+        recon: what the live reconstruction said at its end; None without one, or where it failed.
+    """
+
+    path: Path
+    n_frames: int
+    missing: tuple[int, ...]
+    flags: Mapping[str, int]
+    seconds: float
+    bytes: int
+    recon: Mapping[str, Any] | None
+
+
+def run_scan(
+    config: Config,
+    runs: Path | None = None,
+    sinks: Sequence[Sink] = (),
+    stop: StopRequest | None = None,
+    *,
+    live: LiveCommand | None = None,
+    bench: Bench | None = None,
+    ask: Ask | None = None,
+) -> RunResult:
+    """Run the scan that `config` describes.
+
+    Args:
+        runs: the folder in which the run gets its own; the configured one unless given.
+        sinks: besides events.jsonl and user.log in the run's folder.
+        stop: to end it from another thread or a signal handler.
+        live: makes the command line of a live reconstruction; None: none.
+        bench: connected devices, left open at the end; None: those that `config` names, opened and closed here.
+        ask: puts a request to the operator, where the shutter or the sample is moved by hand.
+
+    Raises:
+        ConfigError: the plan breaks a limit; nothing has moved and no folder was made.
+        DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: somebody asked for it.
+        DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
+            the file; the event `scan_done` says how much, and `failed` why.
+    """
+    began = time.monotonic()
+    stop = stop or StopRequest()
+    runs = runs or Path(config.storage.folder)
+    with ExitStack() as connected:
+        bench = bench or connected.enter_context(connect(config, ask=ask, heed=lambda: _heed(stop)))
+        prepared = prepare(config, bench, runs)
+        _heed(stop)
+        folder = create_run_folder(runs, config.sample.name, SystemClock().now())
+        with ExitStack() as stack:
+            try:
+                (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
+                events = stack.enter_context(new_log(folder / EVENTS))
+                log = stack.enter_context(new_log(folder / USER_LOG))
+            except OSError as error:
+                raise DataError(
+                    f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
+                ) from error
+            emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], bench.clock))
+            run = _Run(config, bench, prepared, folder, stop, emit, began)
+            return run.go(live, release=connected.close)
+
+
+def _heed(stop: StopRequest) -> None:
+    """Before the run has begun, a stop is as good as an abort."""
+    if stop.stopping:
+        raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    config: Config
+    bench: Bench
+    prepared: Prepared
+    folder: Path
+    stop: StopRequest
+    emit: Emit
+    began: float
+
+    def go(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
+        """The whole run, and its last word."""
+        try:
+            self._enter(State.PREPARING)
+            result = self._scan(live, release)
+        except BaseException as error:
+            self._enter(State.FAILED)
+            self.emit("failed", {"message": in_words(error), "exit_code": exit_code(error), "folder": self.folder})
+            raise
+        self._enter(State.DONE)
+        self.emit("done", {**asdict(result), "folder": self.folder})
+        return result
+
+    def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
+        path = self.folder / SCAN
+        command = None if live is None else live(path, self.folder / RECON)
+        self.emit("run_started", self._facts(path))
+        writer = self._writer(path)
+        with ExitStack() as ending:
+            follower = None
+            if command is not None:
+                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit)
+                ending.callback(follower.close)
+            return self._acquire_and_follow(writer, follower, release)
+
+    def _acquire_and_follow(
+        self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
+    ) -> RunResult:
+        recorder = self._recorder(writer)
+        acquisition = self._acquisition()
+        labels = LabelLog()
+        self._enter(State.ACQUIRING)
+        with self._beam_log() as beam:
+            error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
+        self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
+        disk = _failure_of(recorder.finish)
+        error = self._graver(error, disk)
+        status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
+        missing = acquisition.missing
+        # A write that does not return holds HDF5's lock: to close the file would be to wait for it.
+        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
+        error = self._graver(error, unfinished)
+        if self.bench.simulated is not None and not recorder.hangs:
+            n = writer.committed
+            error = self._graver(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
+        for remark in writer.remarks:
+            self.emit("warning", {"message": remark})
+        error = self._graver(error, _failure_of(release))
+        result = RunResult(
+            path=writer.path,
+            n_frames=writer.committed,
+            missing=tuple(missing),
+            flags=dict(recorder.flagged),
+            seconds=time.monotonic() - self.began,
+            bytes=writer.path.stat().st_size,
+            recon=None,
+        )
+        self.emit("scan_done", {**asdict(result), "status": status})
+        if follower is not None:
+            said = follower.finish(self._give_up(unfinished is not None), lambda: self.stop.aborting)
+            result = replace(result, recon=said)
+        if error is not None:
+            raise error
+        return replace(result, seconds=time.monotonic() - self.began)
+
+    def _acquire(self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog) -> None:
+        # Closing the iterator is what makes the instrument safe when the recorder fails.
+        with closing(acquisition.frames()) as frames:
+            for frame in frames:
+                if self.bench.simulated is not None:
+                    labels.add(frame.index, self.bench.simulated.labels(frame.time))
+                recorder.put(frame)
+
+    def _give_up(self, unfinished: bool) -> Callable[[], bool]:
+        """The live reconstruction ends early after an abort, a stop that came after the scan, or with a broken file."""
+        stopped = self.stop.stopping
+        return lambda: unfinished or self.stop.aborting or (self.stop.stopping and not stopped)
+
+    def _graver(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
+        """Of two failures the one that the run ends with: a stop or lost frames give way to another; both are told."""
+        if error is None or after is None or after is error:
+            return error or after
+        if isinstance(error, ScanStopped | LedgerError):
+            error, after = after, error
+        self.emit("warning", {"message": str(after)})
+        return error
+
+    def _enter(self, state: State, message: str | None = None) -> None:
+        self.emit("state", {"state": state, "message": message or MESSAGES[state]})
+
+    def _writer(self, path: Path) -> NXtomoWriter:
+        storage = self.config.storage
+        return NXtomoWriter(
+            path,
+            self.prepared.info,
+            self.prepared.timing.shape,
+            clock=self.bench.clock,
+            preview_bin=storage.preview_bin,
+            flush_every=storage.flush_every,
+        )
+
+    def _recorder(self, writer: NXtomoWriter) -> Recorder:
+        return Recorder(
+            writer,
+            self.prepared.watch,
+            self.prepared.timeline,
+            preview_bin=self.config.storage.preview_bin,
+            emit=self.emit,
+            stop=self.stop,
+            stop_on_alarm=self.config.monitor.on_alarm == "stop",
+        )
+
+    def _acquisition(self) -> Acquisition:
+        prepared, bench = self.prepared, self.bench
+        settle = prepared.plan.settle
+        return Acquisition(
+            bench.devices, prepared.timeline, prepared.settings, settle, bench.clock, self.stop, self.emit
+        )
+
+    def _beam_log(self) -> BeamLog:
+        chosen = self.config.devices.beam_monitor
+        if isinstance(chosen, NoBeamMonitor):
+            return BeamLog(None, math.inf, self.emit)
+        return BeamLog(self.bench.beam_monitor, chosen.period_s, self.emit)
+
+    def _facts(self, path: Path) -> Mapping[str, Any]:
+        timeline = self.prepared.timeline
+        return {
+            "folder": self.folder,
+            "path": path,
+            "sample": self.config.sample.name,
+            "n_frames": timeline.n_frames,
+            "duration": timeline.duration,
+            "total_bytes": timeline.total_bytes,
+            "remarks": timeline.remarks,
+        }
+
+
+def _failure_of(action: Callable[[], None]) -> BaseException | None:
+    """What the action raised; the run goes on to close what is open before it is raised again."""
+    try:
+        action()
+    except BaseException as error:
+        return error
+    return None

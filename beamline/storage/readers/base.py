@@ -1,0 +1,134 @@
+"""ScanSource: one view of a scan, whatever the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from drivers.frame import Frame, FrameKind
+
+Quantity = Literal["counts", "line_integrals", "unknown"]
+Attributes = Mapping[str, str | float | int]
+
+WHOLE = slice(None)
+
+
+class ScanSource(Protocol):
+    """The frames of one scan and what is known about them. Nothing is guessed: unknown is None, NaN or "unknown".
+
+    Attributes:
+        path: what was opened.
+        format: "nxtomo", "diamond_nexus", "data_exchange", "tiff_series", "tiff_stack", ...
+        shape: (rows, cols) of a frame.
+        dtype: of the pixels that read() returns.
+        quantity: what a pixel is. "unknown" where the file does not say and the caller did not.
+        image_key: int32 [frame], values of drivers.frame.FrameKind.
+        angles: float64 [frame] radians, NaN where unknown.
+        exposures: float64 [frame] s, NaN where unknown.
+        pixel_size_mm: at the sample; on the detector where the beam is a cone.
+        axis_col: rotation axis in 0-based pixel-centre columns.
+        cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
+        attributes: whatever else the file says, for the record.
+        finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
+    """
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def format(self) -> str: ...
+    @property
+    def shape(self) -> tuple[int, int]: ...
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+    @property
+    def quantity(self) -> Quantity: ...
+    @property
+    def image_key(self) -> NDArray[np.int32]: ...
+    @property
+    def angles(self) -> NDArray[np.float64]: ...
+    @property
+    def exposures(self) -> NDArray[np.float64]: ...
+    @property
+    def pixel_size_mm(self) -> float | None: ...
+    @property
+    def energy_kev(self) -> float | None: ...
+    @property
+    def axis_col(self) -> float | None: ...
+    @property
+    def cone(self) -> tuple[float, float] | None: ...
+    @property
+    def attributes(self) -> Attributes: ...
+    @property
+    def finished(self) -> bool: ...
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
+        ...
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames one after the other, as a camera gave them. DataError where pixels are not uint16 counts."""
+        ...
+
+    def refresh(self) -> int:
+        """Look again at a growing file; how many frames can be read now."""
+        ...
+
+    def close(self) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
+    """Frame numbers of a slice or an array (negative ones count from the end); IndexError beyond the n readable."""
+    if isinstance(frames, slice):
+        return np.arange(n)[frames]
+    indices = np.atleast_1d(np.asarray(frames))
+    if indices.size == 0:
+        return np.empty(0, np.int64)
+    if indices.ndim != 1 or indices.dtype.kind not in "ui":
+        raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
+    indices = indices.astype(np.int64)
+    if indices.min() < -n or indices.max() >= n:
+        raise IndexError(f"Frames {indices.min()}..{indices.max()} asked for, but only 0..{n - 1} can be read.")
+    return np.where(indices < 0, indices + n, indices)
+
+
+def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
+    """0, 1, 2, ... from each change of kind on: the trigger of each frame within its block."""
+    rows = np.arange(image_key.size)
+    starts = np.where(np.diff(image_key, prepend=image_key[:1] - 1) != 0, rows, 0)
+    return rows - np.maximum.accumulate(starts)
+
+
+def bare_frames(source: ScanSource) -> Iterator[Frame]:
+    """Frames of a source that knows no more than ScanSource tells: no framestamps and no times."""
+    require_counts(source)
+    keys, angles, exposures = source.image_key, source.angles, source.exposures
+    triggers = count_in_blocks(keys)
+    for i, key in enumerate(keys):
+        yield Frame(
+            counts=source.read([i])[0],
+            kind=FrameKind(int(key)),
+            index=i,
+            trigger=int(triggers[i]),
+            framestamp=-1,
+            angle=float(angles[i]),
+            time=np.nan,
+            exposure=float(exposures[i]),
+        )
+
+
+def require_counts(source: ScanSource) -> None:
+    """DataError where the pixels are not the uint16 that a Frame holds."""
+    if source.dtype != np.uint16:
+        raise DataError(
+            f"{source.path} holds {source.dtype} pixels; a camera's frames are uint16. Read them as arrays instead."
+        )

@@ -1,0 +1,135 @@
+"""DataExchangeSource: the /exchange group of Data Exchange files (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224).
+
+The format keeps darks, flats and projections apart and does not say when the references were taken: the frames are
+numbered darks first, then flats, then projections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.hdf5 import require_real
+from beamline.storage.readers.base import WHOLE, Quantity, bare_frames, frame_indices
+from drivers.frame import Frame, FrameKind
+
+PARTS = (
+    (FrameKind.DARK, "exchange/data_dark"),
+    (FrameKind.FLAT, "exchange/data_white"),
+    (FrameKind.PROJECTION, "exchange/data"),
+)
+
+
+def is_data_exchange(file: h5py.File) -> bool:
+    return hdf5.dataset(file, "exchange/data") is not None
+
+
+class DataExchangeSource:
+    """A Data Exchange scan; see ScanSource. `finished` is always True: the format has no way to grow.
+
+    Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
+    """
+
+    format = "data_exchange"
+    finished = True
+    energy_kev: float | None = None
+    axis_col: float | None = None
+    cone: tuple[float, float] | None = None
+
+    def __init__(self, path: Path, *, own_angles: bool = True) -> None:
+        """Open. `own_angles` False: the caller brings the angles, so theta may be absent."""
+        self.path = path
+        self._file = hdf5.open_hdf5(path)
+        try:
+            found = ((kind, hdf5.dataset(self._file, where)) for kind, where in PARTS)
+            self._parts = [(kind, item) for kind, item in found if item is not None]
+            self._check()
+            sizes = [len(item) for _, item in self._parts]
+            self._starts = np.cumsum([0, *sizes])
+            n_views = sizes[-1]
+            self.shape: tuple[int, int] = tuple(self._parts[-1][1].shape[1:])
+            self.dtype: np.dtype[Any] = np.result_type(*(item.dtype for _, item in self._parts))
+            self.image_key = np.repeat([kind for kind, _ in self._parts], sizes).astype(np.int32)
+            self.angles = np.full(self.image_key.size, np.nan)
+            self.exposures = np.full(self.image_key.size, np.nan)
+            if own_angles:
+                self.angles[-n_views:] = self._theta(n_views)
+            kinds = {kind for kind, _ in self._parts}
+            self.quantity: Quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
+            self.attributes = self._attributes()
+            pixel = self._file.attrs.get("pixel_size_mm")
+            self.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _check(self) -> None:
+        for _, item in self._parts:
+            require_real(item.dtype, f"{item.name} in {self.path}")
+            if item.ndim != 3 or item.shape[1:] != self._parts[-1][1].shape[1:]:
+                shapes = ", ".join(f"{part.name} {part.shape}" for _, part in self._parts)
+                raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
+            lost = hdf5.missing_links(item)
+            if lost:
+                raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there.")
+
+    def _theta(self, n_views: int) -> NDArray[np.float64]:
+        theta = hdf5.dataset(self._file, "exchange/theta")
+        if theta is None:
+            raise DataError(
+                f"{self.path} has no /exchange/theta. Some readers then assume 0 to 180 degrees; we do not: "
+                "give them with --angles FILE (degrees, one a line)."
+            )
+        angles = hdf5.radians(theta, default="degrees")
+        if angles.size != n_views:
+            raise DataError(f"{self.path}: /exchange/theta has {angles.size} angles for {n_views} projections.")
+        return angles
+
+    def _attributes(self) -> dict[str, str | float | int]:
+        said: dict[str, str | float | int] = {}
+        for name, value in self._file.attrs.items():
+            if isinstance(value, np.number):
+                said[name] = float(value)
+            else:
+                said[name] = " ".join(hdf5.text(part) for part in np.ravel(value))
+        for name, where in (("title", "exchange/title"), ("sample", "measurement/sample/name")):
+            item = hdf5.dataset(self._file, where)
+            if item is not None:
+                said[name] = hdf5.text(item[()])
+        said["theta_units"] = hdf5.attribute(self._file["exchange"].get("theta", self._file), "units") or "not given"
+        return said
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order; darks and flats are cast to dtype."""
+        indices = frame_indices(frames, self.image_key.size)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        for (_, item), first, last in zip(self._parts, self._starts[:-1], self._starts[1:], strict=True):
+            wanted = np.flatnonzero((indices >= first) & (indices < last))
+            if wanted.size:
+                part = np.empty((wanted.size, *out.shape[1:]), item.dtype)
+                hdf5.read_frames(item, indices[wanted] - first, rows, part)
+                out[wanted] = part
+        return out
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames one after the other; time, exposure and framestamp are not in the file."""
+        return bare_frames(self)
+
+    def refresh(self) -> int:
+        return int(self.image_key.size)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,87 @@
+"""Where NeXus files keep a scan: the detector with frames and image keys, and the angles that belong to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where a file keeps what we need; None where it does not."""
+
+    entry: h5py.Group
+    detector: h5py.Group
+    data: h5py.Dataset
+    image_key: h5py.Dataset
+    angle: h5py.Dataset | None
+    angle_problem: str
+
+
+def find(file: h5py.File) -> list[Places]:
+    """Every tomography entry of a file; [] where it has none. DataError where the frames' own file is missing."""
+    found = []
+    unresolved: list[str] = []
+    for name in file:
+        top = hdf5.resolve(file, name)
+        entries = [top] if isinstance(top, h5py.Group) else []
+        entries += [item for item in _groups(entries[0]) if "instrument" in item] if entries else []
+        for entry in entries:
+            for detector in _groups(hdf5.resolve(entry, "instrument")):
+                key = hdf5.dataset(detector, "image_key")
+                data = hdf5.dataset(detector, "data")
+                if key is not None and data is not None and data.ndim == 3:
+                    found.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
+                elif key is not None and detector.get("data", getlink=True) is not None and data is None:
+                    unresolved.append(_link(detector, "data"))
+    if unresolved and not found:
+        raise DataError(
+            f"{file.filename} has no frames: {unresolved[0]} is not there. Put the linked file back beside this one."
+        )
+    return found
+
+
+def _groups(parent: Any) -> list[h5py.Group]:
+    if not isinstance(parent, h5py.Group):
+        return []
+    items = (hdf5.resolve(parent, name) for name in parent)
+    return [item for item in items if isinstance(item, h5py.Group)]
+
+
+def _link(group: h5py.Group, name: str) -> str:
+    link = group.get(name, getlink=True)
+    where = f"{link.filename}:{link.path}" if isinstance(link, h5py.ExternalLink) else getattr(link, "path", "")
+    return f"{group.name}/{name} -> {where}"
+
+
+def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset | None, str]:
+    angle = hdf5.dataset(entry, "sample/rotation_angle")
+    if angle is not None:
+        return angle, ""
+    # Diamond: the NXdata named as the detector says which scanned axis goes with the frames.
+    data = hdf5.resolve(entry, str(detector.name).rsplit("/", 1)[1])
+    name = hdf5.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
+    if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
+        angle = hdf5.dataset(data, name)
+        return angle, "" if angle is not None else f"{_link(data, name)} is not there"
+    return None, f"{entry.name} has no sample/rotation_angle"
+
+
+def choose(file: h5py.File, found: list[Places]) -> Places:
+    """The one entry to read; DataError where there is none, or several and no `default` among them."""
+    if not found:
+        raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
+    if len(found) > 1:
+        default = hdf5.attribute(file, "default")
+        found = [places for places in found if str(places.entry.name).strip("/") == default]
+    if len(found) != 1:
+        raise DataError(
+            f"{file.filename} has several tomography entries or detectors and no `default` that names one of them. "
+            "Set the attribute `default` of the file, or split it."
+        )
+    return found[0]

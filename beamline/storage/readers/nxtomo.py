@@ -1,0 +1,231 @@
+"""NXtomoSource: scans as NXtomo lays them out: ours (also while they grow), ESRF's, and Diamond's NeXus with links.
+
+What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.hdf5 import require_real
+from beamline.storage.readers.base import WHOLE, Quantity, count_in_blocks, frame_indices, require_counts
+from beamline.storage.readers.nexus_places import choose, find
+from beamline.storage.writers import layout
+from drivers.frame import Frame, FrameKind
+
+
+class NXtomoSource:
+    """A scan in NXtomo's structure; see ScanSource."""
+
+    def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
+        """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units."""
+        self.path = path
+        self._file = hdf5.open_hdf5(path, follow)
+        try:
+            self._places = places = choose(self._file, find(self._file))
+            self._ours = layout.COMMITTED in self._file
+            self._check()
+            shape = places.data.shape
+            self.shape = (int(shape[1]), int(shape[2]))
+            self.dtype: np.dtype[Any] = places.data.dtype
+            definition = hdf5.text(_value(places.entry, "definition")) or hdf5.attribute(places.entry, "definition")
+            self.format = _format(definition, hdf5.text(_value(places.entry, "program_name")))
+            said = hdf5.text(_value(self._file, "/entry/record/quantity"))
+            self.quantity = _quantity(said, self.dtype)
+            self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
+            energy = (hdf5.scalar(places.entry, f"{where}/incident_energy", hdf5.ENERGY_UNITS) for where in BEAMS)
+            self.energy_kev = next((value for value in energy if value is not None), None)
+            # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
+            self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
+            self.cone = self._cone()
+            self.n = 0
+            self._own_angles = own_angles
+            self.refresh()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _cone(self) -> tuple[float, float] | None:
+        sod = hdf5.scalar(self._file, layout.SOURCE_DISTANCE, hdf5.LENGTH_UNITS)
+        beyond = hdf5.scalar(self._places.detector, "distance", hdf5.LENGTH_UNITS)
+        return None if sod is None or beyond is None else (sod, sod + beyond)
+
+    def _check(self) -> None:
+        finer = hdf5.dataset(self._places.detector, "image_key_control")
+        for item in (self._places.data, self._places.image_key, finer):
+            if item is not None:
+                require_real(item.dtype, f"{item.name} in {self.path}")
+        lost = hdf5.missing_links(self._places.data)
+        if lost:
+            raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there ({len(lost)} missing).")
+
+    def refresh(self) -> int:
+        """Look again at a growing file; how many frames can be read now."""
+        places = self._places
+        finer = hdf5.dataset(places.detector, "image_key_control")
+        if self._ours:
+            finer = hdf5.dataset(places.entry, "frame_log/kind")
+        key = places.image_key if finer is None else finer
+        if self._ours:
+            committed = self._file[layout.COMMITTED]
+            committed.refresh()
+            n = int(committed[()])
+            if n > self.n:
+                for item in (places.data, key, places.angle):
+                    if item is not None:
+                        item.refresh()
+        else:
+            n = int(places.data.shape[0])
+        angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
+        keys = np.ravel(key[()])
+        sizes = (int(places.data.shape[0]), keys.size, angles.size)
+        if min(sizes) < n or (not self._ours and max(sizes) > n):
+            raise DataError(
+                f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
+            )
+        known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
+        self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
+        self.n, self.angles = n, angles[:n]
+        seconds = self._seconds(places.detector, "count_time")
+        self.exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
+        return n
+
+    @property
+    def finished(self) -> bool:
+        if not self._ours:
+            return True
+        flag = self._file[layout.FINISHED]
+        flag.refresh()
+        return bool(flag[()])
+
+    @property
+    def attributes(self) -> dict[str, str | float | int]:
+        """What else the file says: sample, title, times, status, missing triggers, flagged frames."""
+        entry = self._places.entry
+        said: dict[str, str | float | int] = {}
+        for name, where in TEXTS.items():
+            value = hdf5.text(_value(entry, where))
+            if value:
+                said[name] = value
+        for name, where, units in NUMBERS:
+            number = hdf5.scalar(entry, where, units)
+            if number is not None:
+                said[name] = number
+        if "exposure_s" not in said and np.isfinite(self.exposures).any():
+            said["exposure_s"] = float(np.nanmedian(self.exposures))
+        position = hdf5.dataset(self._places.detector, "x_rotation_axis_pixel_position")
+        if position is not None:
+            said["x_rotation_axis_pixel_position"] = f"{position[()]} (not used: its origin is not defined)"
+        if self._places.angle_problem:
+            said["angles"] = f"unknown: {self._places.angle_problem}"
+        if self._ours:
+            for item in (self._file[layout.STATUS], self._file[layout.MISSING]):
+                item.refresh()
+            said["status"] = hdf5.text(self._file[layout.STATUS][()]) or "running"
+            said["missing_triggers"] = int(self._file[layout.MISSING].shape[0])
+            flags = self._file["/entry/frame_log/flags"]
+            flags.refresh()
+            said["flagged_frames"] = int(np.count_nonzero(flags[: self.n]))
+        return said
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order."""
+        indices = frame_indices(frames, self.n)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        hdf5.read_frames(self._places.data, indices, rows, out)
+        return out
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames one after the other, with all that the file knows about each."""
+        require_counts(self)
+        time = self._seconds(self._places.entry, "frame_log/time")
+        trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
+        framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
+        for i in range(self.n):
+            yield Frame(
+                counts=self.read([i])[0],
+                kind=FrameKind(int(self.image_key[i])),
+                index=i,
+                trigger=int(trigger[i]),
+                framestamp=int(framestamp[i]),
+                angle=float(self.angles[i]),
+                time=float(time[i]),
+                exposure=float(self.exposures[i]),
+            )
+
+    def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
+        item = hdf5.dataset(self._places.entry, path)
+        if item is None:
+            return default
+        if self._ours:
+            item.refresh()
+        return np.asarray(item[()])
+
+    def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
+        item = hdf5.dataset(group, path)
+        factor = None if item is None else hdf5.TIME_UNITS.get(hdf5.attribute(item, "units").lower())
+        if item is None or factor is None or item.dtype.kind not in "uif":
+            return np.full(self.n, np.nan)
+        if self._ours:
+            item.refresh()
+        values = np.ravel(item[()]).astype(np.float64) * factor
+        if values.size == 1:
+            return np.full(self.n, values[0])
+        return values[: self.n] if values.size >= self.n else np.full(self.n, np.nan)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+BEAMS = ("instrument/beam", "beam", "sample/beam")
+TEXTS = {
+    "sample": "sample/name",
+    "title": "title",
+    "definition": "definition",
+    "program": "program_name",
+    "start_time": "start_time",
+    "end_time": "end_time",
+    "instrument": "instrument/name",
+}
+NUMBERS = (
+    ("exposure_s", "record/exposure", hdf5.TIME_UNITS),
+    ("period_s", "record/period", hdf5.TIME_UNITS),
+    ("no_data", "record/no_data", {"": 1.0}),
+    ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
+    ("source_distance_mm", "record/source_distance", hdf5.LENGTH_UNITS),
+)
+
+
+def _value(group: h5py.Group, path: str) -> Any:
+    item = hdf5.dataset(group, path)
+    return b"" if item is None else item[()]
+
+
+def _format(definition: str, program: str) -> str:
+    if definition == layout.FLOAT_DEFINITION:
+        return "float_projections"
+    if program.startswith("GDA"):
+        return "diamond_nexus"
+    return "nxtomo" if definition == layout.NXTOMO else "nexus"
+
+
+def _quantity(said: str, dtype: np.dtype[Any]) -> Quantity:
+    if said == "line_integrals":
+        return "line_integrals"
+    return (
+        "counts" if said == "counts" or (not said and dtype.kind in "iu") else "unknown"
+    )  # NXtomo: data are integers, as detected

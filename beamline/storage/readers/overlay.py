@@ -1,0 +1,152 @@
+"""Overlay: a scan with angles or references that its file lacks or has wrong, or a quantity that it cannot say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.angle_table import assign
+from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, bare_frames, frame_indices
+from drivers.frame import Frame, FrameKind
+
+
+class Overlay:
+    """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
+
+    Where darks (flats) are given, those of `base` become INVALID: they stay, and nobody uses them.
+    """
+
+    def __init__(
+        self,
+        base: ScanSource,
+        *,
+        angles: NDArray[np.float64] | None = None,
+        angles_from: str = "",
+        darks: NDArray[Any] | None = None,
+        flats: NDArray[Any] | None = None,
+        quantity: Quantity | None = None,
+    ) -> None:
+        """Lay over `base`.
+
+        Args:
+            angles: radians, one for each frame or each projection of `base`; `angles_from` names them in errors.
+            darks, flats: [frame, row, col].
+
+        DataError where shapes or counts do not fit.
+        """
+        self._base = base
+        self._replaced = {FrameKind.DARK: darks, FrameKind.FLAT: flats}
+        given = [(kind, images) for kind, images in self._replaced.items() if images is not None]
+        for kind, images in given:
+            if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
+                raise DataError(
+                    f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
+                    f"{base.shape} as in {base.path}."
+                )
+        # One dtype, as of one camera: references are measured like the frames, and averages of them are floats.
+        self.dtype: np.dtype[Any] = np.result_type(base.dtype, *(images.dtype for _, images in given))
+        blocks = [images.astype(self.dtype) for _, images in given]
+        self._front = np.concatenate(blocks) if blocks else np.empty((0, *base.shape), self.dtype)
+        self._front_key = np.repeat([int(kind) for kind, _ in given], [len(images) for _, images in given])
+        self._angles = None if angles is None else assign(base.image_key, angles, angles_from)
+        self._quantity = quantity
+
+    @property
+    def path(self) -> Path:
+        return self._base.path
+
+    @property
+    def format(self) -> str:
+        return self._base.format
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self._base.shape
+
+    @property
+    def quantity(self) -> Quantity:
+        if self._quantity is not None:
+            return self._quantity
+        has_both = {FrameKind.DARK, FrameKind.FLAT} <= set(self.image_key.tolist())
+        return "counts" if has_both and self._base.quantity == "unknown" else self._base.quantity
+
+    @property
+    def image_key(self) -> NDArray[np.int32]:
+        keys = self._base.image_key.copy()
+        for kind, images in self._replaced.items():
+            if images is not None:
+                keys[keys == kind] = FrameKind.INVALID
+        return np.concatenate([self._front_key, keys]).astype(np.int32)
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        return np.concatenate(
+            [np.full(len(self._front), np.nan), self._base.angles if self._angles is None else self._angles]
+        )
+
+    @property
+    def exposures(self) -> NDArray[np.float64]:
+        """References that are laid over come without an exposure."""
+        return np.concatenate([np.full(len(self._front), np.nan), self._base.exposures])
+
+    @property
+    def pixel_size_mm(self) -> float | None:
+        return self._base.pixel_size_mm
+
+    @property
+    def energy_kev(self) -> float | None:
+        return self._base.energy_kev
+
+    @property
+    def cone(self) -> tuple[float, float] | None:
+        return self._base.cone
+
+    @property
+    def axis_col(self) -> float | None:
+        return self._base.axis_col
+
+    @property
+    def attributes(self) -> Attributes:
+        return self._base.attributes
+
+    @property
+    def finished(self) -> bool:
+        return self._base.finished
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order."""
+        n = len(self._front)
+        indices = frame_indices(frames, n + self._base.image_key.size)
+        front = indices < n
+        if not front.any():
+            return self._base.read(indices - n, rows).astype(self.dtype, copy=False)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        out[front] = self._front[indices[front], rows]
+        if not front.all():
+            out[~front] = self._base.read(indices[~front] - n, rows)
+        return out
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames one after the other; those of `base` keep what their file knows about them."""
+        if len(self._front) or self.dtype != np.uint16:
+            return bare_frames(self)
+        angles = self.angles
+        return (replace(frame, angle=float(angles[frame.index])) for frame in self._base.frames())
+
+    def refresh(self) -> int:
+        return len(self._front) + self._base.refresh()
+
+    def close(self) -> None:
+        self._base.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

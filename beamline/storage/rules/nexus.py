@@ -1,0 +1,234 @@
+"""How an NXtomo must be written down (NeXus definitions 2026.01 and what its readers need), one function a rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage import hdf5
+from beamline.storage.readers.nexus_places import Places, find
+from beamline.storage.rules.finding import Finding
+from beamline.storage.writers import layout
+
+Rule = Callable[[Places], Iterator[Finding]]
+
+
+def nexus_findings(file: h5py.File) -> list[Finding]:
+    """What the rules find in every tomography entry of a file; [] for a file that has none."""
+    return [finding for places in find(file) for rule in RULES for finding in rule(places)]
+
+
+def definition_said(places: Places) -> Iterator[Finding]:
+    """The entry says that it is an NXtomo."""
+    said = _text(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
+    if said == layout.FLOAT_DEFINITION:
+        yield Finding("info", "definition", f"{said}: float frames in NXtomo's places, on purpose not an NXtomo.")
+    elif said != layout.NXTOMO:
+        yield Finding("warning", "definition", f"{places.entry.name}/definition is {said!r}, expected 'NXtomo'.")
+
+
+def integer_frames(places: Places) -> Iterator[Finding]:
+    """NXtomo's data are what the detector counted (NX_INT)."""
+    if places.data.dtype.kind not in "iu" and _text(places.entry, "definition") != layout.FLOAT_DEFINITION:
+        yield Finding(
+            "error",
+            "integer-frames",
+            f"Frames are {places.data.dtype}; NXtomo demands integers, as the camera counted.",
+        )
+
+
+def key_length(places: Places) -> Iterator[Finding]:
+    """One image key a frame."""
+    for name in ("image_key", "image_key_control"):
+        key = hdf5.dataset(places.detector, name)
+        if key is not None and key.size != places.data.shape[0]:
+            yield Finding("error", "key-length", f"{name} has {key.size} entries for {places.data.shape[0]} frames.")
+
+
+def key_codes(places: Places) -> Iterator[Finding]:
+    """Image keys are 0 projection, 1 flat, 2 dark, 3 invalid; -1 (alignment) only in image_key_control."""
+    for name, legal in (("image_key", {0, 1, 2, 3}), ("image_key_control", {-1, 0, 1, 2, 3})):
+        key = hdf5.dataset(places.detector, name)
+        wrong = set() if key is None else set(np.unique(key[()]).tolist()) - legal
+        if wrong:
+            yield Finding("error", "key-codes", f"{name} holds {sorted(wrong)}; legal are {sorted(legal)}.")
+
+
+def angle_length(places: Places) -> Iterator[Finding]:
+    """One angle a frame."""
+    if places.angle is not None and places.angle.size != places.data.shape[0]:
+        yield Finding("error", "angle-length", f"{places.angle.size} angles for {places.data.shape[0]} frames.")
+
+
+def angle_units(places: Places) -> Iterator[Finding]:
+    """Angles say their unit: readers differ in what they assume."""
+    if places.angle is not None:
+        unit = hdf5.attribute(places.angle, "units")
+        if unit.lower() not in hdf5.ANGLE_UNITS:
+            said = f"the units {unit!r}" if unit else "no units attribute"
+            yield Finding("error", "angle-units", f"{places.angle.name} has {said}; expected degree or rad.")
+
+
+def links_targeted(places: Places) -> Iterator[Finding]:
+    """NXdata links to the three that NXtomo wants, and @target names where each really is."""
+    nxdata = hdf5.resolve(places.entry, "data")
+    if not isinstance(nxdata, h5py.Group):
+        yield Finding("warning", "links", f"{places.entry.name}/data (NXdata) is not there: viewers find no plot.")
+        return
+    for name, original in (("data", places.data), ("image_key", places.image_key), ("rotation_angle", places.angle)):
+        if original is None:
+            continue
+        linked = hdf5.dataset(nxdata, name)
+        target = hdf5.attribute(original, "target")
+        if linked is None:
+            yield Finding("warning", "links", f"{nxdata.name}/{name} is not there.")
+        elif linked != original:
+            yield Finding("warning", "links", f"{nxdata.name}/{name} is another dataset than {original.name}.")
+        elif not target:
+            yield Finding("warning", "links", f"{original.name} has no @target: strict readers refuse the link to it.")
+        elif hdf5.dataset(places.entry, target) != original:
+            yield Finding("warning", "links", f"@target of {original.name} names {target!r}, which is something else.")
+
+
+def axis_order(places: Places) -> Iterator[Finding]:
+    """NXdata's axes are rotation_angle, then rows and columns as float positions."""
+    nxdata = hdf5.resolve(places.entry, "data")
+    if not isinstance(nxdata, h5py.Group) or "axes" not in nxdata.attrs:
+        if isinstance(nxdata, h5py.Group):
+            yield Finding("warning", "axes", f"{nxdata.name} has no axes attribute.")
+        return
+    axes = [hdf5.text(axis) for axis in np.ravel(nxdata.attrs["axes"])]
+    if len(axes) != 3 or axes[0] != "rotation_angle":
+        yield Finding("warning", "axes", f"axes are {axes}; expected rotation_angle, then rows, then columns.")
+        return
+    for axis, n in zip(axes, places.data.shape, strict=True):
+        item = hdf5.dataset(nxdata, axis)
+        if item is None or item.dtype.kind != "f" or item.size != n:
+            yield Finding("warning", "axes", f"axis {axis!r} of {nxdata.name} is no float dataset of {n} numbers.")
+
+
+def names_said(places: Places) -> Iterator[Finding]:
+    """Sample name and title, which validators and people look for."""
+    for where in ("sample/name", "title"):
+        if not _text(places.entry, where):
+            yield Finding("warning", "names", f"{places.entry.name}/{where} is empty or not there.")
+
+
+def iso_times(places: Places) -> Iterator[Finding]:
+    """start_time and end_time are ISO 8601 and in order."""
+    found = []
+    for name in ("start_time", "end_time"):
+        said = _text(places.entry, name)
+        if not said:
+            continue
+        try:
+            found.append(datetime.fromisoformat(said))
+        except ValueError:
+            yield Finding("warning", "iso-times", f"{places.entry.name}/{name} is {said!r}, which is not ISO 8601.")
+    if len(found) == 2 and (found[0].tzinfo is None) == (found[1].tzinfo is None) and found[1] < found[0]:
+        yield Finding("warning", "iso-times", f"It ends ({found[1]}) before it starts ({found[0]}).")
+
+
+def time_order(places: Places) -> Iterator[Finding]:
+    """Frames come one after the other."""
+    times = _column(places, "frame_log/time")
+    back = np.flatnonzero(np.diff(times) < 0)
+    if back.size:
+        step = times[back[0] + 1] - times[back[0]]
+        yield Finding(
+            "error", "time-order", f"Time goes back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s)."
+        )
+
+
+def framestamp_order(places: Places) -> Iterator[Finding]:
+    """A camera's counter goes up by one a frame.
+
+    It starts again where the camera was armed anew: with other frames, or for later triggers of the same ones; not
+    always at 0, for the first frame may be lost.
+    """
+    stamps, triggers = _column(places, "frame_log/framestamp"), _column(places, "frame_log/trigger")
+    key = np.ravel(places.image_key[()])[: stamps.size]
+    if stamps.size < 2 or key.size < stamps.size or triggers.size != stamps.size or (stamps < 0).any():
+        return
+    steps = np.diff(stamps)
+    armed = (np.diff(triggers) > 0) & ((steps < 0) | (stamps[1:] == 0))
+    same_block = (np.diff(key) == 0) & ~armed
+    repeated = np.flatnonzero(same_block & (steps <= 0))
+    if repeated.size:
+        yield Finding(
+            "error",
+            "framestamps",
+            f"{repeated.size} frames repeat or go back in the camera's count (first: frame {repeated[0] + 1}, "
+            f"framestamp {stamps[repeated[0] + 1]:g} after {stamps[repeated[0]]:g}).",
+        )
+    skipped = np.flatnonzero(same_block & (steps > 1))
+    if skipped.size:
+        lost = int((steps[skipped] - 1).sum())
+        yield Finding(
+            "warning",
+            "framestamps",
+            f"The camera counted {lost} frames that are not in the file (first gap before frame {skipped[0] + 1}).",
+        )
+
+
+def frames_differ(places: Places) -> Iterator[Finding]:
+    """No frame was delivered twice: noise makes every checksum new."""
+    checksums = _column(places, "digest/checksum")
+    same = np.flatnonzero(np.diff(checksums) == 0) if checksums.size > 1 else np.empty(0, int)
+    if same.size:
+        yield Finding(
+            "warning",
+            "stuck-frames",
+            f"{same.size} frames equal the one before, pixel by pixel (first: {same[0] + 1}).",
+        )
+
+
+def writer_finished(places: Places) -> Iterator[Finding]:
+    """The writer closed the file, and counted no more rows than there are."""
+    if layout.COMMITTED not in places.entry.file or places.entry.name != layout.ENTRY:
+        return
+    file = places.entry.file
+    committed, n = int(file[layout.COMMITTED][()]), places.data.shape[0]
+    if committed > n:
+        yield Finding("error", "unfinished", f"{committed} frames are counted as committed, but {n} are there.")
+    if not file[layout.FINISHED][()]:
+        yield Finding(
+            "warning", "unfinished", f"Still being written, or its writer died: {committed} frames can be trusted."
+        )
+    status = hdf5.text(file[layout.STATUS][()])
+    if status in ("stopped", "failed"):
+        yield Finding("warning", "unfinished", f"The scan ended as {status!r} after {committed} frames.")
+
+
+RULES: tuple[Rule, ...] = (
+    definition_said,
+    integer_frames,
+    key_length,
+    key_codes,
+    angle_length,
+    angle_units,
+    links_targeted,
+    axis_order,
+    names_said,
+    iso_times,
+    time_order,
+    framestamp_order,
+    frames_differ,
+    writer_finished,
+)
+
+
+def _text(group: h5py.Group, path: str) -> str:
+    item = hdf5.dataset(group, path)
+    return "" if item is None else hdf5.text(item[()])
+
+
+def _column(places: Places, path: str) -> NDArray[Any]:
+    item = hdf5.dataset(places.entry, path)
+    values = np.empty(0) if item is None else np.ravel(item[()])
+    return values.astype(np.float64)

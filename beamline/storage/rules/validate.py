@@ -1,0 +1,249 @@
+"""validate: what a scan must say to be trusted, one function a rule. Public validators pass NaN angles; these do not.
+
+The rules here look at a scan of any format through ScanSource; nexus_rules looks at how an NXtomo is written down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.readers.angle_table import Angles
+from beamline.storage.readers.base import Quantity, ScanSource
+from beamline.storage.readers.open import Images, open_scan
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.nexus import nexus_findings
+from drivers.frame import FrameKind
+
+__all__ = ["Finding", "reconstruction_blockers", "source_findings", "validate"]
+
+SAMPLES = 4  # frames of a kind that are looked at
+EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
+BEAM_SIGMA = 3.0  # a flat must stand this far above the dark, in noise of one dark pixel
+
+
+def validate(
+    path: Path | str,
+    *,
+    angles: Angles | None = None,
+    angle_rows: str | None = None,
+    darks: Images | None = None,
+    flats: Images | None = None,
+    quantity: Quantity | None = None,
+) -> list[Finding]:
+    """Everything that the rules find in a file, worst first; [] for a scan without fault.
+
+    The keywords are open_scan's. Never raises for what is wrong with the file: what cannot be opened is a finding.
+    """
+    path = Path(path)
+    findings = _as_hdf5(path)
+    try:
+        with open_scan(
+            path, angles=angles, angle_rows=angle_rows, darks=darks, flats=flats, quantity=quantity
+        ) as source:
+            findings += source_findings(source)
+    except DataError as error:
+        if not any(finding.severity == "error" for finding in findings):  # else it is already said why
+            findings.append(Finding("error", "readable", str(error)))
+    order = ("error", "warning", "info")
+    return sorted(findings, key=lambda finding: order.index(finding.severity))
+
+
+def source_findings(source: ScanSource) -> list[Finding]:
+    """What the rules of this module find in an open scan."""
+    return [finding for rule in SOURCE_RULES for finding in rule(source)]
+
+
+def reconstruction_blockers(source: ScanSource) -> list[Finding]:
+    """Why this scan must not be reconstructed; [] where nothing stands against it."""
+    return [finding for finding in source_findings(source) if finding.severity == "error"]
+
+
+def enough_views(source: ScanSource) -> Iterator[Finding]:
+    """A reconstruction needs at least two projections."""
+    n = int((source.image_key == FrameKind.PROJECTION).sum())
+    if n < 2:
+        yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
+
+
+def angles_known(source: ScanSource) -> Iterator[Finding]:
+    """Every projection has a finite angle."""
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    unknown = views[~np.isfinite(source.angles[views])]
+    if unknown.size:
+        why = source.attributes.get("angles", "")
+        yield Finding(
+            "error",
+            "angles",
+            f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
+            + (f"; {why}" if why else "")
+            + ". Give them with --angles FILE (degrees, one a line).",
+        )
+
+
+def angles_spread(source: ScanSource) -> Iterator[Finding]:
+    """The projections look from different directions, over half a turn, in degrees that were not taken for radians."""
+    angles = source.angles[source.image_key == FrameKind.PROJECTION]
+    if angles.size < 2 or not np.isfinite(angles).all():
+        return
+    span = float(np.degrees(np.ptp(angles)))
+    distinct = np.unique(np.round(np.degrees(angles), 6))
+    if distinct.size == 1:
+        yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
+        return
+    step = span / (distinct.size - 1)
+    if span < 2 * 3.3 and angles.size > 30:
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"{angles.size} projections span only {span:.3f} degrees: are these radians under a label of degrees?",
+        )
+    elif span + step < 179.5:
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
+        )
+
+
+def quantity_said(source: ScanSource) -> Iterator[Finding]:
+    """It is known what a pixel means: a forgotten or a second logarithm ruins a volume without a sign."""
+    if source.quantity == "unknown":
+        yield Finding(
+            "error",
+            "quantity",
+            "Nothing says whether pixels are counts or line integrals: say --quantity counts or --quantity "
+            "line-integrals.",
+        )
+
+
+def references_present(source: ScanSource) -> Iterator[Finding]:
+    """Counts come with darks and flats."""
+    if source.quantity != "counts":
+        return
+    for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
+        if not (source.image_key == kind).any():
+            yield Finding(
+                "error",
+                "references",
+                f"Counts without {name}: give --{name} FILE (or a folder), or --quantity line-integrals if they are.",
+            )
+
+
+def beam_present(source: ScanSource) -> Iterator[Finding]:
+    """Flats are brighter than darks: a closed shutter or a lost beam leaves nothing to reconstruct."""
+    flats, darks = _sample(source, FrameKind.FLAT), _sample(source, FrameKind.DARK)
+    if source.quantity != "counts" or flats is None or darks is None:
+        return
+    flat, dark = _median(flats), _median(darks)
+    noise = max(1.4826 * _median(np.abs(darks - dark)), 0.5)  # robust: hot pixels do not count
+    if not flat - dark > BEAM_SIGMA * noise:
+        yield Finding(
+            "error",
+            "no-beam",
+            f"There is no beam in it: the flats (median {flat:g}) are not brighter than the darks (median {dark:g}, "
+            f"noise {noise:.2g}). It must not be reconstructed; was the shutter open?",
+        )
+
+
+def exposures_agree(source: ScanSource) -> Iterator[Finding]:
+    """Darks are exposed as long as the projections, and the projections alike; flats may have an exposure of their own,
+    for their light is scaled to the projections'."""
+    exposures = source.exposures
+    views = exposures[(source.image_key == FrameKind.PROJECTION) & np.isfinite(exposures)]
+    if source.quantity != "counts" or views.size == 0:
+        return
+    usual = float(np.median(views))
+    if np.ptp(views) > EXPOSURE_TOLERANCE * usual:
+        yield Finding(
+            "warning",
+            "exposures",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; they are all corrected as if for "
+            f"{usual:g} s.",
+        )
+    darks = np.unique(exposures[(source.image_key == FrameKind.DARK) & np.isfinite(exposures)])
+    if (np.abs(darks - usual) > EXPOSURE_TOLERANCE * usual).any():
+        said = ", ".join(f"{dark:g}" for dark in darks[:4])
+        yield Finding(
+            "warning",
+            "exposures",
+            f"The darks were exposed for {said} s and the projections for {usual:g} s: hot pixels and dark current are "
+            "not the same. Take darks with the projections' exposure.",
+        )
+
+
+def pixels_measured(source: ScanSource) -> Iterator[Finding]:
+    """Projections hold finite numbers that are not all the same."""
+    views = _sample(source, FrameKind.PROJECTION)
+    if views is None:
+        return
+    finite = np.isfinite(views)
+    if not finite.any():
+        yield Finding("error", "pixels", "No finite pixel in the projections looked at: they are all NaN or infinite.")
+    elif float(views[finite].min()) == float(views[finite].max()):
+        yield Finding("error", "pixels", f"Every pixel of the projections looked at is {views[finite][0]:g}.")
+    elif not finite.all():
+        yield Finding("warning", "pixels", f"{1 - finite.mean():.3%} of the pixels looked at are NaN or infinite.")
+
+
+def series_complete(source: ScanSource) -> Iterator[Finding]:
+    """No trigger without a frame, and no number left out of a series of files."""
+    missing = source.attributes.get("missing_triggers", 0)
+    if missing:
+        yield Finding("warning", "missing-frames", f"{missing} triggers gave no frame; the file lists them.")
+    numbers = source.attributes.get("missing_numbers", "")
+    if numbers:
+        yield Finding("warning", "missing-frames", f"The series of files leaves out the numbers {numbers}.")
+
+
+def scale_known(source: ScanSource) -> Iterator[Finding]:
+    """Pixel size, without which a volume has no scale."""
+    if source.pixel_size_mm is None:
+        yield Finding("info", "pixel-size", "No pixel size: lengths will be in pixels, densities per pixel.")
+    elif not 0 < source.pixel_size_mm < 10:
+        yield Finding("error", "pixel-size", f"A pixel size of {source.pixel_size_mm:g} mm cannot be.")
+
+
+SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
+    enough_views,
+    angles_known,
+    angles_spread,
+    quantity_said,
+    references_present,
+    beam_present,
+    exposures_agree,
+    pixels_measured,
+    series_complete,
+    scale_known,
+)
+
+
+def _sample(source: ScanSource, kind: FrameKind) -> NDArray[Any] | None:
+    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
+    rows = np.flatnonzero(source.image_key == kind)
+    if rows.size == 0:
+        return None
+    chosen = np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))
+    middle = source.shape[0] // 2
+    return source.read(rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+
+
+def _median(values: NDArray[Any]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else np.nan
+
+
+def _as_hdf5(path: Path) -> list[Finding]:
+    if not path.is_file():
+        return []
+    try:
+        with hdf5.open_hdf5(path) as file:
+            return nexus_findings(file)
+    except DataError:
+        return []  # not HDF5, or without frames: open_scan says what is wrong

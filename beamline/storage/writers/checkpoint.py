@@ -1,0 +1,76 @@
+"""Checkpoint files: a fit's state and what it was made from, in HDF5; each whole, in place of the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.core.version import version
+from beamline.storage import hdf5
+from beamline.storage.writers.recon_file import Value, value_of
+
+_FORMAT = "splatline checkpoint 1"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A fit as it was left.
+
+    Attributes:
+        state: arrays by name, see recon.splatting.checkpoint.
+        made_from: data and settings that the fit goes on with, by name; they must be the same when it is taken up.
+        steps: that were planned; 0 where a time was.
+    """
+
+    state: Mapping[str, NDArray[Any]]
+    made_from: Mapping[str, Value]
+    steps: int
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Put `checkpoint` at `path`, in place of an older one in one step.
+
+    Raises:
+        DataError: the disk refuses; an older checkpoint stays as it was.
+    """
+    with whole_file(path, replace=True) as partial:
+        try:
+            with hdf5.created(partial) as file:
+                file.attrs["format"], file.attrs["version"] = _FORMAT, version()
+                file.attrs["steps"] = checkpoint.steps
+                for group, values in (("state", checkpoint.state), ("made_from", checkpoint.made_from)):
+                    node = file.create_group(group)
+                    for name, value in values.items():
+                        node[name] = value
+        except OSError as error:
+            raise DataError(f"{path} could not be written ({hdf5.reason(error)}). Check the disk.") from error
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint that `write_checkpoint` wrote.
+
+    Raises:
+        DataError: there is none, or the file is something else.
+    """
+    if not path.is_file():
+        raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
+    try:
+        with h5py.File(path, "r") as file:
+            said = file.attrs.get("format")
+            if said != _FORMAT:
+                raise KeyError(f"its format is {said!r}, expected {_FORMAT!r}")
+            return Checkpoint(
+                {name: np.asarray(node[()]) for name, node in file["state"].items()},
+                {name: value_of(node) for name, node in file["made_from"].items()},
+                int(file.attrs["steps"]),
+            )
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path} is no checkpoint that can be read ({error}); recon --checkpoint makes one.") from error

@@ -1,0 +1,288 @@
+"""The layout of our HDF5 scans: every path, type and unit, made once before the first frame and only grown after.
+
+    /entry                      NXentry, definition NXtomo (NeXus definitions 2026.01): title, start_time, end_time
+      instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, count_time (s),
+                                x_pixel_size, y_pixel_size, distance (mm)
+      instrument/beam           incident_energy;  instrument/devices: what each device said of itself
+      sample                    name, rotation_angle (degree)
+      data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
+      frame_log                 kind, trigger, framestamp, time, flags of each frame
+      digest                    statistics of each frame, and preview f32 [frame, row, col]
+      record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
+      record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
+      progress                  frames_committed, finished, status, missing_triggers
+    /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
+
+image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind and in image_key_control, ESRF's
+extension, which is added at the end of a scan that has such frames (validators refuse it in others).
+Float frames are no NXtomo (its data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from types import MappingProxyType
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.version import version
+from beamline.monitor.digest import FrameDigest, preview_shape
+from drivers.frame import FrameKind
+
+LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
+NXTOMO = "NXtomo"
+FLOAT_DEFINITION = "splatline_float_projections"
+
+ENTRY = "/entry"
+DETECTOR = "/entry/instrument/detector"
+DATA = f"{DETECTOR}/data"
+IMAGE_KEY = f"{DETECTOR}/image_key"
+ANGLE = "/entry/sample/rotation_angle"
+KIND = "/entry/frame_log/kind"
+PREVIEW = "/entry/digest/preview"
+COMMITTED = "/entry/progress/frames_committed"
+FINISHED = "/entry/progress/finished"
+STATUS = "/entry/progress/status"
+MISSING = "/entry/progress/missing_triggers"
+END_TIME = "/entry/end_time"
+BEAM = "/entry/record/beam"
+SOURCE_DISTANCE = "/entry/record/source_distance"
+"""Of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes for cones."""
+
+_SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
+
+COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {  # path: (type, unit)
+        IMAGE_KEY: ("<i4", ""),
+        f"{DETECTOR}/count_time": ("<f8", "s"),
+        ANGLE: ("<f8", "degree"),
+        KIND: ("<i4", ""),
+        "/entry/frame_log/trigger": ("<i8", ""),
+        "/entry/frame_log/framestamp": ("<i8", ""),
+        "/entry/frame_log/time": ("<f8", "s"),
+        "/entry/frame_log/flags": ("<u4", ""),
+        "/entry/digest/minimum": ("<f8", ""),
+        "/entry/digest/maximum": ("<f8", ""),
+        "/entry/digest/mean": ("<f8", ""),
+        "/entry/digest/variance": ("<f8", ""),
+        "/entry/digest/sum_abs": ("<f8", ""),
+        "/entry/digest/invalid_fraction": ("<f8", ""),
+        "/entry/digest/saturated_fraction": ("<f8", ""),
+        "/entry/digest/entropy": ("<f8", "bit"),
+        "/entry/digest/checksum": ("<u4", ""),
+    }
+)
+
+Description = Mapping[str, str | int | float]
+
+
+@dataclass(frozen=True)
+class ScanInfo:
+    """What is known about a scan before its first frame; None where it is not known.
+
+    Attributes:
+        sample: name; title: one line for people.
+        pixel_size_mm: at the sample; energy_kev; distance_mm: sample to detector.
+        exposure, period: s.
+        axis_col: rotation axis in 0-based pixel-centre columns.
+        source_distance_mm: source to sample; given only where the beam is a cone (then `pixel_size_mm` is that on the
+            detector, as NXtomo has it).
+        plan: JSON; config: YAML; both as text for the record.
+        devices: what each device says of itself, by its name.
+        beam_unit: of the beam monitor's readings; None: there is none.
+    """
+
+    sample: str
+    title: str = ""
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    distance_mm: float | None = None
+    exposure: float | None = None
+    period: float | None = None
+    axis_col: float | None = None
+    source_distance_mm: float | None = None
+    plan: str = "{}"
+    config: str = ""
+    devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
+    beam_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class Record:
+    """What one row says about its frame beside the pixels; units as in drivers.frame.Frame (radians, s)."""
+
+    kind: FrameKind
+    angle: float
+    exposure: float = np.nan
+    trigger: int = -1
+    framestamp: int = -1
+    time: float = np.nan
+    flags: int = 0
+
+
+def iso_time(seconds: float) -> str:
+    """ISO 8601 in UTC from seconds since the Unix epoch."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
+def create(
+    file: h5py.File,
+    info: ScanInfo,
+    frame_shape: tuple[int, int],
+    dtype: np.dtype[Any],
+    *,
+    quantity: str,
+    preview_bin: int,
+    start: float | None,
+) -> None:
+    """Make every group, dataset and attribute that the file will have while it grows, with no frame in it yet."""
+    rows, cols = frame_shape
+    definition = NXTOMO if dtype.kind in "iu" else FLOAT_DEFINITION
+    for path, kind in (
+        (ENTRY, "NXentry"),
+        ("/entry/instrument", "NXinstrument"),
+        (DETECTOR, "NXdetector"),
+        ("/entry/instrument/source", "NXsource"),
+        ("/entry/instrument/beam", "NXbeam"),
+        ("/entry/instrument/devices", "NXcollection"),
+        ("/entry/sample", "NXsample"),
+        ("/entry/data", "NXdata"),
+        ("/entry/frame_log", "NXcollection"),
+        ("/entry/digest", "NXcollection"),
+        ("/entry/record", "NXcollection"),
+        ("/entry/progress", "NXcollection"),
+    ):
+        file.create_group(path).attrs["NX_class"] = kind
+    file.attrs["default"] = "entry"
+    file[ENTRY].attrs["default"] = "data"
+
+    file["/entry/definition"] = definition
+    file["/entry/title"] = info.title or info.sample
+    if start is not None:
+        file["/entry/start_time"] = iso_time(start)
+        _rewritable_text(file, END_TIME, "", 40)
+    file["/entry/sample/name"] = info.sample
+    file["/entry/instrument/source/probe"] = "x-ray"
+    # NXsource counts distances along the beam, from the sample.
+    upstream = None if info.source_distance_mm is None else -info.source_distance_mm
+    for path, value, unit in (
+        (f"{DETECTOR}/x_pixel_size", info.pixel_size_mm, "mm"),
+        (f"{DETECTOR}/y_pixel_size", info.pixel_size_mm, "mm"),
+        (f"{DETECTOR}/distance", info.distance_mm, "mm"),
+        ("/entry/instrument/source/distance", upstream, "mm"),
+        (SOURCE_DISTANCE, info.source_distance_mm, "mm"),
+        ("/entry/instrument/beam/incident_energy", info.energy_kev, "keV"),
+        ("/entry/record/exposure", info.exposure, "s"),
+        ("/entry/record/period", info.period, "s"),
+        ("/entry/record/axis_col", info.axis_col, "pixel"),
+    ):
+        if value is not None:
+            file[path] = np.float64(value)
+            file[path].attrs["units"] = unit
+    for name, text in (
+        ("plan", info.plan),
+        ("config", info.config),
+        ("quantity", quantity),
+        ("program", f"splatline {version()}"),
+    ):
+        file[f"/entry/record/{name}"] = text
+    for device, description in info.devices.items():
+        group = file.create_group(f"/entry/instrument/devices/{device.replace('/', '_')}")
+        group.attrs["NX_class"] = "NXcollection"
+        for key, said in description.items():
+            group[key.replace("/", "_")] = said
+
+    _growing(file, DATA, frame_shape, dtype)
+    _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
+    file[PREVIEW].attrs["bin"] = np.int64(preview_bin)
+    for path, (kind, unit) in COLUMNS.items():
+        _growing(file, path, (), np.dtype(kind))
+        if unit:
+            file[path].attrs["units"] = unit
+    file["/entry/frame_log/time"].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
+    if info.beam_unit is not None:
+        file.create_group(BEAM).attrs["NX_class"] = "NXlog"
+        for name, unit in (("time", "s"), ("value", info.beam_unit)):
+            _growing(file, f"{BEAM}/{name}", (), np.dtype("<f8"))
+            file[f"{BEAM}/{name}"].attrs["units"] = unit
+        file[f"{BEAM}/time"].attrs["description"] = "since 1970-01-01T00:00:00Z"
+    _nxdata(file, rows, cols, info.pixel_size_mm)
+
+    file[COMMITTED] = np.int64(0)
+    file[FINISHED] = np.int8(0)
+    _rewritable_text(file, STATUS, "running", 16)
+    _growing(file, MISSING, (), np.dtype("<i8"))
+    file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
+
+
+class Rows:
+    """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete."""
+
+    def __init__(self, file: h5py.File) -> None:
+        self._data: h5py.Dataset = file[DATA]
+        self._preview: h5py.Dataset = file[PREVIEW]
+        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in COLUMNS}
+
+    def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
+        """Row `row`, which may exist or be the next: pixels first, then what is said about them."""
+        said = {
+            "image_key": 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
+            "kind": int(record.kind),
+            "count_time": record.exposure,
+            "rotation_angle": np.degrees(record.angle),
+            "trigger": record.trigger,
+            "framestamp": record.framestamp,
+            "time": record.time,
+            "flags": record.flags,
+        }
+        for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
+            self._grow(dataset, row + 1)
+            dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
+        for name, column in self._columns.items():
+            self._grow(column, row + 1)
+            column[row] = said[name] if name in said else vars(digest)[name]
+
+    @staticmethod
+    def _grow(dataset: h5py.Dataset, n: int) -> None:
+        if dataset.id.shape[0] < n:  # never shrinks: a reader may hold the rows beyond
+            dataset.id.set_extent((n, *dataset.id.shape[1:]))
+
+
+def settle(file: h5py.File) -> None:
+    """Once SWMR writing is over: what strict validators want otherwise than a growing file can have it."""
+    if END_TIME in file:
+        end = file[END_TIME].asstr()[()]
+        del file[END_TIME]
+        file[END_TIME] = end
+    kinds = file[KIND][()]
+    if (kinds == FrameKind.ALIGNMENT).any():
+        file[f"{DETECTOR}/image_key_control"] = kinds
+
+
+def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None:
+    """Text of fixed length: variable-length text that is written under SWMR cannot be read (h5py issue 1273)."""
+    file.create_dataset(path, data=value.encode(), dtype=h5py.string_dtype("utf-8", width))
+
+
+def _growing(file: h5py.File, path: str, item: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    chunks = (1, *item) if item else (_SCALARS_PER_CHUNK,)
+    file.create_dataset(path, (0, *item), dtype, maxshape=(None, *item), chunks=chunks)
+
+
+def _nxdata(file: h5py.File, rows: int, cols: int, pixel_size_mm: float | None) -> None:
+    group = file["/entry/data"]
+    group.attrs["signal"] = "data"
+    group.attrs["axes"] = ["rotation_angle", "y", "x"]
+    for path in (DATA, ANGLE, IMAGE_KEY):
+        file[path].attrs["target"] = path  # NeXus: a link is a link by the target that it names
+        group[path.rsplit("/", 1)[1]] = file[path]
+    for name, n in (("y", rows), ("x", cols)):
+        group[name] = np.arange(n) * (1.0 if pixel_size_mm is None else pixel_size_mm)
+        group[name].attrs["units"] = "pixel" if pixel_size_mm is None else "mm"
+    for index, name in enumerate(("rotation_angle", "y", "x")):
+        group.attrs[f"{name}_indices"] = np.int64(index)

@@ -1,0 +1,145 @@
+"""Reconstruction files: a volume, everything it was made with and how it grew, as NXtomoproc; all of it or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.core.version import version
+from beamline.storage import hdf5
+from recon.base.volume import Grid, Volume
+
+Value = str | int | float | bool | NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ReconRecord:
+    """A volume and where it comes from.
+
+    Attributes:
+        volume: attenuation [z, y, x].
+        length_unit: "mm" where the pixel size is known, else "px"; the volume is in 1/length_unit.
+        raw_file: name of the scan it was made from.
+        title, sample: for people.
+        time: s since the Unix epoch when it was made.
+        parameters: every setting used, by name; numbers, strings and arrays.
+        metrics: figures of merit, by name.
+        history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
+    """
+
+    volume: Volume
+    length_unit: str
+    raw_file: str
+    title: str
+    sample: str
+    time: float
+    parameters: Mapping[str, Value]
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
+    """Write `record` to `path` as NXtomoproc (NeXus definitions, applications/NXtomoproc).
+
+    Raises:
+        DataError: if `path` exists and `replace` is not set, or the disk refuses; no partial file stays.
+    """
+    with whole_file(path, replace=replace) as partial:
+        try:
+            with hdf5.created(partial) as file:
+                _write_entry(_group(file, "entry", "NXentry"), record)
+                file.attrs["default"] = "entry"
+        except OSError as error:
+            raise DataError(
+                f"{path} could not be written ({hdf5.reason(error)}). Check the disk; nothing was left there."
+            ) from error
+
+
+def _write_entry(entry: h5py.Group, record: ReconRecord) -> None:
+    entry.attrs["default"] = "data"
+    entry["definition"] = "NXtomoproc"
+    entry["title"] = record.title
+    source = _group(_group(entry, "instrument", "NXinstrument"), "source", "NXsource")
+    source["probe"] = "x-ray"
+    _group(entry, "sample", "NXsample")["name"] = record.sample
+
+    process = _group(entry, "reconstruction", "NXprocess")
+    process["program"] = "splatline"
+    process["version"] = version()
+    process["date"] = datetime.fromtimestamp(record.time, UTC).isoformat(timespec="seconds")
+    parameters = _group(process, "parameters", "NXparameters")
+    parameters["raw_file"] = record.raw_file
+    for name, value in record.parameters.items():
+        parameters[name] = value
+    for group, values in (("metrics", record.metrics), ("history", record.history)):
+        node = _group(process, group, "NXcollection")
+        for name, value in values.items():
+            node[name] = value
+
+    data = _group(entry, "data", "NXdata")
+    data.attrs["signal"] = "data"
+    data.attrs["axes"] = ["z", "y", "x"]
+    # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
+    data.create_dataset("data", data=record.volume.data, chunks=(1, *record.volume.grid.shape[1:]))
+    data["data"].attrs["units"] = f"1/{record.length_unit}"
+    data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
+    for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
+        data[name] = centres
+        data[name].attrs["units"] = record.length_unit
+
+
+def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
+    group = parent.create_group(name)
+    group.attrs["NX_class"] = nx_class
+    return group
+
+
+def read_reconstruction(path: Path) -> ReconRecord:
+    """The record that `write_reconstruction` wrote.
+
+    Raises:
+        DataError: if the file is missing or is not such a file.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            return _read_entry(file["entry"])
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error
+
+
+def _read_entry(entry: h5py.Group) -> ReconRecord:
+    data, process = entry["data"], entry["reconstruction"]
+    z, y, x = (np.asarray(data[name][:]) for name in ("z", "y", "x"))
+    # A one-voxel axis says nothing about the voxel size, the longest one says it best.
+    longest = max((z, y, x), key=len)
+    size = float(longest[-1] - longest[0]) / (len(longest) - 1) if len(longest) > 1 else 1.0
+    grid = Grid(data["data"].shape, size, tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x)))  # type: ignore[arg-type]
+    parameters = {name: value_of(node) for name, node in process["parameters"].items()}
+    return ReconRecord(
+        volume=Volume(np.asarray(data["data"][:], dtype=np.float32), grid),
+        length_unit=str(data["x"].attrs["units"]),
+        raw_file=str(parameters.pop("raw_file")),
+        title=str(value_of(entry["title"])),
+        sample=str(value_of(entry["sample/name"])),
+        time=datetime.fromisoformat(str(value_of(process["date"]))).timestamp(),
+        parameters=parameters,
+        metrics={name: float(node[()]) for name, node in process["metrics"].items()},
+        history={name: np.asarray(node[()]) for name, node in process["history"].items()},
+    )
+
+
+def value_of(node: h5py.Dataset) -> Value:
+    """What a dataset holds, as plain text or number where it is one."""
+    value = node[()]
+    if isinstance(value, bytes):
+        return value.decode()
+    return value.item() if isinstance(value, np.generic) else value

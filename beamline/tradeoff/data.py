@@ -1,0 +1,64 @@
+"""What all trials of a trade-off share, and the file through which their processes get it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """What every trial of a trade-off shares.
+
+    Attributes:
+        projections, geometry: of the views that may be used.
+        held_out: views that no trial uses, and their geometry.
+        truth: the volume [z, y, x] on Grid.matching(geometry).
+    """
+
+    projections: F32
+    geometry: Geometry
+    held_out: tuple[F32, Geometry] | None
+    truth: F32 | None
+
+    def save(self, path: Path) -> None:
+        """As .npz, without pickle."""
+        arrays = {"projections": self.projections, **_geometry_arrays("geometry", self.geometry)}
+        if self.held_out is not None:
+            arrays |= {"held_out": self.held_out[0], **_geometry_arrays("held_out_geometry", self.held_out[1])}
+        if self.truth is not None:
+            arrays["truth"] = self.truth
+        np.savez(path, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Data:
+        with np.load(path, allow_pickle=False) as file:
+            geometry = _geometry("geometry", file)
+            held = (file["held_out"], _geometry("held_out_geometry", file)) if "held_out" in file else None
+            return cls(file["projections"], geometry, held, file.get("truth"))
+
+
+def geometry_in(path: Path) -> Geometry:
+    """The geometry of what `Data.save` left, without its views."""
+    with np.load(path, allow_pickle=False) as file:
+        return _geometry("geometry", file)
+
+
+def _geometry_arrays(prefix: str, geometry: Geometry) -> dict[str, NDArray[Any]]:
+    return {f"{prefix}.{f.name}": np.asarray(getattr(geometry, f.name)) for f in fields(Geometry)}
+
+
+def _geometry(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Geometry:
+    values: dict[str, Any] = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(Geometry)}
+    rows, cols = values.pop("detector_shape").tolist()
+    plain = {name: value.item() if value.ndim == 0 else value for name, value in values.items()}
+    return Geometry(detector_shape=(rows, cols), **plain)

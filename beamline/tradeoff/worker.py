@@ -1,0 +1,242 @@
+"""One trial in a process of its own, so that its peak memory is its own: `python -m beamline.tradeoff.worker JOB.json`.
+
+Reads the job and its arrays, says progress and the result as lines of JSON on stdout. A job may also be to compile what
+trials will need, once for all of them: compiling takes memory that would otherwise count as the first trial's. Its
+stdin is a pipe that nothing is written to: once that ends, whoever wanted the result is gone, and so is this process.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import recon
+from beamline.core.memory import forget_peak, peak_memory
+from beamline.projections.held_out import with_held_out
+from beamline.report.record import history_arrays, judged_by
+from beamline.tradeoff.data import Data, geometry_in
+from beamline.tradeoff.trials import Loss as TrialLoss
+from beamline.tradeoff.trials import Trial
+from recon.assess import metrics
+from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
+from recon.assess.time_model import record
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.ray_model import Truncation
+from recon.base.views import parse_views
+from recon.base.volume import Grid, Volume
+from recon.reconstruction import Reconstruction
+from recon.splatting.precision import compare
+from recon.splatting.problem import Loss
+from recon.splatting.settings import FitSettings
+from recon.voxels.projector import data_residual
+from recon.warm_up import toy_of
+from recon.warm_up import warm_up as compile_fit
+
+F32 = NDArray[np.float32]
+Say = Callable[[Mapping[str, Any]], None]
+
+_SAY_EVERY = 0.5  # s
+_LOSSES: Mapping[TrialLoss, tuple[Loss, bool]] = {
+    "l1+ssim": ("l1", True),
+    "l1": ("l1", False),
+    "l2+ssim": ("l2", True),
+    "poisson+ssim": ("poisson", True),
+}
+"""The misfit of a fit, and whether SSIM stands beside it."""
+
+
+def run(
+    trial: Trial,
+    data: Data,
+    seed: int,
+    say: Say,
+    now: Callable[[], float] = time.perf_counter,
+    cpu: Callable[[], float] = time.process_time,
+) -> dict[str, Any]:
+    """Make a trial's reconstruction and measure it; the fields of an Outcome.
+
+    Raises:
+        ValueError: the reconstruction refuses these settings.
+    """
+    if trial.group == "precision":
+        found = compare(data.projections, data.geometry, seed, now)
+        return {"seconds": found["seconds_float32"], "peak_bytes": peak_memory(), "details": found}
+    views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
+    projections, geometry = data.projections[views], data.geometry.select(views)
+    grid = Grid.matching(data.geometry)
+    warm_up(trial, data.geometry)
+    forget_peak()
+    before = cpu()
+    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
+    cpu_seconds = cpu() - before
+    peak = peak_memory()  # before measuring, which has needs of its own
+    volume = on_grid(result.volume, grid)
+    found = {}
+    if data.truth is not None:
+        found["psnr"] = metrics.psnr(data.truth, volume.data)
+        found["ssim3d"] = metrics.ssim3d(data.truth, volume.data)
+    if data.held_out is not None:
+        found["residual_held_out"] = data_residual(volume, *data.held_out)
+    if trial.halves and trial.views >= 4:
+        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed)
+    return {
+        "seconds": result.seconds,
+        "cpu_seconds": cpu_seconds,
+        "peak_bytes": peak,
+        "metrics": {name: float(value) for name, value in found.items()},
+        "gaussians": None if result.gaussians is None else result.gaussians.n,
+        "curve": curve_of(result),
+        "curve_of": "" if (judged := judged_by(history_arrays(result.history))) is None else judged.views,
+    }
+
+
+def half_set_resolution(trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int) -> float:
+    """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+
+    def half(views: NDArray[np.int64]) -> F32:
+        made = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None)
+        return on_grid(made.volume, grid).data
+
+    even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
+    return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
+
+
+def reconstruct(
+    trial: Trial,
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid,
+    held_out: tuple[F32, Geometry] | None,
+    seed: int,
+    on_progress: Callable[[recon.Progress], None] | None,
+) -> Reconstruction:
+    """The one place that turns a trial into a call of recon.reconstruct.
+
+    A fit of binned views fills `grid` all the same; voxel methods have one voxel a binned pixel.
+    """
+    if trial.method == "r2":
+        projections, geometry, unseen = with_held_out(projections, geometry, held_out)
+    binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
+    if trial.method != "r2":
+        target = grid if trial.binning == 1 else Grid.matching(coarse)
+        own: dict[str, Any] = {} if trial.iterations is None else {"iterations": trial.iterations}
+        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, on_progress=on_progress, **own)
+    return recon.reconstruct(
+        binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=_settings(trial),
+        start=trial.start, held_out=unseen, on_progress=on_progress,
+    )  # fmt: skip
+
+
+def _settings(trial: Trial) -> FitSettings:
+    loss, with_ssim = _LOSSES[trial.loss]
+    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))
+    return settings if with_ssim else replace(settings, ssim_weight=0.0)
+
+
+def warm_up(trial: Trial, geometry: Geometry) -> None:
+    """Compile what a trial of these views uses on a toy of the same kind, so that compilation is in no trial's time."""
+    if trial.method == "r2":
+        compile_fit("cpu", _settings(trial).loss, geometry, start=trial.start)
+    views, toy = toy_of(geometry)
+    short = replace(
+        trial, binning=1, steps=None if trial.steps is None else 3, gaussians=None if trial.gaussians is None else 60,
+        iterations=None if trial.iterations is None else 1,
+    )  # fmt: skip
+    reconstruct(short, views, toy, Grid.matching(toy), None, 0, None)
+
+
+def on_grid(volume: Volume, grid: Grid) -> Volume:
+    """The volume on another grid, by linear interpolation at its voxels' centres (edge values beyond the ends)."""
+    if volume.grid == grid:
+        return volume
+    index = [
+        (there - here[0]) / edge
+        for there, here, edge in zip(grid.coordinates(), volume.grid.coordinates(), volume.grid.spacing, strict=True)
+    ]
+    out = np.empty(grid.shape, np.float32)
+    plane = np.meshgrid(index[1], index[2], indexing="ij")
+    for k, height in enumerate(index[0]):
+        where = np.stack((np.full_like(plane[0], height), *plane))
+        ndimage.map_coordinates(volume.data, where, out[k], order=1, mode="nearest")
+    return Volume(out, grid)
+
+
+def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
+    """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
+    judged = judged_by(history_arrays(result.history))
+    if judged is None:
+        return []
+    seconds, quality = record(judged.seconds, judged.residuals)
+    return list(zip(seconds.tolist(), quality.tolist(), strict=True))
+
+
+def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:
+    said = -math.inf
+
+    def listen(progress: recon.Progress) -> None:
+        nonlocal said
+        if now() - said >= _SAY_EVERY:
+            said = now()
+            say({"event": "progress", "step": progress.step, "steps": progress.steps})
+
+    return listen
+
+
+def end_with(pipe: int) -> None:
+    """End this process when the file descriptor `pipe` does, that is when the process at its other end has ended.
+
+    Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
+    """
+
+    def wait() -> None:
+        while os.read(pipe, 1024):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()
+
+
+def main(job: Path) -> int:
+    """Run the job in the file `job`.
+
+    That is {"data": .npz, "trial": {...}, "seed": n}, or {"data": .npz, "compile": [{...}, ...]}.
+    """
+
+    def say(line: Mapping[str, Any]) -> None:
+        print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
+
+    said = json.loads(job.read_text(encoding="utf-8"))
+    if "compile" in said:
+        geometry = geometry_in(Path(said["data"]))
+        for trial in said["compile"]:
+            with suppress(ValueError):  # a method that does not take these views: its own trial will say so
+                warm_up(Trial(**trial), geometry)
+        return 0
+    trial = Trial(**said["trial"])
+    try:
+        result = run(trial, Data.load(Path(said["data"])), int(said["seed"]), say)
+    except ValueError as error:
+        say({"event": "failed", "message": str(error)})
+        return 1
+    say({"event": "result", **result})
+    return 0
+
+
+if __name__ == "__main__":
+    end_with(sys.stdin.fileno())
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,78 @@
+"""Beam monitor's electrometer: an instrument on a serial line that answers a query with a line that holds a number.
+
+Confirmed on no instrument. The defaults follow the Keithley 6485 picoammeter as remembered (`READ?` answers
+`+1.0427E-12A,+2.345E+02,+0.000E+00`: current, time, status; 9600 baud; the line's end is set on its panel): check them
+on yours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from drivers.beam_monitors.reading import within_a_line
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line_reader import Framing
+
+QUERY = "READ?"
+PATTERN = r"^\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)"
+
+
+class SerialSource:
+    """Implements `drivers.beam_monitors.reading.TextSource` over a serial line.
+
+    Args:
+        url: what pyserial opens.
+        query: asks for a reading; it must be harmless, since it also finds the line's step again.
+        pattern: what every answer holds; another answer is taken for a disturbed line.
+        setup: commands without a reply that are sent once, before the first query.
+        line_end: of commands and answers.
+        transcript: see `SerialLine`.
+
+    Raises:
+        DeviceError: the port does not open. DeviceRefused: an empty query.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        clock: Clock,
+        *,
+        query: str = QUERY,
+        pattern: str = PATTERN,
+        setup: Sequence[str] = (),
+        timeout: float = 2.0,
+        baudrate: int = 9600,
+        line_end: bytes = b"\r\n",
+        name: str = "beam monitor",
+        transcript: Path | None = None,
+    ) -> None:
+        self.request = query
+        self._form = within_a_line(pattern)
+        if not query:
+            raise DeviceRefused(name, "an empty query asks for nothing", state="Nothing was sent")
+        self._line = SerialLine(
+            url,
+            device=name,
+            probe=Probe(query, self._form),
+            clock=clock,
+            timeout=timeout,
+            baudrate=baudrate,
+            framing=Framing(line_end, line_end),
+            transcript=transcript,
+        )
+        try:
+            for command in setup:
+                self._line.send(command)
+        except DeviceError:
+            self.close()
+            raise
+
+    def text(self) -> str:
+        """The answer to the query. Raises DeviceTimeout, DeviceError."""
+        return self._line.query(self.request, self._form, "a line with a number")[0]
+
+    def close(self) -> None:
+        self._line.close()

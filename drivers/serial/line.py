@@ -1,0 +1,263 @@
+"""Serial line: one request and its reply at a time over any pyserial URL: a port, socket://, or a simulator's sim://.
+
+Rules that keep it in step with the device: one request at a time, a finite timeout, every reply compared with the form
+it must have. After a timeout or a reply of the wrong form nothing that arrives is believed until a harmless probe has
+been answered and the line has fallen quiet. Commands without a reply wait for nobody: a stop goes out at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import serial
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, readable
+from drivers.serial.port import open_port
+from drivers.serial.transcript import Transcript
+
+QUIET = 0.05
+"""s without a byte after which a line counts as quiet."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A query without side effects, and the form of its one-line reply, by which the line finds its step again."""
+
+    request: str
+    reply: str
+
+
+def _sound(line: str) -> str:
+    """A line without a checksum has nothing to say of itself."""
+    return ""
+
+
+class SerialLine:
+    """A device that talks ASCII lines, 8 bits, no parity, 1 stop bit. Safe from several threads.
+
+    Args:
+        url: what pyserial opens: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
+        device: the name that errors carry.
+        probe: see `Probe`.
+        timeout: s for a whole reply, more than 0.
+        unsolicited: form of lines that the device may send unasked; they are noted and passed over.
+        check: what is wrong with a received line, "" where nothing is; for checksums.
+        transcript: file to which every byte sent and received is appended with its time; None keeps none.
+
+    Raises:
+        DeviceError: the port or the transcript cannot be opened. DeviceRefused: a timeout that is none.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        device: str,
+        probe: Probe,
+        clock: Clock,
+        timeout: float,
+        baudrate: int,
+        unsolicited: str = r"(?!)",
+        framing: Framing = CRLF,
+        check: Callable[[str], str] = _sound,
+        transcript: Path | None = None,
+    ) -> None:
+        self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
+        self._asking, self._writing = threading.RLock(), threading.Lock()
+        self._framing, self._in_step, self._closed = framing, True, False
+        if not 0 < timeout < math.inf:
+            raise DeviceRefused(
+                device,
+                f"no reply comes within a timeout of {timeout} s, or it is waited for without end",
+                expected="a positive number of seconds",
+                state="Nothing was sent",
+            )
+        try:
+            self._transcript = Transcript(clock, transcript)
+        except OSError as problem:
+            raise DeviceError(
+                device,
+                f"the transcript {str(transcript)!r} cannot be written: {problem}",
+                advice="Name a file in a folder that exists, or none",
+                state="Nothing was sent",
+            ) from problem
+        try:
+            self._port = open_port(url, baudrate, QUIET, timeout)
+        except BaseException as problem:
+            self._transcript.close()
+            if not isinstance(problem, OSError | ValueError):
+                raise
+            raise DeviceError(
+                device,
+                f"the port {url!r} does not open: {problem}",
+                expected="a port like /dev/ttyUSB0, COM3, socket://host:port or sim://pm16c",
+                advice="Check the cable, the port's name in the configuration and that no other program holds it",
+                state="Nothing was sent",
+            ) from problem
+        self._reader = LineReader(self._port, clock, self._transcript, framing, unsolicited, check)
+
+    def send(self, command: str) -> None:
+        """Send a command that has no reply. It goes out even where the line is out of step or another thread waits for
+        its reply: a stop must not wait.
+
+        Raises:
+            DeviceError: the port is gone. DeviceTimeout: the device does not take bytes.
+        """
+        self._write(command.encode("ascii") + self._framing.command_end, command or "an empty line")
+
+    def send_raw(self, data: bytes) -> None:
+        """`send` for bytes without an end, such as one control character."""
+        self._write(data, readable(data))
+
+    def query(self, request: str, reply: str, meaning: str, state: str = "") -> re.Match[str]:
+        """Send a request and read its reply.
+
+        Args:
+            reply: regular expression that the whole reply must match.
+            meaning: the expected reply in words, for the error.
+            state: what has (not) moved, for the error.
+
+        Raises:
+            DeviceTimeout: no whole reply within the timeout. DeviceError: a reply of another form, or the port is gone.
+        """
+        return self._query(request.encode("ascii") + self._framing.command_end, request, reply, meaning, state)
+
+    def query_raw(self, data: bytes, reply: str, meaning: str, state: str = "") -> re.Match[str]:
+        """`query` for bytes without an end, such as one control character."""
+        return self._query(data, readable(data), reply, meaning, state)
+
+    def close(self) -> None:
+        """Free the port, once a request of another thread is through; a second time does nothing."""
+        with self._asking, self._writing:
+            self._closed = True
+            with contextlib.suppress(OSError):  # a port that is gone has nothing to free
+                self._port.close()
+            self._transcript.close()
+
+    def _query(self, data: bytes, request: str, reply: str, meaning: str, state: str) -> re.Match[str]:
+        with self._asking:
+            self._refuse_if_closed(request)
+            with self._port_may_go(request):
+                if not self._in_step:
+                    self._find_step(request, state)
+                self._in_step = False
+                self._reader.pass_over_what_came_before()
+                self._write(data, request)
+                text = self._reader.reply(self._clock.now() + self._timeout)
+            if text is None:
+                raise self._error(
+                    DeviceTimeout,
+                    f"no whole reply within {self._timeout:g} s",
+                    request=request,
+                    reply=self._reader.begun[:80],
+                    expected=meaning,
+                    advice="Check power, cable and baud rate; the next request will first find the line's step again",
+                    state=state,
+                )
+            if isinstance(text, Damaged):
+                raise self._error(
+                    DeviceError,
+                    f"the reply was damaged on the way: {text.why}",
+                    request=request,
+                    reply=text.text,
+                    expected=meaning,
+                    advice="Check the cable, its shield and the baud rate",
+                    state=state,
+                )
+            match = re.fullmatch(reply, text)
+            if match is None:
+                raise self._error(
+                    DeviceError,
+                    "the reply does not have the form it must have",
+                    request=request,
+                    reply=text,
+                    expected=meaning,
+                    advice="The line may be disturbed or the device be another model",
+                    state=state,
+                )
+            self._in_step = True
+            return match
+
+    def _find_step(self, request: str, state: str) -> None:
+        """Throw away what is on the line, probe, pass over late replies until the probe's own, wait for quiet."""
+        self._transcript.tell("!", "out of step: probing")
+        self._wait_for_quiet(request, state)
+        self._write(self._probe.request.encode("ascii") + self._framing.command_end, self._probe.request)
+        deadline = self._clock.now() + self._timeout
+        while (text := self._reader.line(deadline)) is not None:
+            if isinstance(text, str) and re.fullmatch(self._probe.reply, text):
+                break
+        else:
+            raise self._error(
+                DeviceTimeout,
+                f"still no answer after an earlier failure, for {self._timeout:g} s",
+                request=self._probe.request,
+                expected=f"a reply of the form {self._probe.reply}",
+                advice="Check power, cable and baud rate",
+                state=state,
+            )
+        self._wait_for_quiet(request, state)
+        self._in_step = True
+        self._transcript.tell("!", "in step again")
+
+    def _wait_for_quiet(self, request: str, state: str) -> None:
+        if not self._reader.drain(self._clock.now() + max(self._timeout, 10 * QUIET)):
+            raise self._error(
+                DeviceTimeout,
+                "it sends without pause and was not asked",
+                request=request,
+                expected="a quiet line before the next request",
+                advice="Check the baud rate and that the port is this device's",
+                state=state,
+            )
+
+    def _write(self, data: bytes, text: str) -> None:
+        with self._writing:
+            self._refuse_if_closed(text)
+            self._transcript.tell(">", text)
+            self._transcript.keep(">", data)
+            with self._port_may_go(text):
+                self._port.write(data)
+
+    @contextlib.contextmanager
+    def _port_may_go(self, request: str) -> Iterator[None]:
+        """What the port raises, in the words of the device."""
+        state = "What the device was doing it may still be doing"
+        try:
+            yield
+        except serial.SerialTimeoutException as problem:
+            raise self._error(
+                DeviceTimeout,
+                f"it took no bytes for {self._timeout:g} s",
+                request=request,
+                expected="a device that takes what is sent",
+                advice="Check power, cable and flow control (none is expected)",
+                state=state,
+            ) from problem
+        except OSError as problem:
+            raise self._error(
+                DeviceError,
+                f"the port failed: {problem}",
+                request=request,
+                expected="a port that stays there",
+                advice="Check that the cable or adapter is still plugged in, then start again",
+                state=state,
+            ) from problem
+
+    def _refuse_if_closed(self, request: str) -> None:
+        """What a closed port itself raises differs from system to system."""
+        if self._closed:
+            raise DeviceError(
+                self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
+            )
+
+    def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
+        return kind(self._device, problem, wire=self._transcript.told(), **parts)

@@ -1,0 +1,242 @@
+"""One axis of a PI GCS 2.0 controller and its trigger line: what can be asked of it. Counts here, degrees on the wire.
+
+Set commands are followed by ERR?, and what matters is read back. Protocol: the C-863's manual (MS249E), cross-checked
+with EPICS' and the vendor's host software. One axis, one parameter a line; no daisy chain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+from drivers.errors import DeviceRefused
+from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
+from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
+from drivers.stages.pi_gcs.train import TriggerWindow
+
+ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
+ACCELERATION, DECELERATION, NUMERATOR, DENOMINATOR = "0xB", "0xC", "0xE", "0xF"
+RATE_AGREES = Fraction(1, 100)
+"""Controllers hold velocities and accelerations in steps of their own; more than this is another number."""
+
+
+@dataclass(frozen=True)
+class AxisStatus:
+    """What the axis says. `raw`: the replies, for errors."""
+
+    counts: int
+    moving: bool
+    homed: bool
+    servo: bool
+    raw: str
+
+
+class PiGcsAxis:
+    """Raises (in all methods) what `GcsLine` raises, and DeviceRefused where it must stand and does not."""
+
+    def __init__(self, line: GcsLine, *, axis: str, trigger_line: int, counts_per_turn: int, name: str) -> None:
+        self._line, self._name, self._axis, self._output = line, name, axis, trigger_line
+        self._counts_per_turn = counts_per_turn
+        self._bit = 0
+        self.last_move = ""
+        """The command of the last move or search, for errors."""
+        self._identity = ""
+
+    def degrees(self, counts: Fraction | int) -> str:
+        """The text for a place, distance or rate: exact to far less than a count over any train."""
+        return plain(Fraction(counts) * 360 / self._counts_per_turn)
+
+    def to_counts(self, degrees: str) -> int:
+        return round(Fraction(degrees) * self._counts_per_turn / 360)
+
+    def open(self, acceleration: Fraction) -> str:
+        """Make sure of the controller and take the axis: trigger off, servo on, acceleration (counts/s²); who it is."""
+        self._line.wake()
+        self._identity = self._line.ask("*IDN?", r".*Physik Instrumente.*", "the identity of a PI controller")[0]
+        if self._line.ask("CSV?", r"(\d+)(?:\.\d+)?", "the version of the command language")[1] != "2":
+            raise self._refused(f"{self._identity} does not talk GCS 2.0", "Use a controller with command syntax 2.0")
+        self._line.read_error()
+        axes = [line.strip() for line in self._line.ask("SAI?", r"[\w\s-]+", "the names of its axes")[0].split("\n")]
+        if self._axis not in axes:
+            raise self._refused(f"it has no axis {self._axis!r}, but {', '.join(axes)}", "Correct the configured axis")
+        self._bit = axes.index(self._axis)
+        self.standing("opening")
+        self._compare_counts()
+        self.disarm()
+        if not self._line.flag("SVO?"):
+            self._line.set(f"SVO {self._axis} 1")
+            if not self._line.flag("SVO?"):
+                raise self._line.not_followed(f"SVO {self._axis} 1", "0", "1")
+        self._take_accelerations(acceleration)
+        self._line.fault = 0
+        return self._identity
+
+    def own_limits(self) -> tuple[int, int]:
+        """The controller's own travel range in counts, a thousand million turns at most."""
+        most = 10**9 * self._counts_per_turn
+        low, high = (self.to_counts(self._line.number(query, ANY_NUMBER)) for query in ("TMN?", "TMX?"))
+        return max(low, -most), min(high, most)
+
+    def moving(self) -> bool:
+        form = r"(?:0[xX])?([0-9A-Fa-f]{1,8})"
+        return bool(int(self._line.ask(ARE_THEY_MOVING, form, "the axes that move, as bits")[1], 16) >> self._bit & 1)
+
+    def searching(self) -> bool:
+        """It moves, or is between two parts of a reference move."""
+        return self._line.ask(READY, r"\\x(b[01])", "the byte B1 (ready) or B0")[1] == "b0" or self.moving()
+
+    def counts(self) -> int:
+        return self.to_counts(self._line.number("POS?"))
+
+    def on_target(self) -> bool:
+        return self._line.flag("ONT?")
+
+    def status(self) -> AxisStatus:
+        """Where it is and how; what the error register has becomes `fault`."""
+        moving = self.moving()
+        self._line.read_error()
+        homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
+        error = meaning(self._line.fault) or "no error"
+        said = f"moving {moving:d}, counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
+        return AxisStatus(counts, moving, homed, servo, said)
+
+    def limit_switch(self) -> str:
+        """Which limit switch is on, in words; "" for none, or for a model whose register is not known."""
+        if "C-863" not in self._identity:
+            return ""
+        bits = int(self._line.ask(REGISTER, r"0[xX]([0-9A-Fa-f]{1,8})", "the status register")[1], 16)
+        return {1: "negative limit switch", 4: "positive limit switch", 5: "both limit switches"}.get(bits & 5, "")
+
+    def standing(self, purpose: str) -> None:
+        """Refuses `purpose` while the axis moves; what the error register had becomes `fault`."""
+        if self.moving():
+            raise DeviceRefused(
+                self._name,
+                f"{purpose} is not possible while it moves",
+                advice="Wait for the move to end, or stop it",
+                state=f"The move under way goes on; it is at {self.counts()} counts",
+            )
+        self._line.read_error()
+
+    def start(self, target: int, speed: Fraction) -> None:
+        """Begin a move of the standing axis to `target` counts at `speed` counts/s."""
+        self._take_rate("VEL", speed)
+        self._begin(command := f"MOV {self._axis} {self.degrees(target)}")
+        taken = self._line.number("MOV?")
+        if self.to_counts(taken) != target:
+            raise self._line.not_followed(command, taken, self.degrees(target))
+
+    def search_reference(self, command: str) -> None:
+        """Begin FRF, FNL or FPL of the standing axis."""
+        code, has = (31, "TRS?") if command == "FRF" else (32, "LIM?")
+        if not self._line.flag(has):
+            raise self._refused(f"{command} is not possible: {REFUSALS[code][0]}", advice(code), f"{has} {self._axis}")
+        self.disarm()
+        self._begin(f"{command} {self._axis}")
+
+    def brake(self) -> str:
+        """Send the stop command; what was sent."""
+        self._line.stop(command := f"HLT {self._axis}")
+        return command
+
+    def stop_all(self) -> None:
+        """All axes of the controller stand at once."""
+        self._line.stop(STOP_ALL)
+
+    def arm(self, window: TriggerWindow, active_high: bool) -> None:
+        """Set the trigger line of the standing axis up and switch it on."""
+        self.disarm()
+        self._configure(2, self._axis)
+        self._configure(3, "0")
+        self._configure(7, f"{active_high:d}")
+        self._configure(1, self.degrees(window.step), window.step_tolerance)
+        self._configure(8, self.degrees(window.start))
+        self._configure(9, self.degrees(window.stop))
+        self._switch_trigger(True)
+
+    def disarm(self) -> None:
+        self._switch_trigger(False)
+
+    def _begin(self, command: str) -> None:
+        self._line.fault, before, self._line.commanded = 0, self._line.commanded, True
+        self.last_move = command
+        code = self._line.tell(command)
+        if code in REFUSALS:
+            self._line.commanded = before
+        if code == NOT_ALLOWED_TO_MOVE:
+            raise self._may_not_move(command)
+        self._line.judge(command, code)
+
+    def _may_not_move(self, command: str) -> DeviceRefused:
+        """Which of the two reasons of error 5 it is."""
+        verb = command.split()[0]
+        if not self._line.flag("SVO?"):
+            why = "Find what switched it off, then close the driver and open it again: that switches it on"
+            return self._refused(f"{verb} is not possible: the servo is off", why, command)
+        if not self._line.flag("FRF?"):
+            why = "Search the reference (start_home) when nothing is in its way"
+            return self._refused(f"{verb} is not possible: the axis has no reference yet", why, command)
+        return self._refused(f"{verb} ended with {meaning(5)}", advice(5), command)
+
+    def _configure(self, parameter: int, value: str, tolerance: Fraction = Fraction(1, 2)) -> None:
+        """One CTO and its read-back, which may have fewer decimals than were sent; `tolerance` in counts."""
+        command = f"CTO {self._output} {parameter} {value}"
+        self._line.set(command)
+        form = r"(\w+)" if parameter == 2 else NUMBER
+        asked = f"CTO? {self._output} {parameter}"
+        reply = self._line.ask(asked, rf"{self._output} {parameter} ?= ?{form}", f"{value}, as just set")[1]
+        if parameter in (2, 3, 7):
+            same = reply == value or (parameter != 2 and Fraction(reply) == int(value))
+        else:
+            miss = abs(Fraction(reply) - Fraction(value)) * self._counts_per_turn / 360
+            same = is_rounding_of(reply, value) and miss < tolerance
+        if not same:
+            raise self._line.not_followed(command, reply, value)
+
+    def _switch_trigger(self, on: bool) -> None:
+        command = f"TRO {self._output} {on:d}"
+        self._line.set(command)
+        reply = self._line.ask(f"TRO? {self._output}", rf"{self._output} ?= ?([01])", f"{on:d}, as just set")[1]
+        if reply != f"{on:d}":
+            raise self._line.not_followed(command, reply, f"{on:d}")
+
+    def _compare_counts(self) -> None:
+        """Our counts must be whole counts of the controller's, where it tells (parameters 0xE and 0xF)."""
+        numerator, denominator = (self._line.parameter(number) for number in (NUMERATOR, DENOMINATOR))
+        if numerator is None or denominator is None or not Fraction(denominator):
+            return
+        own = Fraction(numerator) / Fraction(denominator) * 360
+        if own == 0 or (own / self._counts_per_turn).denominator != 1:
+            raise self._refused(
+                f"it counts {float(own):.10g} a turn, which is no multiple of the configured {self._counts_per_turn}",
+                "Correct counts_per_turn in the configuration, or the controller's parameters 0xE and 0xF",
+            )
+
+    def _take_accelerations(self, rate: Fraction) -> None:
+        """By ACC and DEC; a controller that does not know them has parameters for both."""
+        for command, parameter in (("ACC", ACCELERATION), ("DEC", DECELERATION)):
+            try:
+                self._take_rate(command, rate)
+            except DeviceRefused:
+                if self._line.fault != UNKNOWN_COMMAND:
+                    raise
+                text = self.degrees(rate)
+                self._line.set(instead := f"SPA {self._axis} {parameter} {text}")
+                reply = self._line.parameter(parameter)
+                if reply is None or not _nearly(text, reply):
+                    raise self._line.not_followed(instead, reply or "", text) from None
+
+    def _take_rate(self, command: str, rate: Fraction) -> None:
+        """VEL, ACC or DEC in counts."""
+        text = self.degrees(rate)
+        self._line.set(f"{command} {self._axis} {text}")
+        reply = self._line.number(f"{command}?")
+        if not _nearly(text, reply):
+            raise self._line.not_followed(f"{command} {self._axis} {text}", reply, text)
+
+    def _refused(self, problem: str, advice: str, request: str = "") -> DeviceRefused:
+        return DeviceRefused(self._name, problem, request=request, advice=advice, state="Nothing has moved")
+
+
+def _nearly(sent: str, reply: str) -> bool:
+    return abs(Fraction(sent) - Fraction(reply)) <= RATE_AGREES * abs(Fraction(sent))

@@ -1,0 +1,166 @@
+"""The dialogue of PI GCS 2.0: set commands and the error register after each, queries, control bytes, numbers as text.
+
+Set commands are not answered: each is followed by ERR?, which tells what became of it and clears the register.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from fractions import Fraction
+from pathlib import Path
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line_reader import Framing
+from drivers.stages.pi_gcs.errors import REFUSALS, advice, meaning
+
+FRAMING = Framing(command_end=b"\n", line_end=b"\n", continued=" ")
+PROBE = Probe("CSV?", r"\d+\.\d+")
+NUMBER = r"([+-]?\d{1,12}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,2})?)"
+ANY_NUMBER = r"([+-]?\d{1,320}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,3})?)"
+"""Endless stages give limits as large as a number can be."""
+DECIMALS = 12
+
+
+def plain(value: Fraction) -> str:
+    """A decimal number without exponent, rounded to 12 decimals, without needless zeros."""
+    units = round(abs(value) * 10**DECIMALS)
+    whole, rest = divmod(units, 10**DECIMALS)
+    text = f"{whole}.{rest:0{DECIMALS}d}".rstrip("0").rstrip(".")
+    return f"-{text}" if value < 0 and units else text
+
+
+def is_rounding_of(reply: str, sent: str) -> bool:
+    """Whether `reply` is the number sent, or that number in as many decimals as the reply has."""
+    decimals = len(reply.partition(".")[2]) if "e" not in reply.lower() else DECIMALS
+    return abs(Fraction(sent) - Fraction(reply)) <= Fraction(1, 2 * 10**decimals)
+
+
+class GcsLine:
+    """A controller and its one axis that is of interest. `fault` keeps the last code that the register gave, until it
+    is set to 0. Safe from several threads.
+
+    Raises (here and in all methods):
+        DeviceRefused: the controller refuses a command. DeviceError: another code, or a reply of another form.
+        DeviceTimeout: no reply.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        axis: str,
+        name: str,
+        clock: Clock,
+        timeout: float,
+        baudrate: int,
+        transcript: Path | None,
+    ) -> None:
+        self.fault = 0
+        self.commanded = False
+        """A move was begun: what is said of a failure depends on it."""
+        self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
+        self._register = threading.RLock()
+        self._serial = SerialLine(
+            url,
+            device=name,
+            probe=PROBE,
+            clock=clock,
+            timeout=timeout,
+            baudrate=baudrate,
+            framing=FRAMING,
+            transcript=transcript,
+        )
+
+    def set(self, command: str) -> None:
+        """Send a set command; raises where the register then has a code."""
+        self.judge(command, self.tell(command))
+
+    def tell(self, command: str) -> int:
+        """Send a set command; the code that the register then has."""
+        with self._register:
+            self._serial.send(command)
+            return self.read_error()
+
+    def stop(self, command: str | bytes) -> None:
+        """Send a stop, as a command or a control byte, whoever else is asking; then see that it was understood. It sets
+        a code of its own, and what else went wrong before does not speak against it."""
+        if isinstance(command, str):
+            self._serial.send(command)
+        else:
+            self._serial.send_raw(command)
+        with self._register:
+            code = self.read_error()
+        if code in REFUSALS:
+            self.judge(command if isinstance(command, str) else f"#{command[0]}", code)
+
+    def read_error(self) -> int:
+        """The error register, which is then clear; a code other than 0 becomes `fault`."""
+        code = int(self.ask("ERR?", r"\s*(-?\d{1,5})\s*", "an error code")[1])
+        if code:
+            self.fault = code
+        return code
+
+    def judge(self, command: str, code: int) -> None:
+        """Raises what a code after a command means."""
+        if code:
+            refused = code in REFUSALS
+            raise (DeviceRefused if refused else DeviceError)(
+                self._name,
+                f"{command.split()[0]} ended with {meaning(code)}",
+                request=command,
+                reply=str(code),
+                expected="0, no error",
+                advice=advice(code),
+                state="That command did nothing" if refused and self.commanded else self._state(),
+            )
+
+    def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
+        """A query as text, or as a control byte; the match of its whole reply with `form`."""
+        if isinstance(request, bytes):
+            return self._serial.query_raw(request, form, meant, self._state())
+        return self._serial.query(request, form, meant, self._state())
+
+    def flag(self, query: str) -> bool:
+        """A query of the axis that is answered by 0 or 1."""
+        return self.ask(f"{query} {self._axis}", self._key + "([01])", f"{self._axis}=0 or {self._axis}=1")[1] == "1"
+
+    def number(self, query: str, form: str = NUMBER) -> str:
+        """A query of the axis that is answered by a number, as it is written."""
+        return self.ask(f"{query} {self._axis}", self._key + form, f"{self._axis}=number")[1]
+
+    def parameter(self, number: str) -> str | None:
+        """SPA?; None where the controller does not know it: then it does not answer, and the register says why."""
+        request = f"SPA? {self._axis} {number}"
+        try:
+            return self.ask(request, rf"{re.escape(self._axis)} \w+ ?= ?{NUMBER}", f"{self._axis} {number}=number")[1]
+        except DeviceTimeout:
+            if self.read_error() not in REFUSALS:
+                raise
+            self.fault = 0
+            return None
+
+    def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
+        """The error for a read-back that is not what was set."""
+        return DeviceError(
+            self._name,
+            "a setting was not taken",
+            request=command,
+            reply=reply,
+            expected=wanted,
+            advice="Check that no other program or person drives this controller, and the cable",
+            state=self._state(),
+        )
+
+    def wake(self) -> None:
+        """End what another program may have left half said."""
+        self._serial.send("")
+
+    def close(self) -> None:
+        """Free the port; a second time does nothing."""
+        self._serial.close()
+
+    def _state(self) -> str:
+        return "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"

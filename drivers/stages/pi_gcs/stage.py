@@ -1,0 +1,293 @@
+"""PI controller with GCS 2.0 (C-863 class) as rotation stage, with position-synchronised trigger pulses.
+
+Positions are an encoder's and hold only from a reference move on (`start_home`): before it, moves are refused. Pulses
+come from a digital output in trigger mode 0; the controller does not count them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.stages.pi_gcs.axis import AxisStatus, PiGcsAxis
+from drivers.stages.pi_gcs.digital import GcsOutput
+from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
+from drivers.stages.pi_gcs.limits import FIRMWARE_PULSE, SLOWEST, limits_of
+from drivers.stages.pi_gcs.line import GcsLine
+from drivers.stages.pi_gcs.train import FirstPulse, is_spent_by, window_of
+from drivers.stages.standing import POLL, longest_stop, until_standing
+from drivers.stages.stops import Stops
+from drivers.stages.travel import Travel
+
+
+class PiGcsStage:
+    """Implements `drivers.protocols.RotationStage`. Opening switches the servo on and the trigger line off; closing
+    leaves both, and a move under way, as they are.
+
+    `stop` returns when the stage stands, `abort` at once; it stands all axes of the controller. A train is ended by a
+    move that would emit it a second time or turn back inside it.
+
+    Args:
+        url: what pyserial opens.
+        axis: identifier as SAI? lists it.
+        trigger_line: digital output that the pulses come from.
+        counts_per_turn: encoder counts for 2π.
+        timeout: s for a reply.
+        max_speed, acceleration: rad/s, rad/s².
+        low, high: soft limits in radians, within the controller's own.
+        baudrate: as set on the controller; nominal over USB.
+        pulse_width: must be None: the firmware has one.
+        active_high: polarity of the pulses. That CTO parameter 7 is 1 for it is taken from memory.
+        transcript: file to which every byte on the wire is appended; None keeps none.
+        reference: how `start_home` finds the reference: by its switch, or the negative or positive limit switch.
+        first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
+        firmware_pulse: s that the firmware holds a pulse; trains must leave as long between two.
+        tolerance: counts from the target within which a move has arrived (a servo holds to a few counts, never one).
+        settle: s after a move in which the controller may still bring the axis on target.
+
+    Raises:
+        DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        axis: str = "1",
+        trigger_line: int = 1,
+        counts_per_turn: int,
+        clock: Clock,
+        timeout: float = 1.0,
+        max_speed: float,
+        acceleration: float,
+        low: float,
+        high: float,
+        name: str = "stage",
+        baudrate: int = 115_200,
+        pulse_width: float | None = None,
+        active_high: bool = True,
+        transcript: Path | None = None,
+        reference: Literal["FRF", "FNL", "FPL"] = "FRF",
+        first_pulse: FirstPulse | str = FirstPulse.AT_THRESHOLD,
+        firmware_pulse: float = FIRMWARE_PULSE,
+        tolerance: int = 10,
+        settle: float = 1.0,
+    ) -> None:
+        self.name = name
+        self._clock, self._url, self._axis_name, self._trigger_line = clock, url, axis, trigger_line
+        self._reference, self._active_high = reference, active_high
+        self._tolerance, self._settle = tolerance, settle
+        if pulse_width is not None:
+            raise DeviceRefused(
+                name,
+                f"its firmware fixes the width of trigger pulses, so {pulse_width:g} s cannot be set",
+                expected="no pulse_width",
+                advice="Leave it out; make pulses longer by a pulse stretcher, or let the camera trigger on edges",
+                state="Nothing was sent",
+            )
+        try:
+            self._first_pulse = FirstPulse(first_pulse)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse, firmware_pulse)
+            self._travel = Travel(name, limits)
+        except ValueError as problem:
+            raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
+        self._per_radian = Fraction(counts_per_turn) / Fraction(2 * math.pi)
+        self._target: int | None = None
+        self._homing = False
+        self._stops = Stops(name, self._send_stop)
+        self._stops_before = 0
+        self._train: TriggerTrain | None = None
+        self._line = GcsLine(
+            url, axis=axis, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
+        )
+        self._axis = PiGcsAxis(
+            self._line, axis=axis, trigger_line=trigger_line, counts_per_turn=counts_per_turn, name=name
+        )
+        try:
+            self._identity = self._axis.open(Fraction(acceleration) * self._per_radian)
+            self._travel.refuse_narrower(*self._axis.own_limits(), advice="widen the travel range in the controller")
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def limits(self) -> StageLimits:
+        return self._travel.limits
+
+    def to_counts(self, angle: float) -> int:
+        return self._travel.to_counts(angle)
+
+    def to_angle(self, counts: int) -> float:
+        return self._travel.to_angle(counts)
+
+    def position(self) -> float:
+        return self.to_angle(self._axis.counts())
+
+    def status(self) -> StageStatus:
+        status = self._axis.status()
+        held = None if status.moving or not status.servo or self._away(status.counts) else self._target
+        return StageStatus(status.counts, status.moving, status.homed, self._fault(status), held)
+
+    def start_move(self, angle: float, speed: float) -> None:
+        target = self._travel.target(angle)
+        if not SLOWEST <= math.degrees(speed) <= math.degrees(self.limits.max_speed) * (1 + 1e-12):
+            raise DeviceRefused(
+                self.name,
+                f"a speed of {math.degrees(speed):g} deg/s is not possible",
+                expected=f"{SLOWEST:g} to {math.degrees(self.limits.max_speed):g} deg/s",
+                state="Nothing has moved",
+            )
+        with self._begin("the move"):
+            self._axis.standing("a move")
+            if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
+                self.disarm()
+            self._target, self._homing = None, False  # what is left of an earlier move is not this one's if it fails
+            self._axis.start(target, Fraction(speed) * self._per_radian)
+            self._target = target
+
+    def start_home(self) -> None:
+        """As `drivers.protocols.Motion` has it; soft limits do not hold on the way. A train that was armed is over."""
+        with self._begin("the reference move"):
+            self._axis.standing("a reference move")
+            self._train, self._target, self._homing = None, None, False
+            self._axis.search_reference(self._reference)
+            self._homing = True
+
+    def moving(self) -> bool:
+        return self._axis.searching() if self._homing else self._axis.moving()
+
+    def wait(self, timeout: float) -> float:
+        target, homing = self._target, self._homing
+        if self._until_standing(timeout):
+            aim = "" if target is None else self._travel.degrees(target)
+            raise self._travel.still_moving(timeout, self._axis.counts(), aim, self._axis.last_move)
+        if target is not None:
+            self._until_settled(target)
+        status = self._axis.status()
+        if homing and not status.homed:
+            error = self._stopped_short("the reference move stopped short", status, "the reference found")
+            self._homing = False
+            raise error
+        if homing:
+            self._homing = False
+        elif target is not None and (self._away(status.counts) or not status.servo):
+            wanted = f"{self._travel.degrees(target)}, {target} counts"
+            raise self._stopped_short(f"it stopped short of {self._travel.degrees(target)}", status, wanted)
+        return self.to_angle(status.counts)
+
+    def arm(self, train: TriggerTrain) -> None:
+        self._travel.refuse_train(train)
+        try:
+            window = window_of(train, self._first_pulse)
+        except ValueError as problem:
+            raise self._travel.cannot_emit(train, f": {problem}") from problem
+        self._axis.standing("arming")
+        self._travel.refuse_late_arming(train, self._axis.counts(), window.start)
+        self._train = None
+        self._axis.arm(window, self._active_high)
+        self._train = train
+
+    def disarm(self) -> None:
+        """In any state, also while it moves."""
+        self._axis.disarm()
+        self._train = None
+
+    def remaining_pulses(self) -> None:
+        """None: the controller does not count its pulses."""
+
+    def stop(self) -> None:
+        self._stops.came(hard=False)
+        command = self._axis.brake()
+        longest = longest_stop(self.limits)
+        if self._until_standing(longest):
+            raise self._travel.not_stopped(longest, self._axis.counts(), command)
+
+    def abort(self) -> None:
+        self._stops.came(hard=True)
+        self._axis.stop_all()
+
+    def describe(self) -> dict[str, str | int | float]:
+        return {
+            "model": "PI GCS 2.0",
+            "identity": self._identity,
+            "port": self._url,
+            "axis": self._axis_name,
+            "trigger_output": f"digital output {self._trigger_line}",
+            "trigger_polarity": "active high" if self._active_high else "active low",
+            "first_pulse": self._first_pulse.value,
+            "pulse_width_s": "fixed by the firmware",
+            **self._travel.described(),
+        }
+
+    def digital_output(self, number: int) -> GcsOutput:
+        """Another output of the controller, such as one that opens a shutter.
+
+        Raises:
+            DeviceRefused: it is the one of the trigger pulses.
+        """
+        if number == self._trigger_line:
+            raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
+        return GcsOutput(self._line, number, f"{self.name} output {number}")
+
+    def close(self) -> None:
+        self._line.close()
+
+    @contextmanager
+    def _begin(self, purpose: str) -> Iterator[None]:
+        """Around the commands that begin a move; a stop meanwhile wins."""
+        self._stops_before = self._stops.count
+        with self._stops.none_while(purpose):
+            yield
+
+    def _send_stop(self, hard: bool) -> None:
+        if hard:
+            self._axis.stop_all()
+        else:
+            self._axis.brake()
+
+    def _until_standing(self, timeout: float) -> bool:
+        """Whether it still moves when the time is over."""
+        return until_standing(self._clock, self.moving, bool, timeout)
+
+    def _until_settled(self, target: int) -> None:
+        """Let the servo bring it on target, where it is near it."""
+        deadline = self._clock.now() + self._settle
+        while self._clock.now() < deadline and not self._axis.on_target() and not self._away(self._axis.counts()):
+            self._clock.sleep(POLL)
+
+    def _away(self, counts: int) -> bool:
+        return self._target is not None and abs(counts - self._target) > self._tolerance
+
+    def _fault(self, status: AxisStatus) -> str:
+        """Why the last move ended early, or what stands, in words; "" for nothing."""
+        code, words = self._line.fault, []
+        early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
+        if code and code != STOPPED:
+            words.append(meaning(code))
+        elif early and (code == STOPPED or self._stops.count != self._stops_before):
+            words.append(meaning(STOPPED))
+        elif early:
+            words.append(self._axis.limit_switch() or "no reason given")
+        if not status.servo:
+            words.append("the servo is off")
+        return ", ".join(words)
+
+    def _stopped_short(self, problem: str, status: AxisStatus, expected: str) -> DeviceError:
+        code, why = self._line.fault, self._fault(status) or "no reason given"
+        return DeviceError(
+            self.name,
+            f"{problem} ({why})",
+            request=self._axis.last_move,
+            reply=status.raw,
+            expected=expected,
+            advice=advice(code) if code in EVENTS else "Find what stopped it (limit switch, person) before moving on",
+            state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts"
+            + ("" if status.homed else ", which are not those of the reference"),
+        )

@@ -1,0 +1,222 @@
+"""One motor channel of a Tsuji PM16C-04XD(L) in the controller's own units: pulses, pulses/s, codes, and its replies.
+
+Protocol: the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Set commands have no reply,
+so each one that matters is read back.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.stages.pm16c.line import PM16CLine
+from drivers.stages.pm16c.train import TriggerPoints
+
+COUNT = r"([+-]\d{7,10})"
+STATUS_SINCE = (1, 47)
+"""Firmware."""
+MAX_SPEED = 5_000_000
+"""pulses/s."""
+MAX_COUNT = 2_147_483_647
+"""Of positions, trigger points and limits, either way."""
+ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
+STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
+
+
+@dataclass(frozen=True)
+class ChannelStatus:
+    """What STSx? says. `ending` is why the last move ended early, in words; "" where it did not."""
+
+    remote: bool
+    moving: bool
+    ending: str
+    counts: int
+    raw: str
+
+    @property
+    def stopped(self) -> bool:
+        """Somebody stopped it."""
+        return bool(STOPS & set(self.ending.split(", ")))
+
+
+class PM16CChannel:
+    """Talks to the controller about one channel; it is put on position controller A, whose trigger output is TP0.
+
+    Raises (here and in all methods):
+        DeviceError: a reply or a read-back is not what it must be. DeviceTimeout: no reply.
+        DeviceRefused: the controller is in LOCAL, or its motors move.
+    """
+
+    def __init__(
+        self, url: str, *, channel: int, name: str, clock: Clock, timeout: float, baudrate: int, transcript: Path | None
+    ) -> None:
+        self._name, self._digit = name, f"{channel:X}"
+        self.last_move = ""
+        """The command of the last move or search, for errors."""
+        self._restore_local = False
+        self._line = PM16CLine(url, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript)
+
+    def open(self, rate_code: int) -> str:
+        """Go to REMOTE, take position controller A without a train, set the acceleration; the firmware's version."""
+        c = self._digit
+        self._line.send("")  # an empty line ends what another program may have left half said
+        version = self._line.ask("VER?", r".*PM16C-04X.*", "the version of a PM16C-04XD(L)")[0]
+        self._refuse_old(version)
+        if not self.status().remote:
+            self._line.send("REM")
+            self._restore_local = True
+            self._line.until(self.status, lambda status: status.remote)
+        self.standing("opening")
+        self._line.send("ERRC")
+        if not self._channels().startswith(c):
+            self._line.send(command := f"SETCH{c}---")
+            channels = self._line.until(self._channels, lambda channels: channels.startswith(c))
+            if not channels.startswith(c):
+                raise self._line.not_followed(command, channels, f"channel {c} on position controller A")
+        self._line.make_ready(f"TMGC{c}", f"TMGR?{c}", "NO")  # of whoever was here before and died
+        self._line.set(f"RTE{c}{rate_code:03d}", f"RTE?{c}", rate_code)
+        return version
+
+    def own_limits(self) -> tuple[int, int] | None:
+        """The controller's own soft limits (backward, forward) in counts; None where they are switched off, which the
+        first of the switch bits says [from memory]."""
+        c = self._digit
+        if self._line.ask(f"SETLS?{c}", r"[01]{8}", "eight limit-switch bits")[0][0] == "0":
+            return None
+        backward, forward = (self._line.ask(f"{side}L?{c}", COUNT, "a signed position")[1] for side in "BF")
+        return int(backward), int(forward)
+
+    def counts(self) -> int:
+        return int(self._line.ask(f"PS?{self._digit}", COUNT, "a signed position in pulses")[1])
+
+    def status(self) -> ChannelStatus:
+        form = rf"([RL]){self._digit}([PNS])(?:[0-9A-F]([0-9A-F]{{2}})|---){COUNT}"
+        match = self._line.ask(f"STS{self._digit}?", form, "remote flag, channel, motion, status bits and position")
+        bits = int(match[3] or "0", 16)
+        ending = ", ".join(text for bit, text in ENDINGS.items() if bits & bit)
+        return ChannelStatus(match[1] == "R", match[2] != "S" or bool(bits & 1), ending, int(match[4]), match[0])
+
+    def standing(self, purpose: str) -> ChannelStatus:
+        """The status; refuses `purpose` while the motor moves or the panel is in LOCAL."""
+        status = self.status()
+        if status.moving:
+            raise DeviceRefused(
+                self._name,
+                f"{purpose} is not possible while it moves",
+                reply=status.raw,
+                advice="Wait for the move to end, or stop it",
+                state=f"The move under way goes on; it is at {status.counts} counts",
+            )
+        if not status.remote:
+            raise DeviceRefused(
+                self._name,
+                f"{purpose} is not possible: the controller is in LOCAL",
+                reply=status.raw,
+                advice="Wait until all its motors stand and set REMOTE on the panel",
+                state="Nothing has moved",
+            )
+        return status
+
+    def start(self, target: int, speed: int) -> None:
+        """Begin a move to `target` counts at `speed` pulses/s."""
+        self.standing("a move")
+        self._take_speed(speed)
+        self._begin(f"ABS{self._digit}{target:+d}", target)
+
+    def find_home(self, speed: int) -> None:
+        """Begin the search for the home switch at `speed` pulses/s; it leaves the trigger output cleared."""
+        self.standing("a home search")
+        self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
+        self._take_speed(speed)
+        self._begin(f"FDHP{self._digit}", None)
+
+    def go_home(self, home: int) -> None:
+        """Begin the move to the home that the search found, at the speed of the search."""
+        self._begin(f"GTHP{self._digit}", home)
+
+    def home(self) -> int | None:
+        """Where the home switch was found, in counts; None where no search has found it."""
+        reply = self._line.ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
+        return None if reply[1] is None else int(reply[1])
+
+    def preset(self, counts: int) -> None:
+        """Call the place where it stands `counts`."""
+        self.standing("a preset")
+        self._line.set(f"PS{self._digit}{counts:+d}", f"PS?{self._digit}", counts)
+
+    def arm(self, mode: int, points: TriggerPoints) -> None:
+        """Set up the trigger output and make it ready."""
+        c = self._digit
+        self._line.make_ready(f"TMGC{c}", f"TMGR?{c}", "NO")
+        self._line.set(f"TMGM{c}{mode}", f"TMGM?{c}", mode)
+        self._line.set(f"TMGS{c}{points.start:+d}", f"TMGS?{c}", points.start)
+        self._line.set(f"TMGE{c}{points.end:+d}", f"TMGE?{c}", points.end)
+        self._line.set(f"TMGI{c}{points.interval}", f"TMGI?{c}", points.interval)
+        self._line.make_ready(f"TMGR{c}", f"TMGR?{c}", "YES")
+
+    def disarm(self) -> None:
+        self.standing("disarming")
+        self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
+
+    def slow_stop(self) -> str:
+        """Send the stop command; what was sent. It waits for nothing."""
+        self._line.send(command := f"SSTP{self._digit}")
+        return command
+
+    def emergency_stop(self) -> str:
+        """As `slow_stop`, without deceleration."""
+        self._line.send(command := f"ESTP{self._digit}")
+        return command
+
+    def close(self) -> None:
+        """Give the panel back if it was in LOCAL, and free the port even where the line is dead."""
+        try:
+            if self._restore_local:
+                self._line.send("LOC")
+        finally:
+            self._line.close()
+
+    def _channels(self) -> str:
+        """On position controllers A to D."""
+        return self._line.ask("SETCH?", r"[0-9A-F]{4}", "four channels")[0]
+
+    def _refuse_old(self, version: str) -> None:
+        number = re.match(r"(\d+)\.(\d+) ", version)
+        if number is not None and (int(number[1]), int(number[2])) < STATUS_SINCE:
+            raise DeviceRefused(
+                self._name,
+                f"its firmware {number[1]}.{number[2]} does not tell the status of one channel (STSx?)",
+                request="VER?",
+                reply=version,
+                expected="{}.{} or later".format(*STATUS_SINCE),
+                advice="Have the firmware updated by the vendor",
+                state="Nothing has moved",
+            )
+
+    def _take_speed(self, speed: int) -> None:
+        c = self._digit
+        self._line.set(f"SPDH{c}{speed}", f"SPDH?{c}", speed)
+        self._line.make_sure(f"SPDH{c}", f"SPD?{c}", "[HML]SPD", "HSPD", str)
+
+    def _begin(self, command: str, target: int | None) -> None:
+        """Send a command that moves and see that it does, or that it is at its target (None: no target) already."""
+        self._line.commanded, self.last_move = True, command
+        self._line.send(command)
+
+        def begun(status: ChannelStatus) -> bool:
+            return status.moving or status.counts == (self.home() if target is None else target)
+
+        status = self._line.until(self.status, begun)
+        if not begun(status):
+            raise DeviceError(
+                self._name,
+                f"the move did not start ({status.ending or self._line.complaint()})",
+                request=command,
+                reply=status.raw,
+                expected="a moving motor",
+                advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
+                state=f"The stage stands at {status.counts} counts",
+            )

@@ -1,0 +1,100 @@
+"""The PM16C's dialogue: queries are answered, settings are not, so each setting that matters is read back.
+
+A controller that writes its memory takes its time: KEK's driver waits 40 ms after settings. So a read-back that is not
+as set is repeated for a while, and the setting then sent once more, before it is taken for refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError
+from drivers.serial.line import Probe, SerialLine
+
+PROBE = Probe("STQ?", r"[RL][0-4]")
+STOPPED_NOTE = r"STOP[0-9A-F]"
+MEMORY = 0.12
+"""s in which a setting has taken effect."""
+LOOK = 0.02
+"""s between looks whether it has."""
+T = TypeVar("T")
+
+
+class PM16CLine:
+    """Raises (in all methods):
+    DeviceError: a reply or a read-back is not what it must be. DeviceTimeout: no reply.
+    """
+
+    def __init__(
+        self, url: str, *, name: str, clock: Clock, timeout: float, baudrate: int, transcript: Path | None
+    ) -> None:
+        self.commanded = False
+        """A move was begun: what is said of a failure depends on it."""
+        self._name, self._clock = name, clock
+        self._serial = SerialLine(
+            url,
+            device=name,
+            probe=PROBE,
+            clock=clock,
+            timeout=timeout,
+            baudrate=baudrate,
+            unsolicited=STOPPED_NOTE,
+            transcript=transcript,
+        )
+
+    def send(self, command: str) -> None:
+        """It waits for nothing."""
+        self._serial.send(command)
+
+    def ask(self, request: str, form: str, meaning: str) -> re.Match[str]:
+        state = "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
+        return self._serial.query(request, form, meaning, state)
+
+    def set(self, command: str, query: str, value: int) -> None:
+        """Send a setting that is a number and read it back."""
+        self.make_sure(command, query, r"[+-]?\d+", value, int)
+
+    def make_ready(self, command: str, query: str, wanted: str) -> None:
+        """Arm or disarm the trigger output and see that it is so."""
+        self.make_sure(command, query, "YES|NO", wanted, str)
+
+    def make_sure(self, command: str, query: str, form: str, wanted: T, read: Callable[[str], T]) -> None:
+        """Send a setting, whose reply to `query` has `form` and is then read as `wanted`."""
+        for _ in range(2):
+            self.send(command)
+            found = self.until(lambda: read(self.ask(query, form, f"{wanted}, as just set")[0]), wanted.__eq__)
+            if found == wanted:
+                return
+        raise self.not_followed(command, str(found), str(wanted))
+
+    def until(self, look: Callable[[], T], good: Callable[[T], bool]) -> T:
+        """The first look that is good, or the last one while a setting may still take effect."""
+        deadline = self._clock.now() + MEMORY
+        while not good(seen := look()) and self._clock.now() < deadline:
+            self._clock.sleep(LOOK)
+        return seen
+
+    def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
+        """The error for a read-back that is not what was set."""
+        return DeviceError(
+            self._name,
+            f"a setting was not taken ({self.complaint()})",
+            request=command,
+            reply=reply,
+            expected=wanted,
+            advice="Check that no other program or person drives this controller",
+            state="Nothing has moved",
+        )
+
+    def complaint(self) -> str:
+        """The controller's own error text, then cleared."""
+        text = self.ask("ERR?", r".*", "an error text")[0]
+        self.send("ERRC")
+        return f"the controller says {text}"
+
+    def close(self) -> None:
+        self._serial.close()

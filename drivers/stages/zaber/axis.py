@@ -1,0 +1,228 @@
+"""One axis of a Zaber device in the device's own units: microsteps, native speeds, settings, flags, and its replies.
+
+Every command but a stop has its own message id and waits for its reply, which says whether it was taken.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.clock import Clock
+from drivers.errors import DeviceRefused
+from drivers.serial.line import Probe, SerialLine
+from drivers.stages.zaber.packet import (
+    REASONS,
+    UNREFERENCED,
+    Reply,
+    damage,
+    encode,
+    passed_over_form,
+    reply_form,
+    reply_of,
+)
+
+PROBE_ID, STOP_ID, IDS = 98, 99, 98
+"""Ordinary commands count their ids from 0 to 97."""
+REPEATS = 3
+"""Times that a command is sent again where the device says AGAIN."""
+PAUSE = 0.05
+"""s before that."""
+TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
+"""A number with more digits is no position that an axis can have, and none that a float holds."""
+KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
+"""Settings of the axis that survive a power cycle: as they were found they are left."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What the device says of itself."""
+
+    number: str
+    serial: str
+    firmware: str
+
+    @property
+    def has_triggers(self) -> bool:
+        """They came with firmware 7.06."""
+        return tuple(int(part) for part in self.firmware.split(".")[:2]) >= (7, 6)
+
+
+@dataclass(frozen=True)
+class AxisStatus:
+    """Position in microsteps, motion, and every warning flag, the gravest first."""
+
+    counts: int
+    moving: bool
+    flags: tuple[str, ...]
+    raw: str
+
+    @property
+    def referenced(self) -> bool:
+        return UNREFERENCED.isdisjoint(self.flags)
+
+    @property
+    def faulty(self) -> bool:
+        """A fault stands, whatever the last move did."""
+        return any(flag.startswith("F") for flag in self.flags)
+
+
+class ZaberAxis:
+    """Talks to one axis of one device, and to the device itself.
+
+    Raises (here and in all methods):
+        DeviceRefused: the device rejects a command. DeviceError: a reply is not what it must be or is damaged.
+        DeviceTimeout: no reply.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        device: int,
+        axis: int,
+        name: str,
+        clock: Clock,
+        timeout: float,
+        baudrate: int,
+        transcript: Path | None,
+    ) -> None:
+        self.number = axis
+        self._name, self._device, self._axis, self._clock = name, device, axis, clock
+        self._ids = itertools.cycle(range(IDS))
+        self._must_have_checksum = False
+        self._commanded = False
+        self.last_move = ""
+        """The command of the last move or search, for errors."""
+        self._found: dict[str, str] = {}
+        self._checksums_found = "1"
+        self._line = SerialLine(
+            url,
+            device=name,
+            probe=Probe(encode(device, 0, PROBE_ID, ""), reply_form(device, 0, PROBE_ID, TEXT)),
+            clock=clock,
+            timeout=timeout,
+            baudrate=baudrate,
+            unsolicited=passed_over_form(STOP_ID),
+            check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
+            transcript=transcript,
+        )
+
+    def open(self) -> Identity:
+        """Demand checksums, ask who is there, remember the settings that will change."""
+        self._line.send("")  # an empty line ends what half a command may be waiting in the device
+        if (found := self._get_if_known("comm.checksum")) is not None:
+            self._checksums_found = found
+            self.ask("set comm.checksum 1")
+            self._must_have_checksum = True
+        number = self._get_if_known("device.id") or self.ask("get deviceid", WHOLE).data
+        identity = Identity(number, self.ask("get system.serial", WHOLE).data, self.ask("get version", NUMBER).data)
+        self.standing("opening")
+        self._found = {setting: self.get(setting) for setting in KEPT}
+        return identity
+
+    def cycle(self) -> str | None:
+        """Microsteps of a full turn as the device has them; None where it has no such setting."""
+        return self._get_if_known("limit.cycle.dist", axis=True)
+
+    def travel(self) -> tuple[int, int]:
+        """The device's own limits in microsteps."""
+        low, high = (int(self.get(f"limit.{end}", WHOLE)) for end in ("min", "max"))
+        return low, high
+
+    def get(self, setting: str, form: str = NUMBER) -> str:
+        """A setting of the axis."""
+        return self.ask_axis(f"get {setting}", form).data
+
+    def set(self, setting: str, value: str | int) -> None:
+        self.ask_axis(f"set {setting} {value}")
+
+    def status(self) -> AxisStatus:
+        reply = self.ask_axis("get pos", WHOLE)
+        flags = self._flags("warnings") if reply.flag else ()
+        return AxisStatus(int(reply.data), reply.busy, flags, reply.raw)
+
+    def forget_flags(self) -> None:
+        """Clear the flags that only remember."""
+        self.ask_axis("warnings clear", TEXT)
+
+    def standing(self, purpose: str) -> AxisStatus:
+        """The status; refuses `purpose` while the axis moves."""
+        status = self.status()
+        if status.moving:
+            raise DeviceRefused(
+                self._name,
+                f"{purpose} is not possible while it moves",
+                reply=status.raw,
+                advice="Wait for the move to end, or stop it",
+                state=f"The move under way goes on; it is at {status.counts} counts",
+            )
+        return status
+
+    def move(self, target: int) -> None:
+        self._begin(f"move abs {target}")
+
+    def home(self) -> None:
+        self._begin("home")
+
+    def stop(self, words: str) -> str:
+        """Send `stop` or `estop`; what was sent. It waits for nothing: the reply is passed over when it comes."""
+        self._line.send(packet := encode(self._device, self._axis, STOP_ID, words))
+        return packet
+
+    def ask(self, words: str, form: str = TEXT) -> Reply:
+        """Ask the device itself."""
+        return self._ask(0, words, form)
+
+    def ask_axis(self, words: str, form: str = TEXT) -> Reply:
+        return self._ask(self._axis, words, form)
+
+    def close(self) -> None:
+        """Leave the settings as they were found, and free the port even where the line is dead."""
+        try:
+            for setting, value in self._found.items():
+                self.set(setting, value)
+            if self._checksums_found != "1":
+                self._must_have_checksum = False
+                self.ask(f"set comm.checksum {self._checksums_found}")
+        finally:
+            self._line.close()
+
+    def _begin(self, words: str) -> None:
+        self._commanded, self.last_move = True, words
+        self.ask_axis(words)
+
+    def _flags(self, words: str) -> tuple[str, ...]:
+        return tuple(self.ask_axis(words, r"\d+(?: \w\w)*").data.split()[1:])
+
+    def _get_if_known(self, setting: str, *, axis: bool = False) -> str | None:
+        with contextlib.suppress(DeviceRefused):
+            return self._ask(self._axis if axis else 0, f"get {setting}", NUMBER).data
+        return None
+
+    def _ask(self, axis: int, words: str, form: str) -> Reply:
+        for _ in range(REPEATS):
+            reply = self._exchange(axis, words, form)
+            if reply.accepted or reply.data != "AGAIN":
+                break
+            self._clock.sleep(PAUSE)
+        if not reply.accepted:
+            raise DeviceRefused(
+                self._name,
+                f"it rejects this: {REASONS.get(reply.data, 'a reason that this driver does not know')} ({reply.data})",
+                request=words,
+                reply=reply.raw,
+                advice="Check the configuration against the device, and that no other program drives it",
+                state="The move under way goes on" if reply.busy else "Nothing has moved by it",
+            )
+        return reply
+
+    def _exchange(self, axis: int, words: str, form: str) -> Reply:
+        state = "A move was started before; the stage may be turning" if self._commanded else "Nothing has moved"
+        identity = next(self._ids)
+        request, meaning = encode(self._device, axis, identity, words), f"the reply to message {identity:02d}"
+        match: re.Match[str] = self._line.query(request, reply_form(self._device, axis, identity, form), meaning, state)
+        return reply_of(match)

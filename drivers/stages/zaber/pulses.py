@@ -1,0 +1,102 @@
+"""The digital outputs of a Zaber device: one gives pulse trains by two triggers, others are switched by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.errors import DeviceRefused
+from drivers.protocols import TriggerTrain
+from drivers.stages.zaber.axis import ZaberAxis
+from drivers.stages.zaber.train import PulseSettings, begun, remaining, set_up
+
+ADVICE = (
+    "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
+    "room for one step before the first pulse"
+)
+
+
+class ZaberPulses:
+    """Sets up, takes away and counts pulse trains.
+
+    Raises (in all methods):
+        DeviceRefused, DeviceError, DeviceTimeout: as `ZaberAxis`.
+    """
+
+    def __init__(self, axis: ZaberAxis, settings: PulseSettings, name: str) -> None:
+        self.settings = settings
+        self._axis, self._name = axis, name
+        self._train: TriggerTrain | None = None
+        self._touched = True
+
+    def arm(self, train: TriggerTrain, counts: int, stand_at: Callable[[int], None]) -> None:
+        """Set up the triggers for a train and enable the first one.
+
+        Args:
+            counts: where the stage stands.
+            stand_at: brings it to another place.
+        """
+        setup = set_up(self.settings, train, self._axis.number, counts)
+        self._train, self._touched = None, True
+        try:
+            for command in setup.commands:
+                self._axis.ask(command)
+            if setup.stand not in (None, counts):
+                stand_at(setup.stand)
+            self._axis.ask(setup.enable)
+        except DeviceRefused as problem:
+            raise DeviceRefused(
+                self._name,
+                f"the triggers cannot be set up: {problem.problem}",
+                request=problem.request,
+                reply=problem.reply,
+                advice=ADVICE,
+                state="This train is not armed",
+            ) from problem
+        self._train = train
+
+    def disarm(self) -> None:
+        """Disable the triggers and put the output at rest, where that was not done yet."""
+        if self._touched:
+            for command in (*self.settings.disable, self.settings.rest):
+                self._axis.ask(command)
+            self._train, self._touched = None, False
+
+    def remaining(self) -> int:
+        """Pulses still to come."""
+        if self._train is None:
+            return 0
+        return remaining(self.settings, self._train, self._shown())
+
+    def before_move(self, counts: int, target: int) -> None:
+        """Keep a train right when a move from `counts` goes against it: distance counts both ways. One that is under
+        way ends; one whose first pulse is still to come is set up anew, or ends where that takes standing elsewhere."""
+        train = self._train
+        if train is None or train.interval * (target - counts) >= 0 or not begun(self.settings, self._shown()):
+            return
+        if self.settings.chained and self.remaining() == train.n:
+            self.arm(train, counts, _nowhere)
+        else:
+            self.disarm()
+
+    def _shown(self) -> str:
+        """What `trigger show` tells, for this many triggers at least."""
+        needed = max(self.settings.starter, self.settings.repeater)
+        return self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").data
+
+
+def _nowhere(counts: int) -> None:
+    """A chained train is set up wherever the stage stands."""
+
+
+class ZaberOutput:
+    """A digital output of a device whose stage is open. Implements `drivers.shutter.DigitalOutput`."""
+
+    def __init__(self, axis: ZaberAxis, number: int, name: str) -> None:
+        self.name = name
+        self._axis, self._number = axis, number
+
+    def set(self, high: bool) -> None:
+        self._axis.ask(f"io set do {self._number} {int(high)}")
+
+    def get(self) -> bool:
+        return self._axis.ask(f"io get do {self._number}", "[01]").data == "1"

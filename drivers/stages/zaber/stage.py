@@ -1,0 +1,298 @@
+"""Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
+
+Positions are commanded microsteps unless `measured`. What is known of the firmware from memory only is a setting:
+`speed_unit` here, the rest in `drivers.stages.zaber.train.PulseSettings`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.stages.standing import longest_stop, until_standing
+from drivers.stages.stops import Stops
+from drivers.stages.travel import Travel
+from drivers.stages.zaber.axis import AxisStatus, ZaberAxis
+from drivers.stages.zaber.limits import SPEED_UNIT, limits_of, native_limits
+from drivers.stages.zaber.packet import meaning_of
+from drivers.stages.zaber.pulses import ZaberOutput, ZaberPulses
+from drivers.stages.zaber.train import PulseSettings, pulses_of
+
+STANDING_IN_PLACE = 10.0
+"""s beyond twice the time of a short move after which it has failed."""
+
+
+class ZaberStage:
+    """Implements `drivers.protocols.RotationStage`. Closing it leaves a move under way to end by itself, takes an armed
+    train away and leaves speed, acceleration and checksums as they were found.
+
+    `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
+    move against a train under way ends the train: the controller counts distance both ways. With `pulses.chained` false
+    `arm` itself turns the stage to one step before the first pulse and waits; it then speeds up over the first pulses.
+
+    Args:
+        url: what pyserial opens; a controller's LAN port is "socket://host:55550".
+        device, axis: address in the chain, axis of the device.
+        output: digital output of the pulses, from 1.
+        counts_per_turn: microsteps for 2π; must be the device's own limit.cycle.dist.
+        timeout: s for a reply.
+        max_speed, acceleration: rad/s, rad/s²; the acceleration becomes one that the controller has, see `limits`.
+        low, high: soft limits in radians.
+        pulse_width: s, whole milliseconds; None is 1 ms, or half an interval where `toggle`.
+        active_high: the output rests low.
+        toggle: fires toggle the output (for firmware without `schedule`); intervals must then be even.
+        speed_unit: see `SPEED_UNIT` [memory: the vendor's long-standing convention].
+        pulses: what else of the triggers can be chosen; output, width and polarity are those given here.
+        transcript: file to which every byte on the wire is appended; None keeps none.
+
+    Raises:
+        DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        device: int = 1,
+        axis: int = 1,
+        output: int = 1,
+        counts_per_turn: int,
+        clock: Clock,
+        timeout: float = 1.0,
+        max_speed: float,
+        acceleration: float,
+        low: float,
+        high: float,
+        name: str = "stage",
+        baudrate: int = 115_200,
+        pulse_width: float | None = None,
+        active_high: bool = True,
+        toggle: bool = False,
+        speed_unit: float = SPEED_UNIT,
+        pulses: PulseSettings | None = None,
+        transcript: Path | None = None,
+    ) -> None:
+        self.name = name
+        self._clock, self._url, self._where = clock, url, (device, axis)
+        self._speed_unit = speed_unit
+        try:
+            if not (1 <= device <= 99 and 1 <= axis <= 9):
+                raise ValueError(f"device {device}, axis {axis} do not exist; they are 1 to 99 and 1 to 9")
+            rest = pulses or PulseSettings()
+            chosen = pulses_of(rest, output=output, width=pulse_width, active_high=active_high, toggle=toggle)
+            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, chosen, speed_unit)
+            self._fastest, steepest = native_limits(counts_per_turn, max_speed, acceleration, speed_unit)
+        except ValueError as problem:
+            raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
+        self._travel = Travel(name, limits)
+        self._target: int | None = None
+        self._homing = False
+        self._closed = False
+        self._stops = Stops(name, self._send_stop)
+        self._axis = ZaberAxis(
+            url,
+            device=device,
+            axis=axis,
+            name=name,
+            clock=clock,
+            timeout=timeout,
+            baudrate=baudrate,
+            transcript=transcript,
+        )
+        self._pulses = ZaberPulses(self._axis, chosen, name)
+        try:
+            self._identity = self._axis.open()
+            self._check_turn_and_travel()
+            self._axis.set("accel", steepest)
+            if self._identity.has_triggers:
+                self._pulses.disarm()  # of whoever was here before and died
+        except BaseException:
+            self.close()
+            raise
+        self._travel = Travel(name, replace(limits, trigger_output=self._identity.has_triggers))
+
+    @property
+    def limits(self) -> StageLimits:
+        return self._travel.limits
+
+    def to_counts(self, angle: float) -> int:
+        return self._travel.to_counts(angle)
+
+    def to_angle(self, counts: int) -> float:
+        return self._travel.to_angle(counts)
+
+    def position(self) -> float:
+        return self.to_angle(self._axis.status().counts)
+
+    def status(self) -> StageStatus:
+        status = self._axis.status()
+        fault = meaning_of(status.flags)
+        return StageStatus(status.counts, status.moving, status.referenced, "" if fault is None else fault.text)
+
+    def start_move(self, angle: float, speed: float) -> None:
+        self._start_move(angle, speed, self._stops.count)
+
+    def _start_move(self, angle: float, speed: float, stops: int) -> None:
+        """`stops`: their number before; one that comes from then on wins."""
+        target = self._travel.target(angle)
+        per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._speed_unit
+        native = round(speed * per_radian) if 0 < speed < 2 * self.limits.max_speed else 0
+        if not 1 <= native <= self._fastest:
+            raise DeviceRefused(
+                self.name,
+                f"a speed of {math.degrees(speed):g} deg/s is not possible",
+                expected=f"native 1 to {self._fastest}, at most {math.degrees(self.limits.max_speed):g} deg/s",
+                state="Nothing has moved",
+            )
+        with self._stops.none_while("the move", stops):
+            status = self._axis.standing("a move")
+            if not status.referenced:
+                raise DeviceRefused(
+                    self.name,
+                    "a move is not possible: its position is not referenced",
+                    reply=status.raw,
+                    advice="Search the reference (home) first",
+                    state="Nothing has moved",
+                )
+            self._pulses.before_move(status.counts, target)
+            if status.flags:
+                self._axis.forget_flags()
+            self._axis.set("maxspeed", native)
+            self._axis.move(target)
+        self._target, self._homing = target, False
+
+    def start_home(self) -> None:
+        """Begin the search at the speed and acceleration that the controller has for it."""
+        with self._stops.none_while("the search for the reference"):
+            status = self._axis.standing("a search for the reference")
+            self.disarm()
+            if status.flags:
+                self._axis.forget_flags()
+            self._axis.home()
+        self._target, self._homing = None, True
+
+    def moving(self) -> bool:
+        return self._axis.status().moving
+
+    def wait(self, timeout: float) -> float:
+        status = self._until_standing(timeout)
+        aim = "its reference" if self._homing else "" if self._target is None else self._travel.degrees(self._target)
+        if status.moving:
+            raise self._travel.still_moving(timeout, status.counts, aim, self._axis.last_move, status.raw)
+        fault = meaning_of(status.flags)
+        if self._homing:
+            arrived = status.referenced and "NI" not in status.flags
+        else:
+            arrived = self._target is None or status.counts == self._target
+        if not arrived or (aim and status.faulty):
+            raise DeviceError(
+                self.name,
+                f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
+                request=self._axis.last_move,
+                reply=status.raw,
+                expected=f"to stand at {aim} without a fault",
+                advice="Find what stopped it before moving on" if fault is None else fault.advice,
+                state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts: "
+                + ("no reason given" if fault is None else fault.text),
+            )
+        self._homing = False
+        return self.to_angle(status.counts)
+
+    def arm(self, train: TriggerTrain) -> None:
+        self._travel.refuse_train(train)
+        if not self.limits.trigger_output:
+            raise DeviceRefused(
+                self.name,
+                f"its firmware {self._identity.firmware} has no triggers",
+                expected="7.06 or later",
+                advice="Update the firmware with the vendor's software",
+                state="Nothing has moved and this train is not armed",
+            )
+        stops, counts = self._stops.count, self._axis.standing("arming").counts
+        self._travel.refuse_late_arming(train, counts)
+        self._pulses.arm(train, counts, lambda there: self._stand_at(there, stops))
+
+    def disarm(self) -> None:
+        """Legal in every state. The output is put at rest."""
+        self._pulses.disarm()
+
+    def remaining_pulses(self) -> int:
+        """By the fires that the controller's triggers still count."""
+        return self._pulses.remaining()
+
+    def stop(self) -> None:
+        self._stops.came(hard=False)
+        packet = self._send_stop(hard=False)
+        longest = longest_stop(self.limits)
+        status = self._until_standing(longest)
+        if status.moving:
+            raise self._travel.not_stopped(longest, status.counts, packet, status.raw)
+
+    def abort(self) -> None:
+        self._stops.came(hard=True)
+        self._send_stop(hard=True)
+
+    def describe(self) -> dict[str, str | int | float]:
+        pulses, (device, axis) = self._pulses.settings, self._where
+        return {
+            "model": f"Zaber device {self._identity.number}",
+            "serial": self._identity.serial,
+            "firmware": self._identity.firmware,
+            "port": self._url,
+            "device": device,
+            "axis": axis,
+            "trigger_output": f"digital output {pulses.output}",
+            "trigger_position": "encoder" if pulses.measured else "commanded",
+            "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
+            "pulse_active_high": int(pulses.active_high),
+            **self._travel.described(),
+        }
+
+    def digital_output(self, number: int) -> ZaberOutput:
+        """Another output of the device, such as one that opens a shutter.
+
+        Raises:
+            DeviceRefused: it is the one of the trigger pulses.
+        """
+        if number == self._pulses.settings.output:
+            raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
+        return ZaberOutput(self._axis, number, f"{self.name} output {number}")
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with contextlib.suppress(DeviceError):  # closing a dead line is no news to whoever closes
+                self.disarm()
+            with contextlib.suppress(DeviceError):
+                self._axis.close()
+
+    def _send_stop(self, hard: bool) -> str:
+        """What was sent."""
+        return self._axis.stop("estop" if hard else "stop")
+
+    def _stand_at(self, counts: int, stops: int) -> None:
+        """Turn there and wait, unless there are more stops by now."""
+        way = abs(self.to_angle(counts - self._axis.standing("arming").counts))
+        self._start_move(self.to_angle(counts), self.limits.max_speed, stops)
+        self.wait(2 * way / self.limits.max_speed + STANDING_IN_PLACE)
+
+    def _check_turn_and_travel(self) -> None:
+        own = self._axis.cycle()
+        if own is None or float(own) != self.limits.counts_per_turn:
+            raise DeviceRefused(
+                self.name,
+                "it has no limit.cycle.dist, so it does not rotate" if own is None else f"a turn has {own} microsteps",
+                expected=f"{self.limits.counts_per_turn} a turn, as configured",
+                advice="Correct counts_per_turn, or check device and axis",
+                state="Nothing has moved",
+            )
+        self._travel.refuse_narrower(*self._axis.travel(), advice="widen the controller's limits")
+
+    def _until_standing(self, timeout: float) -> AxisStatus:
+        """The status once the stage stands, or when the time is over."""
+        return until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)

@@ -1,0 +1,124 @@
+"""Grid and Volume: a box of voxels in the sample's frame, and the attenuation in it."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+
+_COARSEST = 4.0  # pixels: voxels of a fit's box, however coarse the volume that is wanted
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A box of voxels; voxel [k, j, i] has its centre at centre + ((i, j, k) - (n - 1) / 2) * edge.
+
+    Attributes:
+        shape: (nz, ny, nx) in voxels; z runs along the rotation axis.
+        voxel_size: edge in mm along x and y, and along z where no other is given.
+        centre: (z, y, x) of the box's centre in mm; the rotation axis is x = y = 0.
+        slice_pitch: edge in mm along z; None: voxels are cubes.
+    """
+
+    shape: tuple[int, int, int]
+    voxel_size: float = 1.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slice_pitch: float | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or min(self.shape) < 1:
+            raise ValueError(f"grid shape must be (nz, ny, nx) >= 1, got {self.shape}")
+        for name, edge in (("voxel_size", self.voxel_size), ("slice_pitch", self.spacing[0])):
+            if not (np.isfinite(edge) and edge > 0):
+                raise ValueError(f"{name} must be a positive length in mm, got {edge}")
+        if len(self.centre) != 3 or not np.isfinite(self.centre).all():
+            raise ValueError(f"centre must be three finite lengths (z, y, x) in mm, got {self.centre}")
+        # A shape from a list or an array is the same box.
+        object.__setattr__(self, "shape", tuple(operator.index(n) for n in self.shape))
+        object.__setattr__(self, "centre", tuple(float(c) for c in self.centre))
+
+    @classmethod
+    def matching(cls, geometry: Geometry) -> Grid:
+        """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis, at the height that views see.
+
+        Views that are shifted apart widen it to what at least half as many of them see as see any part: an alignment's
+        small shifts change nothing, views that jump up and down give all heights. However far off the detector's middle
+        the axis falls, it is no wider for that: all that such views see is in `of_field`.
+        """
+        across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
+        height = geometry.middle_height + middle * geometry.sample_pitch
+        return cls((down, across, across), geometry.sample_pitch, (height, 0.0, 0.0))
+
+    @classmethod
+    def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
+        """A box around the rotation axis that holds all that any view sees, wherever the axis falls in it.
+
+        It spans what shifted views see, and is as wide as needed for an axis off the detector; rolled and tilted views
+        count as straight ones. A cone's field is measured at the rotation axis, as its makers do: what lies nearer the
+        source is seen larger, and by few views only. The box of a wide cone ends before its source.
+        """
+        low, high = geometry.heights
+        across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
+        nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error is no voxel
+        if geometry.is_cone and nx * voxel_size >= math.sqrt(2) * geometry.sod:
+            nx = max(1, math.floor(across))  # the corners of the last voxel would reach the source
+        return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
+
+    @classmethod
+    def for_fit(cls, geometry: Geometry, wanted: Grid) -> Grid:
+        """The box that a fit covers whatever volume is wanted of it: the field, in voxels like those wanted.
+
+        They are no finer than a pixel, which the views do not resolve, and no coarser than four, from which no fit
+        could start.
+        """
+        pixel = geometry.sample_pitch
+        return cls.of_field(geometry, min(max(wanted.voxel_size, pixel), _COARSEST * pixel))
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """Voxel edges (z, y, x) in mm."""
+        return (self.voxel_size if self.slice_pitch is None else self.slice_pitch, self.voxel_size, self.voxel_size)
+
+    @property
+    def edges(self) -> NDArray[np.float64]:
+        """Lower and upper corner of the box, [2, 3] mm, each (x, y, z)."""
+        half = np.asarray(self.shape[::-1]) * np.asarray(self.spacing[::-1]) / 2
+        middle = np.asarray(self.centre[::-1])
+        return np.stack((middle - half, middle + half))
+
+    def coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Voxel centres along each axis: (z [nz], y [ny], x [nx]) in mm."""
+        return tuple(  # type: ignore[return-value]
+            c + (np.arange(n) - (n - 1) / 2) * edge
+            for n, c, edge in zip(self.shape, self.centre, self.spacing, strict=True)
+        )
+
+
+def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
+    """How many pixels the shifted views reach across along columns (0) or rows (1), and where their middle is, from
+    that of a view without a shift; without what fewer than half as many views see as see the best seen part."""
+    size = geometry.detector_shape[1 - axis]
+    first = -geometry.shifts[:, axis]
+    edges = np.unique(np.concatenate((first, first + size)))
+    within = (edges[:-1] + edges[1:]) / 2
+    seen = (first[:, None] <= within) & (within < first[:, None] + size)
+    enough = np.flatnonzero(2 * seen.sum(axis=0) >= seen.sum(axis=0).max())
+    low, high = float(edges[enough[0]]), float(edges[enough[-1] + 1])
+    return max(1, round(high - low)), (low + high - size) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Attenuation on a grid. `data` is float32 [z, y, x] in 1/mm (1/pixel where the pitch is 1)."""
+
+    data: NDArray[np.float32]
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        if self.data.shape != self.grid.shape:
+            raise ValueError(f"volume data has shape {self.data.shape}, its grid {self.grid.shape}")

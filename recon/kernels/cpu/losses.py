@@ -1,0 +1,291 @@
+"""Fused losses on the CPU: L1, D-SSIM and total variation with their gradients in a few passes (numba, threaded)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon.kernels.cpu import lanes
+from recon.kernels.cpu.activation import F32, OPTIONS
+
+_f = np.float32
+RADIUS = 5  # an 11 x 11 window
+MARGIN = 16  # zeros to the left and right of a line
+TASK_ROWS = 8
+_LARGEST = np.float32(1e38)
+L1, L2, POISSON = range(3)
+
+
+class DataTerm(NamedTuple):
+    """What a pixel x that should be y costs; δ makes the three alike in size where |x - y| is about δ.
+
+    L1: |x - y|.   L2: (x - y)² / 2δ.   POISSON: e^(-depth y) (x - y)² / 2δ, the second-order expansion of the
+    likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534). No
+    matter transmits more than all, so a y below 0 weighs as one of 0: a few such pixels would outweigh all others.
+    """
+
+    kind: int
+    delta: float
+    depth: float
+
+
+ABSOLUTE = DataTerm(L1, 1.0, 1.0)
+
+
+def gaussian_window(sigma: float = 1.5) -> F32:
+    """The 11 taps of SSIM's Gaussian window, summing to 1 (Wang et al. 2004)."""
+    taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / sigma) ** 2)
+    return (taps / taps.sum()).astype(np.float32)
+
+
+@njit(inline="always", fastmath=True)
+def _columns(start, cols, width):  # type: ignore[no-untyped-def]
+    """Sixteen columns for the block at `start`: the first, and which lanes of them the block before did not have."""
+    first = min(start, width - lanes.WIDTH)
+    return first, start - first, cols - first
+
+
+@njit(inline="always", fastmath=True)
+def _down(plane, row, first, window):  # type: ignore[no-untyped-def]
+    """The window down the columns of plane [row, col], zeros outside, for sixteen columns."""
+    amount = lanes.zero()
+    for other in range(max(0, row - RADIUS), min(plane.shape[0], row + RADIUS + 1)):
+        amount = amount + lanes.load(plane, other, first) * window[other - row + RADIUS]
+    return amount
+
+
+@njit(inline="always", fastmath=True)
+def _across(half, k, first, window):  # type: ignore[no-untyped-def]
+    """The window along line k of half, whose column 0 stands at MARGIN between zeros, for sixteen columns."""
+    amount = lanes.zero()
+    for tap in range(2 * RADIUS + 1):
+        amount = amount + lanes.load(half, k, first + (MARGIN - RADIUS) + tap) * window[tap]
+    return amount
+
+
+@njit(**OPTIONS)
+def _blur(plane: F32, window: F32, halves: F32, out: F32) -> None:
+    """The separable window over plane [row, col], zeros outside; halves [task, line, col] is scratch with margins."""
+    rows, width = plane.shape
+    for task in prange(halves.shape[0]):
+        half = halves[task]
+        for row in range(task * TASK_ROWS, min(rows, (task + 1) * TASK_ROWS)):
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, width, width)
+                lanes.store(half, 0, first + MARGIN, _down(plane, row, first, window))
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, width, width)
+                lanes.store(out, row, first, _across(half, 0, first, window))
+
+
+@njit(**OPTIONS)
+def _ssim_terms(
+    image: F32, target: F32, weights: F32 | None, cols: int, target_blurred: F32, window: F32, c1: float, c2: float,
+    halves: F32, partials: F32, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Partial derivatives of the SSIM map with respect to the blurred x, x², xy; sums [row] of the map itself.
+
+    With weights (None is settled when the kernel is compiled: that loop has no trace of them) the map is w SSIM.
+    """
+    one, two, k1, k2 = _f(1), _f(2), _f(c1), _f(c2)
+    rows, width = image.shape
+    for task in prange(halves.shape[0]):
+        half = halves[task]
+        for row in range(task * TASK_ROWS, min(rows, (task + 1) * TASK_ROWS)):
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, cols, width)
+                bx, bxx, bxy = lanes.zero(), lanes.zero(), lanes.zero()
+                for other in range(max(0, row - RADIUS), min(rows, row + RADIUS + 1)):
+                    x = lanes.load(image, other, first)
+                    weighted = x * window[other - row + RADIUS]
+                    bx, bxx = bx + weighted, bxx + weighted * x
+                    bxy = bxy + weighted * lanes.load(target, other, first)
+                lanes.store(half, 0, first + MARGIN, bx)
+                lanes.store(half, 1, first + MARGIN, bxx)
+                lanes.store(half, 2, first + MARGIN, bxy)
+            amount = lanes.zero()
+            for start in range(0, width, lanes.WIDTH):
+                first, fresh, high = _columns(start, cols, width)
+                mx, my = _across(half, 0, first, window), lanes.load(target_blurred[0], row, first)
+                # Differences of squares: what rounding makes of them must neither be negative nor break Cauchy-Schwarz.
+                vx = lanes.clamp(_across(half, 1, first, window) - mx * mx, _f(0), _LARGEST)
+                vy = lanes.clamp(lanes.load(target_blurred[1], row, first) - my * my, _f(0), _LARGEST)
+                vxy = _across(half, 2, first, window) - mx * my
+                low1, low2 = one / (mx * mx + my * my + k1), one / (vx + vy + k2)
+                structure = two * lanes.clamp(vxy * low2, _f(-0.5), _f(0.5)) + k2 * low2
+                luminance, heavy = (two * mx * my + k1) * low1, low2
+                if weights is not None:
+                    weight = lanes.load(weights, row, first)
+                    structure, heavy = structure * weight, low2 * weight
+                value = luminance * structure
+                d_vx = lanes.zero() - value * low2
+                d_vxy = two * luminance * heavy
+                d_mx = two * low1 * (my * structure - mx * value)
+                amount = amount + lanes.between(value, fresh, high)
+                # Columns that only fill up sixteen lanes are no part of the mean.
+                d_x = d_mx - two * mx * d_vx - my * d_vxy
+                lanes.store(partials[0], row, first, lanes.between(d_x, 0, high))
+                lanes.store(partials[1], row, first, lanes.between(d_vx, 0, high))
+                lanes.store(partials[2], row, first, lanes.between(d_vxy, 0, high))
+            sums[row] = lanes.total(amount)
+
+
+@njit(**OPTIONS)
+def _combine(
+    image: F32, target: F32, weights: F32 | None, cols: int, partials: F32, window: F32, term: DataTerm, share: float,
+    ssim: float, halves: F32, gradient: F32, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """The gradient from the blurred partial derivatives and from the data term; sums [row] of w times that term."""
+    rows, width = image.shape
+    kind, soft, depth = term.kind, _f(1) / _f(term.delta), -_f(term.depth)
+    for task in prange(halves.shape[0]):
+        half = halves[task]
+        for row in range(task * TASK_ROWS, min(rows, (task + 1) * TASK_ROWS)):
+            for start in range(0, width, lanes.WIDTH):
+                first, _, _ = _columns(start, cols, width)
+                for k in range(3):
+                    lanes.store(half, k, first + MARGIN, _down(partials[k], row, first, window))
+            amount = lanes.zero()
+            for start in range(0, width, lanes.WIDTH):
+                first, low, high = _columns(start, cols, width)
+                x, y = lanes.load(image, row, first), lanes.load(target, row, first)
+                difference = x - y
+                if kind == L1:
+                    pull = lanes.sign(difference)
+                    value = difference * pull
+                elif kind == L2:
+                    pull = difference * soft
+                    value = difference * pull * _f(0.5)
+                else:
+                    pull = difference * soft * lanes.exp(lanes.clamp(y, _f(0), _LARGEST) * depth)
+                    value = difference * pull * _f(0.5)
+                slope = _across(half, 0, first, window) + y * _across(half, 2, first, window)
+                slope = slope + _f(2) * x * _across(half, 1, first, window)
+                if weights is not None:
+                    weight = lanes.load(weights, row, first)
+                    pull, value, slope = pull * weight, value * weight, slope * lanes.sign(weight)
+                amount = amount + lanes.between(value, low, high)
+                lanes.store(gradient, row, first, pull * _f(share) - slope * _f(ssim))
+            sums[row] = lanes.total(amount)
+
+
+class ProjectionLoss:
+    """mean D(x, y) + λ (1 - SSIM(x, y)) and its gradient, for many images x against few targets y; D a `DataTerm`.
+
+    Two passes over the rows: blurs of x, x², xy and the SSIM map's partial derivatives; blurs of these and the
+    gradient. Each task takes a few rows and blurs them first down, then along one line that stays in its cache. The
+    target's blurred maps do not change during a fit, so they are computed once per view.
+
+    With weights w [row, col] >= 0 it is mean w (D(x, y) + λ (1 - SSIM(m x, m y))), m = 1 where w > 0 and 0 elsewhere:
+    a pixel of no weight is for SSIM's windows what lies outside the image, and its gradient is exactly 0. The mean
+    counts all pixels, so that a ray pulls alike in whole views and in masked ones.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        ssim_weight: float,
+        c1: float = 0.01**2,
+        c2: float = 0.03**2,
+        term: DataTerm = ABSOLUTE,
+    ) -> None:
+        rows, self._cols = shape
+        self.ssim_weight, self.c1, self.c2, self.term = ssim_weight, c1, c2, term
+        self.window = gaussian_window()
+        # Narrow images get columns of zeros to the right: the kernels take sixteen at a time.
+        self._width = max(self._cols, lanes.WIDTH)
+        self._halves = np.zeros((-(-rows // TASK_ROWS), 3, self._width + 2 * MARGIN), np.float32)
+        self._partials = np.empty((3, rows, self._width), np.float32)
+        self._sums = np.empty(rows, np.float64)
+
+    def _wide(self, image: F32) -> F32:
+        if image.shape[1] == self._width:
+            return np.ascontiguousarray(image)
+        wide = np.zeros((image.shape[0], self._width), np.float32)
+        wide[:, : self._cols] = image
+        return wide
+
+    def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
+        """Blurred m y and m y² [2, row, col] of a target image; at least sixteen columns."""
+        wide = self._wide(target if weights is None else target * (weights > 0))
+        out = np.empty((2, *wide.shape), np.float32)
+        for plane, blurred in zip((wide, wide * wide), out, strict=True):
+            _blur(plane, self.window, self._halves, blurred)
+        return out
+
+    def __call__(
+        self, image: F32, target: F32, target_maps: F32, gradient: F32, weights: F32 | None = None
+    ) -> float:  # fmt: skip
+        """The loss; `gradient` [row, col] receives its derivative with respect to `image`.
+
+        `target_maps` are those of the same weights. Image and target must be finite also where the weight is 0.
+        """
+        pixels = image.size
+        x, y, cols = self._wide(image), self._wide(target), self._cols
+        whole = gradient.shape == x.shape and gradient.flags.c_contiguous
+        slope = gradient if whole else np.empty_like(x)
+        w, seen = None, x
+        if weights is not None:
+            w = self._wide(weights)
+            seen = x * (w > 0)
+        _ssim_terms(
+            seen, y, w, cols, target_maps, self.window, self.c1, self.c2, self._halves, self._partials, self._sums
+        )  # fmt: skip
+        ssim = float(self._sums.sum()) / pixels
+        share = 1.0 if weights is None else float(weights.mean(dtype=np.float64))
+        weight = self.ssim_weight / pixels
+        _combine(
+            x, y, w, cols, self._partials, self.window, self.term, 1.0 / pixels, weight, self._halves, slope, self._sums
+        )
+        if not whole:
+            gradient[...] = slope[:, :cols]
+        return float(self._sums.sum()) / pixels + self.ssim_weight * (share - ssim)
+
+
+@njit(**OPTIONS)
+def _total_variation(volume: F32, weight: float, gradient: F32, sums: NDArray[np.float64]) -> None:
+    nz, ny, nx = volume.shape
+    w = _f(weight)
+    for z in prange(nz):
+        amount = 0.0
+        for y in range(ny):
+            for x in range(nx):
+                here, slope = volume[z, y, x], _f(0)
+                if x + 1 < nx:
+                    step = volume[z, y, x + 1] - here
+                    amount += abs(step)
+                    slope -= np.sign(step)
+                if y + 1 < ny:
+                    step = volume[z, y + 1, x] - here
+                    amount += abs(step)
+                    slope -= np.sign(step)
+                if z + 1 < nz:
+                    step = volume[z + 1, y, x] - here
+                    amount += abs(step)
+                    slope -= np.sign(step)
+                if x > 0:
+                    slope += np.sign(here - volume[z, y, x - 1])
+                if y > 0:
+                    slope += np.sign(here - volume[z, y - 1, x])
+                if z > 0:
+                    slope += np.sign(here - volume[z - 1, y, x])
+                gradient[z, y, x] = w * slope
+        sums[z] = amount
+
+
+def total_variation(volume: F32, gradient: F32, weight: float) -> float:
+    """weight * mean |difference of neighbours| over the three axes; `gradient` [z, y, x] receives its derivative.
+
+    The mean runs over all differences of the box (Zha et al. 2024).
+    """
+    nz, ny, nx = volume.shape
+    count = (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)
+    if count == 0:
+        gradient[...] = 0
+        return 0.0
+    sums = np.empty(nz, np.float64)
+    _total_variation(volume, weight / count, gradient, sums)
+    return weight * float(sums.sum()) / count

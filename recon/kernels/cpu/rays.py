@@ -1,0 +1,328 @@
+"""The exact integral along each ray of a cone, for the few Gaussians whose affine footprint is not good enough (numba).
+
+With H = S⁻¹Rᵀ, t from the source to the centre and D along the ray of a pixel, a Gaussian's integral along a line is
+
+    V = ρ sqrt(2π) |D| / |H D| exp(-1/2 |H t x H D|² / |H D|²)
+
+Measured in the offset δ of the pixel from the centre's, that is the affine footprint with three numbers more. Taken to
+the depth of the centre, H D = e + y with e = H t and y linear in δ; the part of y across e is what the footprint's
+quadratic form N = δᵀKδ measures, its part along e is α·δ. So
+
+    V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   η = 1 / |e|²,   α = η (e·Hu, e·Hv) tz / f
+
+with W, K from `footprints_cpu`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All are sums of
+squares: no digits are lost where Gaussians are thin. The rays with N / Q <= c² pass within c standard deviations; they
+fill an ellipse, and each row of pixels is cut where it leaves it; whole rows are drawn where the Gaussian reaches the
+plane of the source.
+
+The integral runs over the whole line, also behind the source: a Gaussian that reaches the source is out of bounds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon.kernels.cpu.activation import F32, OPTIONS
+from recon.kernels.cpu.footprints import (
+    HU,
+    KV,
+    SHEAR,
+    Camera,
+    K,
+    U,
+    V,
+    W,
+    footprint_table,
+    footprints,
+    footprints_backward,
+)  # fmt: skip
+
+F64 = NDArray[np.float64]
+_f = np.float32
+_BAND = 8  # rows a task: each owns its pixels, so nothing is shared
+# Columns of the terms: α, η, W |f / D₀|, the truncation c² and the box that it fills.
+AU, AV, ETA, WEIGHT, CUT, ROW0, ROW1, COL0, COL1 = range(9)
+# Columns of the sums, with a = g V, b = ∂ ln V / ∂N, q = ∂ ln V / ∂Q, l = 1 + α·δ; b goes with τ = δu - r δv and δv.
+A, BT, BV, BTT, BTV, BVV, L, LU, LV, N = range(10)
+
+
+@njit(inline="always", fastmath=True)
+def _decay(x):  # type: ignore[no-untyped-def]
+    """e^x for x <= 0, to 4e-6: e^(x / 32) by its series, squared five times. np.exp would keep the loop scalar."""
+    t = max(x, _f(-40)) * _f(1 / 32)
+    p = _f(1 / 120) + t * _f(1 / 720)
+    p = _f(1) + t * (_f(1) + t * (_f(0.5) + t * (_f(1 / 6) + t * (_f(1 / 24) + t * p))))
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    return p * p
+
+
+@njit(**OPTIONS)
+def _terms(
+    means: F32,
+    scales: F32,
+    rotations: F32,
+    densities: F32,
+    axes: F32,
+    focal: float,
+    sod: float,
+    faint: float,
+    cut: float,
+    rows: int,
+    cols: int,
+    table: F32,
+    terms: F64,
+) -> None:
+    for i in prange(densities.shape[0]):
+        for k in range(9):
+            terms[i, k] = 0.0
+        broadest = max(scales[i, 0], max(scales[i, 1], scales[i, 2]))
+        most = densities[i] * math.sqrt(2 * math.pi) * broadest  # of any ray
+        if table[i, HU] < 0.0 or most <= faint:
+            continue
+        tx = ty = 0.0
+        tz = sod
+        for j in range(3):
+            tx, ty, tz = tx + axes[0, j] * means[i, j], ty + axes[1, j] * means[i, j], tz + axes[2, j] * means[i, j]
+        ax, ay = tx / tz, ty / tz
+        hh = hu = hv = 0.0
+        for k in range(3):
+            pu = pv = pd = 0.0
+            for j in range(3):
+                r = rotations[i, 3 * j + k]
+                pu, pv, pd = pu + axes[0, j] * r, pv + axes[1, j] * r, pd + axes[2, j] * r
+            sharp = 1.0 / scales[i, k]
+            h = (ax * pu + ay * pv + pd) * sharp
+            hh, hu, hv = hh + h * h, hu + h * pu * sharp, hv + h * pv * sharp
+        au, av, eta = hu / (hh * focal), hv / (hh * focal), 1.0 / (hh * tz * tz)
+        c2 = min(cut * cut, 2.0 * math.log(most / faint))
+        terms[i, AU], terms[i, AV], terms[i, ETA], terms[i, CUT] = au, av, eta, c2
+        terms[i, WEIGHT] = table[i, W] / math.sqrt(1.0 + ax * ax + ay * ay)
+        # The conic N (1 - c²η) = c² (1 + α·δ)²: an ellipse unless the Gaussian reaches the source's plane.
+        row0, row1, col0, col1 = 0.0, float(rows), 0.0, float(cols)
+        kv, shear = 1.0 / table[i, KV], float(table[i, SHEAR])
+        left = 1.0 - c2 * eta
+        if left > 0.0:
+            svv = kv / left
+            suv, suu = shear * svv, (1.0 / table[i, K]) / left + shear * shear * svv
+            gu, gv = suu * au + suv * av, suv * au + svv * av
+            left = 1.0 - c2 * (au * gu + av * gv)
+            if left > 0.0:
+                mu, mv = table[i, U] + c2 * gu / left, table[i, V] + c2 * gv / left
+                wide = math.sqrt(c2 / left * (suu + c2 * gu * gu / left))
+                high = math.sqrt(c2 / left * (svv + c2 * gv * gv / left))
+                row0, row1 = max(row0, math.ceil(mv - high)), min(row1, math.floor(mv + high) + 1.0)
+                col0, col1 = max(col0, math.ceil(mu - wide)), min(col1, math.floor(mu + wide) + 1.0)
+        if row0 < row1 and col0 < col1:
+            terms[i, ROW0], terms[i, ROW1], terms[i, COL0], terms[i, COL1] = row0, row1, col0, col1
+
+
+@njit(inline="always", fastmath=True)
+def _span(table, terms, i, row):  # type: ignore[no-untyped-def]
+    """Columns first..last (excluded) of a row that lie within the conic."""
+    au, av, c2 = terms[i, AU], terms[i, AV], terms[i, CUT]
+    dv = row - float(table[i, V])
+    left, k, shear = 1.0 - c2 * terms[i, ETA], float(table[i, K]), float(table[i, SHEAR])
+    # (left k - c² αu²) δu² - 2 half δu + rest <= 0 with δu measured from the middle of the affine footprint's row.
+    line = 1.0 + (av + au * shear) * dv
+    square, half = left * k - c2 * au * au, c2 * au * line
+    rest = left * table[i, KV] * dv * dv - c2 * line * line
+    first, last = terms[i, COL0], terms[i, COL1]
+    if square > 0.0:
+        under = half * half - square * rest
+        if under <= 0.0:
+            return 0, 0
+        middle = float(table[i, U]) + shear * dv + half / square
+        reach = math.sqrt(under) / square
+        first, last = max(first, math.ceil(middle - reach)), min(last, math.floor(middle + reach) + 1.0)
+    return int(first), int(last)
+
+
+@njit(**OPTIONS)
+def _render(table: F32, terms: F64, focal: float, col: float, row: float, image: F32) -> None:
+    rows = image.shape[0]
+    for band in prange((rows + _BAND - 1) // _BAND):
+        per = _f(1 / focal)
+        for i in range(table.shape[0]):
+            au, av, eta, weight = _f(terms[i, AU]), _f(terms[i, AV]), _f(terms[i, ETA]), _f(terms[i, WEIGHT])
+            k, shear, kv, u = table[i, K], table[i, SHEAR], table[i, KV], table[i, U]
+            for r in range(max(band * _BAND, int(terms[i, ROW0])), min((band + 1) * _BAND, int(terms[i, ROW1]))):
+                first, last = _span(table, terms, i, r)
+                if first >= last:
+                    continue
+                line = image[r, first:last]
+                dv, du0 = _f(r) - table[i, V], _f(first) - u
+                up, over0 = _f(r - row) * per, _f(first - col) * per
+                tall, up2, along = kv * dv * dv, _f(1) + up * up, _f(1) + av * dv
+                for j in range(line.shape[0]):
+                    du, over = du0 + _f(j), over0 + _f(j) * per
+                    across = du - shear * dv
+                    n = k * across * across + tall
+                    lift = along + au * du
+                    inverse = _f(1) / (lift * lift + eta * n)
+                    line[j] += weight * np.sqrt((up2 + over * over) * inverse) * _decay(_f(-0.5) * n * inverse)
+
+
+@njit(**OPTIONS)
+def _sums(table: F32, terms: F64, focal: float, col: float, row: float, gradient: F32, sums: F32) -> None:
+    for i in prange(table.shape[0]):
+        per = _f(1 / focal)
+        au, av, eta, weight = _f(terms[i, AU]), _f(terms[i, AV]), _f(terms[i, ETA]), _f(terms[i, WEIGHT])
+        k, shear, kv, u = table[i, K], table[i, SHEAR], table[i, KV], table[i, U]
+        for m in range(10):
+            sums[i, m] = _f(0)
+        for r in range(int(terms[i, ROW0]), int(terms[i, ROW1])):
+            first, last = _span(table, terms, i, r)
+            if first >= last:
+                continue
+            line = gradient[r, first:last]
+            dv, du0 = _f(r) - table[i, V], _f(first) - u
+            up, over0 = _f(r - row) * per, _f(first - col) * per
+            tall, up2, along = kv * dv * dv, _f(1) + up * up, _f(1) + av * dv
+            s = sb = sbt = sbtt = sl = slu = sn = _f(0)
+            for j in range(line.shape[0]):
+                du, over = du0 + _f(j), over0 + _f(j) * per
+                across = du - shear * dv
+                n = k * across * across + tall
+                lift = along + au * du
+                inverse = _f(1) / (lift * lift + eta * n)
+                a = line[j] * weight * np.sqrt((up2 + over * over) * inverse) * _decay(_f(-0.5) * n * inverse)
+                aq = a * _f(0.5) * inverse * (n * inverse - _f(1))
+                ab, al = eta * aq - _f(0.5) * inverse * a, lift * aq
+                s += a
+                sb += ab
+                sbt += ab * across
+                sbtt += ab * across * across
+                sl += al
+                slu += al * du
+                sn += aq * n
+            sums[i, A] += s
+            sums[i, BT] += sbt
+            sums[i, BV] += sb * dv
+            sums[i, BTT] += sbtt
+            sums[i, BTV] += sbt * dv
+            sums[i, BVV] += sb * dv * dv
+            sums[i, L] += sl
+            sums[i, LU] += slu
+            sums[i, LV] += sl * dv
+            sums[i, N] += sn
+
+
+@njit(**OPTIONS)
+def _as_moments(table: F32, terms: F64, sums: F32, moments: F32) -> None:
+    """The moments with which an affine footprint would have the same gradient through W, K and the centre."""
+    for i in prange(table.shape[0]):
+        for m in range(6):
+            moments[i, m] = _f(0)
+        if table[i, HU] < 0:
+            continue
+        per_w = -2.0 / table[i, W]
+        moments[i, 0] = -0.5 * per_w * sums[i, A]
+        # Σ₂α along τ and v, without Σ₂'s large parts that would cancel in τ.
+        along_t = terms[i, AU] / table[i, K]
+        along_v = (table[i, SHEAR] * terms[i, AU] + terms[i, AV]) / table[i, KV]
+        moments[i, 1] = per_w * (sums[i, BT] + sums[i, L] * along_t)
+        moments[i, 2] = per_w * (sums[i, BV] + sums[i, L] * along_v)
+        moments[i, 3], moments[i, 4] = per_w * sums[i, BTT], per_w * sums[i, BTV]
+        moments[i, 5] = per_w * sums[i, BVV]
+
+
+@njit(**OPTIONS)
+def _bend(
+    terms: F64,
+    sums: F32,
+    means: F32,
+    scales: F32,
+    rotations: F32,
+    axes: F32,
+    focal: float,
+    sod: float,
+    d_means: F32,
+    d_log_scales: F32,
+    d_rotations: F32,
+) -> None:
+    """Add what flows through α, η and |D₀|, which an affine footprint has not."""
+    for i in prange(means.shape[0]):
+        if terms[i, ROW0] >= terms[i, ROW1]:
+            continue
+        tx = ty = 0.0
+        tz = sod
+        for j in range(3):
+            tx, ty, tz = tx + axes[0, j] * means[i, j], ty + axes[1, j] * means[i, j], tz + axes[2, j] * means[i, j]
+        ax, ay = tx / tz, ty / tz
+        power = 1.0 + ax * ax + ay * ay
+        hh = 1.0 / (terms[i, ETA] * tz * tz)
+        geta = float(sums[i, N]) * terms[i, ETA]
+        gau, gav = 2.0 * sums[i, LU], 2.0 * sums[i, LV]
+        along = -2.0 * (gau * terms[i, AU] + gav * terms[i, AV] + geta) / hh
+        gau, gav = gau / (focal * hh), gav / (focal * hh)
+        gax, gay = -sums[i, A] * ax / power, -sums[i, A] * ay / power
+        for k in range(3):
+            pu = pv = pd = 0.0
+            for j in range(3):
+                r = rotations[i, 3 * j + k]
+                pu, pv, pd = pu + axes[0, j] * r, pv + axes[1, j] * r, pd + axes[2, j] * r
+            sharp = 1.0 / scales[i, k]
+            xu, xv, h = pu * sharp, pv * sharp, (ax * pu + ay * pv + pd) * sharp
+            gh, gxu, gxv = gau * xu + gav * xv + along * h, gau * h, gav * h
+            d_log_scales[i, k] -= _f(gh * h + gxu * xu + gxv * xv)
+            gax, gay = gax + gh * xu, gay + gh * xv
+            gpu, gpv, gpd = (gh * ax + gxu) * sharp, (gh * ay + gxv) * sharp, gh * sharp
+            for j in range(3):
+                d_rotations[i, 3 * j + k] += _f(axes[0, j] * gpu + axes[1, j] * gpv + axes[2, j] * gpd)
+        gz = -(gax * ax + gay * ay + 2.0 * geta) / tz
+        for j in range(3):
+            d_means[i, j] += _f((axes[0, j] * gax + axes[1, j] * gay) / tz + axes[2, j] * gz)
+
+
+class Rays:
+    """Some Gaussians in one view of a cone, ray by ray; shared by the forward and the backward pass."""
+
+    def __init__(
+        self,
+        means: F32,
+        scales: F32,
+        rotations: F32,
+        densities: F32,
+        camera: Camera,
+        shape: tuple[int, int],
+        faint: float,
+        cut: float,
+    ) -> None:
+        """A Gaussian ends `cut` standard deviations from its centre, or where no ray has more than `faint` of it."""
+        self.parameters, self.camera = (means, scales, rotations, densities), camera
+        self.table = footprint_table(densities.shape[0])
+        footprints(*self.parameters, camera, faint, cut, self.table)
+        self.terms = np.empty((densities.shape[0], 9))
+        rows, cols = shape
+        _terms(
+            *self.parameters, camera.axes, camera.focal, camera.sod, faint, cut, rows, cols, self.table, self.terms
+        )  # fmt: skip
+
+    def add_to(self, image: F32) -> None:
+        """Add the Gaussians to image [row, col]."""
+        c = self.camera
+        _render(self.table, self.terms, c.focal, c.col, c.row, image)
+
+    def backward(
+        self, gradient: F32, d_means: F32, d_log_scales: F32, d_rotations: F32, d_densities: F32, d_centres: F32
+    ) -> None:
+        """Add to the gradients; d_centres [n, 2] gets ∂/∂(col, row) of the footprint's centre in 1/px."""
+        means, scales, rotations, _ = self.parameters
+        c = self.camera
+        sums = np.empty((means.shape[0], 10), np.float32)
+        _sums(self.table, self.terms, c.focal, c.col, c.row, gradient, sums)
+        moments = np.empty((means.shape[0], 6), np.float32)
+        _as_moments(self.table, self.terms, sums, moments)
+        footprints_backward(
+            self.table, moments, *self.parameters, c, d_means, d_log_scales, d_rotations, d_densities, d_centres
+        )  # fmt: skip
+        _bend(
+            self.terms, sums, means, scales, rotations, c.axes, c.focal, c.sod, d_means, d_log_scales, d_rotations
+        )  # fmt: skip

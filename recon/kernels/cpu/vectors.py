@@ -1,0 +1,86 @@
+"""Sums and products of whole volumes and projections in one pass, summed in float64 (numba, threaded)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import get_num_threads, njit, prange
+from numpy.typing import NDArray
+
+from recon.kernels.cpu.activation import F32, OPTIONS
+
+_f = np.float32
+_RUN = 4096  # values summed in float32 before they join the float64 sum
+
+
+@njit(**OPTIONS)
+def _dot(a: F32, b: F32, sums: NDArray[np.float64]) -> None:
+    parts = sums.size
+    for part in prange(parts):
+        total = np.float64(0)
+        end = (part + 1) * a.size // parts
+        for start in range(part * a.size // parts, end, _RUN):
+            x, y = a[start : min(start + _RUN, end)], b[start : min(start + _RUN, end)]
+            run = _f(0)
+            for i in range(x.size):
+                run += x[i] * y[i]
+            total += run
+        sums[part] = total
+
+
+def dot(a: F32, b: F32) -> float:
+    """<a, b> of two arrays of one shape."""
+    sums = np.empty(get_num_threads())
+    _dot(a.reshape(-1), b.reshape(-1), sums)
+    return float(sums.sum())
+
+
+@njit(**OPTIONS)
+def _combine(alpha: float, a: F32, beta: float, b: F32, floor: float, out: F32) -> None:
+    p, q, low = _f(alpha), _f(beta), _f(floor)
+    for i in prange(out.size):
+        out[i] = max(p * a[i] + q * b[i], low)
+
+
+def combine(alpha: float, a: F32, beta: float, b: F32, out: F32, nonnegative: bool = False) -> None:
+    """out = alpha a + beta b, negative values clipped if wanted; `out` may be `a` or `b`."""
+    floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
+    _combine(alpha, a.reshape(-1), beta, b.reshape(-1), floor, out.reshape(-1))
+
+
+@njit(**OPTIONS)
+def _add_product(x: F32, factor: float, a: F32, b: F32, floor: float) -> None:
+    p, low = _f(factor), _f(floor)
+    for i in prange(x.size):
+        x[i] = max(x[i] + p * a[i] * b[i], low)
+
+
+def add_product(x: F32, factor: float, a: F32, b: F32, nonnegative: bool) -> None:
+    """x += factor a b, negative values clipped if wanted."""
+    floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
+    _add_product(x.reshape(-1), factor, a.reshape(-1), b.reshape(-1), floor)
+
+
+@njit(**OPTIONS)
+def _misfit(data: F32, model: F32, weight: F32, scale: F32, sums: NDArray[np.float64]) -> None:
+    parts = sums.size
+    for part in prange(parts):
+        total = np.float64(0)
+        end = (part + 1) * data.size // parts
+        for start in range(part * data.size // parts, end, _RUN):
+            stop = min(start + _RUN, end)
+            run = _f(0)
+            for i in range(start, stop):
+                difference = data[i] - model[i]
+                run += (weight[i] if weight.size else _f(1)) * difference * difference
+                model[i] = difference * (scale[i] if scale.size else _f(1))
+            total += run
+        sums[part] = total
+
+
+def misfit(data: F32, model: F32, weight: F32 | None = None, scale: F32 | None = None) -> float:
+    """Replace `model` by scale (data - model); returns Σ weight (data - model)². None is one everywhere."""
+    empty = np.empty(0, np.float32)
+    sums = np.empty(get_num_threads())
+    weights, scales = (empty if array is None else array.reshape(-1) for array in (weight, scale))
+    _misfit(data.reshape(-1), model.reshape(-1), weights, scales, sums)
+    return float(sums.sum())

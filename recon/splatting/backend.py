@@ -1,0 +1,242 @@
+"""Where a fit computes: the operations of a step as one protocol, done by the CPU's kernels or by a GPU's.
+
+Arrays are numpy's on the CPU and torch tensors on a GPU; a fit passes them from one operation to the next and looks
+into none of them. Losses come as something `float` takes: on a GPU that waits for the device, so do it seldom.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, Protocol, SupportsFloat, TypeVar
+
+import numpy as np
+
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.kernels.cpu import losses as losses_cpu
+from recon.kernels.cpu.activation import F32
+from recon.kernels.cpu.adam import adam_all, add_lengths
+from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
+from recon.splatting.splat import Active, Gradients, RenderedView, Room, grid_layout, render_view
+
+Array = TypeVar("Array")
+
+
+class View(Protocol[Array]):
+    """One rendered view: its image [row, col], and the way back."""
+
+    image: Array
+
+    def backward(self, gradient: Array) -> Array:
+        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
+
+
+class Box(Protocol[Array]):
+    """One box of voxels: its density [z, y, x], and the way back."""
+
+    density: Array
+
+    def backward(self, gradient: Array, *, means_too: bool = True) -> None:
+        """Add what follows from a gradient [z, y, x]; `means_too=False` leaves positions alone."""
+
+
+class Pass(Protocol[Array]):
+    """Physical parameters of a model, and the gradients that views and boxes of voxels have added so far."""
+
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> View[Array]:
+        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ.
+
+        A view must have gone back before the next one is rendered: they share memory.
+        """
+
+    def box(self, grid: Grid, faint: float, cut: float) -> Box[Array]:
+        """Voxelise on a grid; `faint` is a density."""
+
+    def gradients(self) -> tuple[Array, Array, Array, Array]:
+        """Gradients on means, log scales, quaternions and raw densities."""
+
+
+class ProjectionLoss(Protocol[Array]):
+    """mean w (D(x, y) + λ (1 - SSIM(x, y))), see `losses_cpu.ProjectionLoss`."""
+
+    def target_maps(self, target: Array, weights: Array | None = None) -> Array:
+        """What is computed once for a target [row, col]."""
+
+    def __call__(
+        self, image: Array, target: Array, target_maps: Array, weights: Array | None = None
+    ) -> tuple[SupportsFloat, Array]:
+        """The loss and its gradient [row, col], which the next call overwrites."""
+
+
+class Backend(Protocol[Array]):
+    """The operations of a step on one device."""
+
+    def array(self, values: F32) -> Array:
+        """A copy on the device."""
+
+    def numpy(self, array: Array) -> F32:
+        """A copy for the host."""
+
+    def begin(self, means: Array, log_scales: Array, quaternions: Array, raw: Array, unit: float) -> Pass[Array]:
+        """A pass over raw parameters; densities are unit * softplus(raw)."""
+
+    def projection_loss(
+        self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
+    ) -> ProjectionLoss[Array]:
+        """The loss on images of one shape."""
+
+    def misfit(self, image: Array, target: Array, weights: Array | None) -> SupportsFloat:
+        """||w (image - target)|| / ||w target||; 0 for a target of zeros."""
+
+    def total_variation(self, volume: Array, weight: float) -> tuple[SupportsFloat, Array]:
+        """weight * mean |difference of neighbours| of [z, y, x], and its gradient."""
+
+    def add_lengths(self, vectors: Array, factor: float, sums: Array) -> None:
+        """sums [n] += factor |vectors [n, 2]|."""
+
+    def adam(
+        self,
+        parameters: Sequence[Array],
+        gradients: Sequence[Array],
+        first: Sequence[Array],
+        second: Sequence[Array],
+        rates: Sequence[float],
+        step: int,
+        bounds: Sequence[tuple[float, float] | None],
+    ) -> None:
+        """Update the four parameter arrays and their moments in place and keep them within bounds; steps from 1."""
+
+
+def backend_for(device: str) -> Backend[Any]:
+    """The backend for "cpu", or for "cuda", the current CUDA device ("cuda:0" where that is its number).
+
+    Raises:
+        ImportError: triton is not installed.
+        RuntimeError: torch sees no CUDA device.
+        ValueError: another kind of device, or a CUDA device that is not there or not the current one.
+    """
+    if device == "cpu":
+        return Cpu()
+    if not re.fullmatch(r"cuda(:\d+)?", device):
+        raise ValueError(
+            f"device {device!r} was asked for, and a fit computes on 'cpu' or on 'cuda', the current CUDA device: name "
+            "one of these; which CUDA device is the current one, CUDA_VISIBLE_DEVICES says when Python starts"
+        )
+    from recon.kernels.gpu.engine import Gpu  # triton is loaded only where a GPU is asked for
+
+    return Gpu(device)
+
+
+class Cpu:
+    """The numba kernels on numpy arrays."""
+
+    def __init__(self) -> None:
+        self._room: tuple[tuple[int, tuple[int, int]], Room] | None = None
+
+    def array(self, values: F32) -> F32:
+        return np.array(values, np.float32)
+
+    def numpy(self, array: F32) -> F32:
+        return array.copy()
+
+    def begin(self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> CpuPass:
+        return CpuPass(self, means, log_scales, quaternions, raw, unit)
+
+    def room(self, n: int, detector_shape: tuple[int, int]) -> Room:
+        """Memory for a view of n Gaussians; the last one again where it fits."""
+        if self._room is None or self._room[0] != (n, detector_shape):
+            self._room = ((n, detector_shape), Room.of(n, detector_shape))
+        return self._room[1]
+
+    def projection_loss(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE) -> CpuLoss:
+        return CpuLoss(shape, ssim_weight, term)
+
+    def misfit(self, image: F32, target: F32, weights: F32 | None) -> float:
+        off = image - target if weights is None else weights * (image - target)
+        seen = target if weights is None else weights * target
+        power = float(np.vdot(seen, seen))
+        return (float(np.vdot(off, off)) / power) ** 0.5 if power > 0 else 0.0
+
+    def total_variation(self, volume: F32, weight: float) -> tuple[float, F32]:
+        gradient = np.empty_like(volume)
+        return losses_cpu.total_variation(volume, gradient, weight), gradient
+
+    def add_lengths(self, vectors: F32, factor: float, sums: F32) -> None:
+        add_lengths(vectors, factor, sums)
+
+    def adam(
+        self,
+        parameters: Sequence[F32],
+        gradients: Sequence[F32],
+        first: Sequence[F32],
+        second: Sequence[F32],
+        rates: Sequence[float],
+        step: int,
+        bounds: Sequence[tuple[float, float] | None],
+    ) -> None:
+        adam_all(parameters, gradients, first, second, rates, step, bounds)
+
+
+class CpuPass:
+    """A pass by the numba kernels."""
+
+    def __init__(
+        self, backend: Cpu, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float
+    ) -> None:  # fmt: skip
+        self._backend, self._raw, self._unit = backend, (quaternions, raw), unit
+        self.active = Active.of(means, log_scales, quaternions, raw, unit)
+        self.into = Gradients.zeros(raw.shape[0])
+
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> CpuView:
+        room = self._backend.room(len(self.active.densities), geometry.detector_shape)
+        return CpuView(render_view(self.active, geometry, view, faint, cut, model, room=room), self.into)
+
+    def box(self, grid: Grid, faint: float, cut: float) -> CpuBox:
+        return CpuBox(self, grid, faint, cut)
+
+    def gradients(self) -> tuple[F32, F32, F32, F32]:
+        return self.into.to_raw(*self._raw, self._unit)
+
+
+class CpuView:
+    """A view by the numba kernels."""
+
+    def __init__(self, seen: RenderedView, into: Gradients) -> None:
+        self._seen, self._into, self.image = seen, into, seen.image
+
+    def backward(self, gradient: F32) -> F32:
+        centres = np.empty((len(self._into.densities), 2), np.float32)
+        self._seen.backward(gradient, self._into, centres)
+        return centres
+
+
+class CpuBox:
+    """A box of voxels by the numba kernels."""
+
+    def __init__(self, run: CpuPass, grid: Grid, faint: float, cut: float) -> None:
+        self._into, self._layout = run.into, grid_layout(run.active, grid, faint, cut)
+        self.density: F32 = np.ascontiguousarray(self._layout.fill())
+
+    def backward(self, gradient: F32, *, means_too: bool = True) -> None:
+        into = self._into
+        self._layout.backward(
+            gradient, into.means, into.log_scales, into.rotations, into.densities, means_too=means_too
+        )  # fmt: skip
+
+
+class CpuLoss:
+    """The fused loss by the numba kernels."""
+
+    def __init__(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm) -> None:
+        self._loss = losses_cpu.ProjectionLoss(shape, ssim_weight, term=term)
+        self._slope = np.empty(shape, np.float32)
+
+    def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
+        return self._loss.target_maps(target, weights)
+
+    def __call__(
+        self, image: F32, target: F32, target_maps: F32, weights: F32 | None = None
+    ) -> tuple[float, F32]:  # fmt: skip
+        return self._loss(image, target, target_maps, self._slope, weights), self._slope

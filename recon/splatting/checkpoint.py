@@ -1,0 +1,79 @@
+"""A fit's state as plain arrays and back, to the bit: what a checkpoint holds. Nothing here is pickled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.splatting.backend import Backend, Cpu
+from recon.splatting.optimise import FitState
+from recon.splatting.settings import NAMES
+
+_COUNTS = ("limit", "step", "seen")
+_SCALARS = ("unit", "loss", "residual")
+_WORDS = 4  # of 64 bits: state and increment of PCG64
+
+
+def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str, NDArray[Any]]:
+    """Everything that a step reads, as arrays by name.
+
+    Raises:
+        ValueError: for a random generator other than numpy's default, whose state has another form.
+    """
+    device = backend or Cpu()
+    arrays: dict[str, NDArray[Any]] = {"statistic": device.numpy(state.statistic)}
+    for group in ("parameters", "first", "second"):
+        for name in NAMES:
+            arrays[f"{group}.{name}"] = device.numpy(getattr(state, group)[name])
+    arrays["counts"] = np.array([getattr(state, name) for name in _COUNTS], np.int64)
+    arrays["scalars"] = np.array([float(getattr(state, name)) for name in _SCALARS], np.float64)
+    arrays["drawn"] = np.array(state.drawn, np.int64)
+    generator = state.rng.bit_generator.state
+    if generator["bit_generator"] != "PCG64":
+        raise ValueError(f"a checkpoint holds the state of PCG64, not of {generator['bit_generator']}")
+    inner = generator["state"]
+    words = [inner[key] >> shift & (2**64 - 1) for key in ("state", "inc") for shift in (0, 64)]
+    arrays["generator"] = np.array([*words, generator["has_uint32"], generator["uinteger"]], np.uint64)
+    return arrays
+
+
+def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None = None) -> FitState:
+    """The inverse of `arrays_of`: the next step does what it would have done.
+
+    Raises:
+        ValueError: where arrays are missing, disagree in length, or hold values that are not finite.
+    """
+    device = backend or Cpu()
+    groups = ("parameters", "first", "second")
+    wanted = [f"{group}.{name}" for group in groups for name in NAMES]
+    missing = [k for k in (*wanted, "statistic", "counts", "scalars", "drawn", "generator") if k not in arrays]
+    if missing:
+        raise ValueError(f"this is no checkpoint of a fit: {missing} are missing")
+    n = len(arrays["parameters.raw"])
+    widths = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw": (n,)}
+    shapes: dict[str, tuple[int, ...]] = {key: widths[key.split(".")[1]] for key in wanted}
+    shapes |= {"statistic": (n,), "counts": (len(_COUNTS),), "scalars": (len(_SCALARS),), "generator": (_WORDS + 2,)}
+    for key, shape in shapes.items():
+        if np.shape(arrays[key]) != shape:
+            raise ValueError(f"{key} of the checkpoint has shape {np.shape(arrays[key])}, expected {shape}")
+    for key in wanted:
+        if not np.isfinite(arrays[key]).all():
+            raise ValueError(f"{key} of the checkpoint holds values that are not finite")
+    words = [int(word) for word in arrays["generator"]]
+    rng = np.random.default_rng(0)
+    rng.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": words[0] | words[1] << 64, "inc": words[2] | words[3] << 64},
+        "has_uint32": words[4],
+        "uinteger": words[5],
+    }
+    parts = {group: {name: device.array(arrays[f"{group}.{name}"]) for name in NAMES} for group in groups}
+    limit, step, seen = (int(v) for v in arrays["counts"])
+    unit, loss, residual = (float(v) for v in arrays["scalars"])
+    return FitState(
+        parts["parameters"], parts["first"], parts["second"], device.array(arrays["statistic"]), unit, rng, limit,
+        step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
+    )  # fmt: skip

@@ -1,0 +1,188 @@
+"""Problem: the data of a fit on the device that fits them, in units in which published rates and weights hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.volume import Grid
+from recon.kernels.cpu.activation import F32
+from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
+from recon.splatting.backend import Backend, ProjectionLoss
+
+Loss = Literal["l1", "l2", "poisson"]
+_KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
+
+# Images hold values of about one. Of ones beyond this no matter in the field can be the cause, and sums of products of
+# their squares, which SSIM takes, would leave float32's range.
+_LARGEST = 1e6
+# Of later views, where the unit may be that of the noise before the sample was there: what SSIM could not hold.
+_LARGEST_LATER = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The data of a fit: images in half fields times density units, geometry and grid in mm.
+
+    Attributes:
+        images: one [row, col] each view, projections / (half_field * unit).
+        target_maps: each view blurred for SSIM.
+        weights: of each view's pixels [row, col]; None where all weigh one.
+        geometry: of the views.
+        grid: the box that Gaussians live in; it should hold all that the views see, whatever volume is wanted later.
+        half_field: mm.
+        unit: 1/mm.
+        noise: standard deviation of a pixel's noise, in units of `images`.
+        loss: the projection loss.
+        backend: the device's operations, and the owner of all these arrays.
+    """
+
+    images: tuple[Any, ...]
+    target_maps: tuple[Any, ...]
+    weights: tuple[Any | None, ...]
+    geometry: Geometry
+    grid: Grid
+    half_field: float
+    unit: float
+    noise: float
+    loss: ProjectionLoss[Any]
+    backend: Backend[Any]
+
+    @property
+    def scale(self) -> np.float32:
+        """Line integrals over what `images` hold."""
+        return np.float32(self.half_field * self.unit)
+
+    @property
+    def projections(self) -> F32:
+        """The line integrals [view, row, col], back on the host."""
+        return np.stack([self.backend.numpy(image) * self.scale for image in self.images])
+
+
+def make_problem(
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid,
+    unit: float,
+    backend: Backend[Any],
+    *,
+    weights: F32 | None = None,
+    loss: Loss = "l1",
+    ssim_weight: float = 0.25,
+) -> Problem:
+    """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
+
+    Values that are not finite, or more than a million half fields times density units, get no weight, see
+    `masks.masked`. The squared losses are made of the size of the
+    absolute one at the data's noise (see `noise_level`), so that the weights of SSIM and total variation keep their
+    meaning.
+
+    Args:
+        weights: of each ray [view, row, col], 0 or more; None: one for all.
+
+    Raises:
+        ValueError: where shapes disagree, a view has no value that can be used, or the loss is unknown.
+    """
+    expected = (geometry.n_views, *geometry.detector_shape)
+    if projections.shape != expected:
+        raise ValueError(f"projections have shape {projections.shape}, the geometry says {expected}")
+    if loss not in _KINDS:
+        raise ValueError(f"loss must be one of {get_args(Loss)}, got {loss!r}")
+    half_field = max(n * edge for n, edge in zip(grid.shape, grid.spacing, strict=True)) / 2
+    scale = half_field * unit
+    filled, known = masked(projections, weights, _LARGEST * scale)
+    delta = max(noise_level(filled) / scale, 1e-4)
+    projection_loss = backend.projection_loss(
+        geometry.detector_shape, ssim_weight, DataTerm(_KINDS[loss], delta, scale)
+    )
+    empty = Problem((), (), (), geometry, grid, half_field, unit, delta, projection_loss, backend)
+    return replace(_with_views(empty, filled, known), geometry=geometry)
+
+
+def extend(problem: Problem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None) -> Problem:
+    """The problem with more views [view, row, col]; those it has are not copied.
+
+    Large values are let in up to what the loss can hold: where the first views showed nothing, it is the density unit
+    that is wrong. Only beyond a thousand million half fields times density units they get no weight.
+
+    Raises:
+        ValueError: where the problem's views differ in shift, roll or tilt, see `Geometry.at`, or a view has no value
+            that can be used.
+    """
+    geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
+    largest = _LARGEST_LATER * problem.half_field * problem.unit
+    return replace(_with_views(problem, *masked(projections, weights, largest)), geometry=geometry)
+
+
+def joined(geometry: Geometry, factor: int) -> Geometry:
+    """The geometry of factor x factor joined pixels, each in the middle of its own, while the sample stays in place.
+
+    `Geometry.binned` counts a parallel beam's heights from the middle of the rows that are left: a sample of its own.
+
+    Raises:
+        ValueError: where the detector has fewer rows or columns than are to be joined.
+    """
+    if factor > min(geometry.detector_shape):
+        rows, cols = geometry.detector_shape
+        raise ValueError(
+            f"coarse={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set `coarse` to "
+            f"{min(rows, cols)} or less (1: the fit begins on single pixels)"
+        )
+    return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
+
+
+def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Problem:
+    """The same problem on joined pixels: a first look at the large scales for a fraction of the time.
+
+    A joined pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
+    have no part in it.
+
+    Raises:
+        ValueError: as `joined`.
+    """
+    geometry = joined(problem.geometry, factor)
+    data, weights = problem.projections, None
+    if any(w is not None for w in problem.weights):
+        ones = np.ones(problem.geometry.detector_shape, np.float32)
+        each = np.stack([ones if w is None else problem.backend.numpy(w) for w in problem.weights])
+        weights = bin_views(each, factor)
+        sums = bin_views(each * data, factor)
+        data = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)  # make_problem fills the others
+    else:
+        data = bin_views(data, factor)
+    return make_problem(
+        data, geometry, problem.grid, problem.unit, problem.backend,
+        weights=weights, loss=loss, ssim_weight=ssim_weight,
+    )  # fmt: skip
+
+
+def noise_level(projections: F32) -> float:
+    """Standard deviation of the noise of a pixel, from second differences along the rows, which smooth matter leaves
+    small: their median absolute value over 0.6745 √6. 0 for fewer than three columns."""
+    cols = projections.shape[-1]
+    if cols < 3:
+        return 0.0
+    some = projections[:: max(1, len(projections) // 8)]
+    bends = some[..., 2:] - 2 * some[..., 1:-1] + some[..., :-2]
+    return float(np.median(np.abs(bends))) / (0.6745 * 6**0.5)
+
+
+def _with_views(problem: Problem, projections: F32, weights: F32 | None) -> Problem:
+    backend, loss = problem.backend, problem.loss
+    images = tuple(backend.array(np.ascontiguousarray(view, np.float32) / problem.scale) for view in projections)
+    known: tuple[Any | None, ...] = (None,) * len(images)
+    if weights is not None:
+        known = tuple(None if bool((w == 1).all()) else backend.array(w) for w in weights)
+    maps = tuple(loss.target_maps(image, w) for image, w in zip(images, known, strict=True))
+    return replace(
+        problem,
+        images=problem.images + images,
+        target_maps=problem.target_maps + maps,
+        weights=problem.weights + known,
+    )

@@ -1,0 +1,299 @@
+"""project and voxelize: Gaussians to line integrals and to voxels, differentiable, by the kernel that fits the data.
+
+Float32 tensors go to the threaded CPU kernels, on a CUDA device to the GPU's; float64 tensors (or
+`kernel="reference"`) to the readable twin, which runs on the CPU.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel, Truncation
+from recon.base.volume import Grid
+from recon.kernels import reference
+from recon.kernels.cpu.activation import F32, activate, activation_backward
+from recon.kernels.cpu.footprints import HU, INEXACT, Camera, footprint_table, footprints, footprints_backward
+from recon.kernels.cpu.project import moments, render, render_layers
+from recon.kernels.cpu.rays import Rays
+from recon.kernels.cpu.voxelize import Layout
+from recon.splatting.gaussians import Gaussians
+
+Kernel = Literal["auto", "cpu", "gpu", "reference"]
+
+
+@dataclass(frozen=True, eq=False)
+class Active:
+    """Physical parameters of Gaussians as float32 arrays, row-major rotations [n, 9]."""
+
+    means: F32
+    scales: F32
+    rotations: F32
+    densities: F32
+
+    @classmethod
+    def of(cls, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> Active:
+        n = raw.shape[0]
+        scales, rotations = np.empty((n, 3), np.float32), np.empty((n, 9), np.float32)
+        densities = np.empty(n, np.float32)
+        activate(log_scales, quaternions, raw, unit, scales, rotations, densities)
+        return cls(means, scales, rotations, densities)
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Gradients on the physical parameters, added to by each projection or box of voxels."""
+
+    means: F32
+    log_scales: F32
+    rotations: F32
+    densities: F32
+
+    @classmethod
+    def zeros(cls, n: int) -> Gradients:
+        shapes: list[tuple[int, ...]] = [(n, 3), (n, 3), (n, 9), (n,)]
+        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
+
+    def to_raw(self, quaternions: F32, raw: F32, unit: float) -> tuple[F32, F32, F32, F32]:
+        """Gradients on means, log scales, quaternions and raw densities."""
+        d_quaternions, d_raw = np.empty_like(quaternions), np.empty_like(raw)
+        activation_backward(quaternions, raw, unit, self.rotations, self.densities, d_quaternions, d_raw)
+        return self.means, self.log_scales, d_quaternions, d_raw
+
+
+def camera(geometry: Geometry, view: int) -> Camera:
+    """One view as the kernels take it."""
+    axes = geometry.axes(view).astype(np.float32)
+    col, row = geometry.origin(view)
+    if geometry.is_cone:
+        return Camera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, straight=False)
+    straight = bool(geometry.roll[view] == 0 and geometry.tilt[view] == 0)
+    return Camera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
+
+
+def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
+    """Footprints of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
+    table = footprint_table(active.densities.shape[0])
+    parameters = (active.means, active.scales, active.rotations, active.densities)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table)
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Memory that views of n Gaussians may share, one after the other: a step on 50k of them allocates several MB."""
+
+    table: F32
+    moments: F32
+    layers: F32
+
+    @classmethod
+    def of(cls, n: int, detector_shape: tuple[int, int]) -> Room:
+        return cls(footprint_table(n), np.empty((n, 6), np.float32), render_layers(*detector_shape))
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedView:
+    """One view's image [row, col] with all that its backward pass needs.
+
+    Attributes:
+        image: line integrals [row, col].
+        active: the Gaussians; neither they nor `room` may change before `backward`.
+        camera, length: the view, and what stands in for a ray's length in a Gaussian.
+        room: holds the table of footprints.
+        exact, rays: positions of the Gaussians that are integrated ray by ray, and their rays (None: there are none).
+    """
+
+    image: F32
+    active: Active
+    camera: Camera
+    length: float
+    room: Room
+    exact: NDArray[np.intp]
+    rays: Rays | None
+
+    def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
+        """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
+        a, table = self.active, self.room.table
+        footprints_backward(
+            table, moments(table, gradient, self.room.moments), a.means, a.scales, a.rotations, a.densities,
+            self.camera, into.means, into.log_scales, into.rotations, into.densities, centres, length=self.length,
+        )  # fmt: skip
+        if self.rays is None:
+            return
+        some, moved = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
+        self.rays.backward(gradient, some.means, some.log_scales, some.rotations, some.densities, moved)
+        centres[self.exact] = moved
+        into.means[self.exact] += some.means
+        into.log_scales[self.exact] += some.log_scales
+        into.rotations[self.exact] += some.rotations
+        into.densities[self.exact] += some.densities
+
+
+def render_view(
+    active: Active,
+    geometry: Geometry,
+    view: int,
+    faint: float,
+    sigmas: float,
+    model: RayModel | None = None,
+    *,
+    image: F32 | None = None,
+    room: Room | None = None,
+) -> RenderedView:
+    """Line integrals of one view into `image` [row, col] (overwritten; None makes one); `faint` in its units.
+
+    `room` is overwritten, too: a view that shares it has to be done with before the next one.
+    """
+    chosen, shape, a = model or RayModel(), geometry.detector_shape, active
+    picture = np.empty(shape, np.float32) if image is None else image
+    space = Room.of(len(a.densities), shape) if room is None else room
+    seen, length = camera(geometry, view), chosen.length(geometry)
+    footprints(
+        a.means, a.scales, a.rotations, a.densities, seen, faint, sigmas, space.table,
+        length=length, exact_above=chosen.exact_above,
+    )  # fmt: skip
+    render(space.table, picture, space.layers)
+    exact, rays = np.empty(0, np.intp), None
+    if geometry.is_cone and chosen.exact_above < math.inf:
+        exact = np.flatnonzero(space.table[:, HU] == INEXACT)
+    if exact.size:
+        some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
+        rays = Rays(*some, seen, shape, faint, sigmas)
+        rays.add_to(picture)
+    return RenderedView(picture, active, seen, length, space, exact, rays)
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+        unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel,
+    ) -> Tensor:  # fmt: skip
+        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
+        images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
+        shared, views = Room.of(len(active.densities), geometry.detector_shape), []
+        for view, image in enumerate(images):  # each keeps its own table until it goes back
+            room = replace(shared, table=footprint_table(len(active.densities)))
+            views.append(render_view(active, geometry, view, faint, cut, model, image=image, room=room))
+        ctx.state = (_array(quaternions), _array(raw), unit, views)
+        return torch.from_numpy(images)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        quaternions, raw, unit, views = ctx.state
+        into = Gradients.zeros(len(raw))
+        centres = np.empty((len(raw), 2), np.float32)
+        for view, image in zip(views, gradient.contiguous().numpy(), strict=True):
+            view.backward(image, into, centres)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None)
+
+
+class _Voxelize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
+        unit: float, grid: Grid, faint: float, cut: float,
+    ) -> Tensor:  # fmt: skip
+        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
+        layout = grid_layout(active, grid, faint, cut)
+        ctx.state = (_array(quaternions), _array(raw), layout, unit)
+        return torch.from_numpy(np.ascontiguousarray(layout.fill()))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        quaternions, raw, layout, unit = ctx.state
+        into = Gradients.zeros(len(raw))
+        layout.backward(gradient.contiguous().numpy(), into.means, into.log_scales, into.rotations, into.densities)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None)
+
+
+def _array(tensor: Tensor) -> F32:
+    return tensor.detach().contiguous().numpy()
+
+
+def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
+    """Where Gaussians fall on a grid; `faint` is a density."""
+    z, y, x = (float(axis[0]) for axis in grid.coordinates())
+    parameters = (active.means, active.scales, active.rotations, active.densities)
+    return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas)
+
+
+def project(
+    gaussians: Gaussians,
+    geometry: Geometry,
+    views: Sequence[int] | slice | None = None,
+    *,
+    truncation: Truncation | None = None,
+    model: RayModel | None = None,
+    kernel: Kernel = "auto",
+) -> Tensor:
+    """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
+
+    A cone's are those of the affine footprint, or of the true ray where `model` says so. Differentiable in all four
+    parameter tensors. The reference kernel truncates nothing.
+
+    Raises:
+        ValueError: the kernel does not take tensors of this type or on this device.
+        ImportError: CUDA tensors, and triton is not installed.
+    """
+    rays = model or RayModel()
+    chosen = geometry if views is None else geometry.select(views)
+    g, which = gaussians, _kernel(gaussians, kernel)
+    if which == "reference":
+        parameters = (g.means, g.scales, g.quaternions, g.densities)
+        length = rays.length(chosen)
+        images = []
+        for view in range(chosen.n_views):
+            exact = None
+            if chosen.is_cone and rays.exact_above < math.inf:
+                exact = reference.affine_error(*parameters[:3], chosen, view) > rays.exact_above
+            images.append(reference.project_view(*parameters, chosen, view, exact=exact, length=length))
+        return torch.stack(images)
+    cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
+    if which == "gpu":
+        from recon.kernels.gpu import autograd  # triton is loaded only where a GPU is asked for
+
+        return autograd.project(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+    return _Project.apply(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+
+
+def voxelize(
+    gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, kernel: Kernel = "auto"
+) -> Tensor:
+    """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
+    g, which = gaussians, _kernel(gaussians, kernel)
+    if which == "reference":
+        z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
+        return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x))
+    cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
+    faint = cut.faint * g.density_unit
+    if which == "gpu":
+        from recon.kernels.gpu import autograd
+
+        return autograd.voxelize(*raw, g.density_unit, grid, faint, cut.sigmas)
+    return _Voxelize.apply(*raw, g.density_unit, grid, faint, cut.sigmas)
+
+
+def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
+    """The line integral below which nothing is drawn."""
+    return truncation.faint * gaussians.density_unit * geometry.sample_pitch * geometry.detector_shape[1]
+
+
+def _kernel(gaussians: Gaussians, kernel: Kernel) -> Kernel:
+    dtype, device = gaussians.means.dtype, gaussians.means.device.type
+    suited: Kernel = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
+    chosen = suited if kernel == "auto" else kernel
+    if chosen != "reference" and dtype != torch.float32:
+        raise ValueError(f"the {chosen} kernel works in float32, the Gaussians are {dtype}")
+    if chosen != "gpu" and device != "cpu":
+        raise ValueError(f"the {chosen} kernel runs on the cpu, the Gaussians are {dtype} on {device}: move them")
+    return chosen

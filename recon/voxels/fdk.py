@@ -1,0 +1,138 @@
+"""Filtered back-projection of a cone beam over a full circle (Feldkamp, Davis & Kress 1984), in 1/mm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recon.base import threads as threads  # torch before the first numba thread
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.kernels.cpu.activation import F32, OPTIONS
+from recon.voxels.fbp import Filter, filter_projections
+from recon.voxels.projector import volume_slices
+from recon.voxels.view_weights import circle_weights, covers_the_circle
+
+F64 = NDArray[np.float64]
+
+_f = np.float32
+_SLAB_BYTES = 128 * 2**20  # filtered views held at a time
+
+
+def has_direct_method(geometry: Geometry) -> bool:
+    """Whether FBP or FDK takes these views: they must be straight, and a cone's must stand all around."""
+    return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))
+
+
+@njit(**OPTIONS)
+def _back_project(
+    filtered: F32, cosines: F64, sines: F64, col0: F64, row0: F64, sod: float, sdd: float, pitch: float,
+    x: F64, y: F64, z: F64, out: F32,
+) -> None:  # fmt: skip
+    """out[y, x, z] += Σ_view (sod / w)² filtered[view, col, row] bilinearly; lengths in mm, w the voxel's depth."""
+    views, cols, rows = filtered.shape[0], filtered.shape[1] - 2, filtered.shape[2] - 2
+    nx, ny, nz = x.size, y.size, z.size
+    step = (z[1] - z[0]) if nz > 1 else 1.0
+    for j in prange(ny):
+        line = np.zeros(rows + 4, np.float32)
+        for v in range(views):
+            c, s = cosines[v], sines[v]
+            for i in range(nx):
+                depth = sod - x[i] * s + y[j] * c
+                magnify = sdd / (depth * pitch)
+                col = (x[i] * c + y[j] * s) * magnify + col0[v] + 1.0
+                if not (col >= 0.5 and col <= cols + 0.5):
+                    continue
+                low = math.floor(col)
+                part = _f(col - low)
+                share = _f((sod / depth) ** 2)
+                climb = step * magnify
+                base = z[0] * magnify + row0[v] + 1.0
+                first = math.ceil(max((0.5 - base) / climb, 0.0))
+                end = math.floor(min((rows + 0.5 - base) / climb, nz - 1.0)) + 1
+                if end <= first:
+                    continue
+                a, b = filtered[v, low], filtered[v, low + 1]
+                r0 = max(0, math.floor(base + climb * first) - 1)
+                r1 = min(rows + 2, math.ceil(base + climb * (end - 1)) + 2)
+                for row in range(r0, r1):
+                    line[row] = share * (a[row] + part * (b[row] - a[row]))
+                target = out[j, i, first:end]
+                base += climb * first
+                for k in range(end - first):
+                    row = base + climb * k
+                    whole = np.uint32(row)
+                    rest = _f(row - whole)
+                    target[k] += line[whole] + rest * (line[whole + np.uint32(1)] - line[whole])
+
+
+def fdk(
+    projections: NDArray[np.float32], geometry: Geometry, grid: Grid | None = None, filter: Filter = "ram-lak"
+) -> NDArray[np.float32]:
+    """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
+
+    Exact in the plane of the source; above and below, values fall off with the square of the cone's angle, and flat
+    interfaces across the axis blur. The detector must see the whole width of the object: what it cuts off brightens the
+    rim. A voxel that a view does not see gets nothing from that view.
+
+    Args:
+        projections: float32 [view, row, col], line integrals (dimensionless).
+        geometry: a cone, straight (no roll, no tilt); views may be shifted.
+        grid: voxels wanted; None: `Grid.matching(geometry)`.
+        filter: "ram-lak", "shepp-logan" or "hann".
+
+    Returns:
+        float32 [z, y, x], 1/mm.
+
+    Raises:
+        ValueError: for a parallel beam, rolled or tilted views, a short scan, a shape that does not belong to the
+            geometry, values that are not finite, a box that reaches the source, or an unknown filter.
+    """
+    expected = (geometry.n_views, *geometry.detector_shape)
+    if projections.shape != expected:
+        raise ValueError(
+            f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
+        )
+    if not geometry.is_cone:
+        raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
+    if not geometry.is_straight:
+        raise ValueError("FDK takes straight views only; these are rolled or tilted: rotate the images first")
+    grid = Grid.matching(geometry) if grid is None else grid
+    reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
+    if reach >= geometry.sod:
+        raise ValueError(
+            f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
+        )
+    weights = circle_weights(geometry.angles)
+    z, y, x = grid.coordinates()
+    rows, cols = geometry.detector_shape
+    volume = np.zeros((y.size, x.size, z.size), np.float32)
+    slab = max(1, _SLAB_BYTES // (4 * rows * cols))
+    for start in range(0, geometry.n_views, slab):
+        part = geometry.select(slice(start, start + slab))
+        prepared = _prepared(projections[start : start + slab], part, weights[start : start + slab], filter)
+        if not np.isfinite(prepared).all():
+            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
+        _back_project(
+            prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0],
+            part.axis_row + part.shifts[:, 1], part.sod, part.sdd, part.pixel_pitch, x, y, z, volume,
+        )  # fmt: skip
+    return volume_slices(volume)
+
+
+def _prepared(views: F32, geometry: Geometry, weights: F64, filter: Filter) -> F32:
+    """Views times half their angle and the cosine of each ray, filtered: [view, col + 2, row + 2], the rim twice."""
+    rows, cols = geometry.detector_shape
+    out = np.empty((geometry.n_views, cols + 2, rows + 2), np.float32)
+    for view in range(geometry.n_views):
+        col0, row0 = geometry.origin(view)
+        u = (np.arange(cols) - col0) * geometry.pixel_pitch
+        v = (np.arange(rows) - row0) * geometry.pixel_pitch
+        cosine = geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
+        # The ramp is that of a detector at the rotation axis. Opposite views share a ray: half the angle each.
+        weighed = (views[view] * (weights[view] / 2 * cosine)).astype(np.float32)
+        out[view] = np.pad(filter_projections(weighed, geometry.sample_pitch, filter).T, 1, mode="edge")
+    return out

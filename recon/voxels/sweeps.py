@@ -1,0 +1,84 @@
+"""Ordered subsets: simultaneous corrections from a few views at a time, the common step of SIRT, SART and OS-SIRT.
+
+    x <- x + relaxation C A_sᵀ R (p_s - A_s x)        R = 1 / row sums of A,  C = 1 / column sums of A_s
+
+One subset of all views is SIRT (Gilbert 1972; Gregor & Benson 2008), one view a subset is SART (Andersen & Kak 1984).
+Of the column sums of the subsets the largest are taken, so that one volume serves all and no step is too long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.kernels.cpu.vectors import add_product, misfit
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+
+# Rays shorter than this share of the longest, and voxels that subsets see less than this share of the best seen, tell
+# too little: their corrections would be divided by almost nothing.
+_LEAST = 1e-3
+
+
+def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
+    """View indices of each subset: neighbours in angle lie in different subsets, so each looks from all sides."""
+    order = np.argsort(np.mod(projector.geometry.angles, projector.geometry.period), kind="stable")
+    count = min(subsets, order.size)
+    return [order[start::count] for start in range(count)]
+
+
+class Sweeps:
+    """Passes over all views, subset by subset. Memory: two volumes, and twice the projections.
+
+    Attributes:
+        column_sums: [y, x, z], the largest that a subset has, 0 where too small.
+    """
+
+    def __init__(
+        self, projector: Projector, data: F32, weight: F32 | None, subsets: Sequence[NDArray[np.intp]]
+    ) -> None:
+        """For `data` [view, col, row], each ray weighing `weight` (None: one), in `subsets` of views."""
+        nz, ny, nx = projector.grid.shape
+        self._parts: list[tuple[Projector, F32, F32 | None, F32]] = []
+        self._step = np.zeros((ny, nx, nz), np.float32)  # largest column sums, then their inverse
+        self._gradient = np.empty_like(self._step)
+        for views in subsets:
+            part = projector.subset(views) if len(subsets) > 1 else projector
+            measured = data[views] if len(subsets) > 1 else data
+            rays = None if weight is None else (weight[views] if len(subsets) > 1 else weight)
+            self._gradient[...] = 1
+            scale = _inverse(part.forward_lines(self._gradient))
+            part.adjoint_lines(np.ones_like(scale) if rays is None else rays, self._gradient)
+            np.maximum(self._step, self._gradient, out=self._step)
+            if rays is not None:
+                scale *= rays
+            self._parts.append((part, measured, rays, scale))
+        _inverse(self._step)
+
+    def run(self, x: F32, relaxation: float, nonnegative: bool, rng: np.random.Generator | None) -> float:
+        """One sweep over x [y, x, z], in place, the subsets in random order (None: as given).
+
+        Returns:
+            Σ weight (A x - p)², each ray counted before its own correction.
+        """
+        order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
+        total = 0.0
+        for index in order:
+            part, data, weight, scale = self._parts[index]
+            model = part.forward_lines(x)
+            total += misfit(data, model, weight, scale)
+            part.adjoint_lines(model, self._gradient)
+            add_product(x, relaxation, self._step, self._gradient, nonnegative)
+        return total
+
+
+def _inverse(sums: F32) -> F32:
+    """1 / sums in place, 0 where they are too small."""
+    least = max(_LEAST * float(sums.max()), float(np.finfo(np.float32).tiny))
+    seen = sums > least
+    np.divide(1, sums, out=sums, where=seen)
+    sums[~seen] = 0
+    return sums

@@ -1,0 +1,40 @@
+"""Total variation as a prior of volumes: its proximal step, which starts where the last one ended."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.volume import Grid
+from recon.kernels.cpu import tv as tv_cpu
+
+F32 = NDArray[np.float32]
+
+
+def difference_weights(grid: Grid) -> tuple[float, float, float]:
+    """Weights of the differences along (y, x, z), so that TV is that of a function whatever the voxel's shape."""
+    return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
+
+
+class TotalVariationProx:
+    """argmin_y ½|y - x|² + threshold TV(y), y >= 0 if wanted; isotropic TV, differences of voxels in 1/voxel.
+
+    A few steps of the dual problem a call (Chambolle 2004, J. Math. Imaging Vis. 20, 89; with the bound: Beck &
+    Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field stays from one call to the next: in an outer
+    iteration x changes little, and the steps add up. Memory: three volumes.
+    """
+
+    def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
+        """For volumes of `shape` [y, x, z]; `steps` dual steps a call."""
+        self._dual = np.zeros((3, *shape), np.float32)
+        self._scratch = tv_cpu.dual_scratch(shape)
+        self._weights, self._nonnegative, self._steps = weights, nonnegative, steps
+
+    def __call__(self, x: F32, threshold: float) -> None:
+        """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
+        if threshold > 0:
+            for _ in range(self._steps):
+                tv_cpu.dual_step(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch)
+            tv_cpu.primal(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch, x)
+        elif self._nonnegative:
+            np.maximum(x, 0, out=x)

@@ -1,0 +1,150 @@
+"""Quadrature weights of views, and of their rays, for back-projection: angles in any order, gaps, rays seen twice."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recon.base.geometry import Geometry
+
+F64 = NDArray[np.float64]
+
+_GAP_LIMIT = 8.0  # an angular gap this many times the median may be missing data, not coarse sampling
+_SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
+
+
+def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
+    """Quadrature weight of each view: its Voronoi cell on the half circle, in radians.
+
+    Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
+    where the half circle is covered. A gap of more than 8 median steps, and wider than random angles leave by chance,
+    is a missing wedge: the views beside it weigh as if the sampling went on, and the sum is the angle measured.
+
+    Args:
+        angles: [view], radians, any order and range.
+
+    Raises:
+        ValueError: for no angles, or some that are not finite.
+    """
+    theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
+    if theta.size == 0 or not np.isfinite(theta).all():
+        raise ValueError(f"weights need at least one angle, all finite, got {theta.size}")
+    if theta.size == 1:
+        return np.full(1, np.pi)
+    order = np.argsort(theta, kind="stable")
+    ordered = theta[order]
+    # Group equal angles; the circle closes, so a last group just below π may be the first one.
+    tolerance = _SAME_ANGLE * np.pi / theta.size
+    group = np.concatenate([[0], np.cumsum(np.diff(ordered) > tolerance)])
+    starts = ordered[np.concatenate([[True], np.diff(group) > 0])]
+    if group[-1] > 0 and starts[0] + np.pi - ordered[-1] <= tolerance:
+        group[group == group[-1]] = 0
+        starts = starts[:-1]
+    if starts.size == 1:
+        return np.full(theta.size, np.pi / theta.size)
+    gaps = np.diff(starts, append=starts[0] + np.pi)
+    typical = float(np.median(gaps))
+    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
+    by_chance = np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
+    gaps = np.where(gaps > max(_GAP_LIMIT * typical, by_chance), typical, gaps)
+    cells = (gaps + np.roll(gaps, 1)) / 2
+    weights = np.empty_like(theta)
+    weights[order] = (cells / np.bincount(group))[group]
+    return weights
+
+
+def covers_the_circle(angles: ArrayLike) -> bool:
+    """Whether views stand all around, without a missing arc."""
+    gaps = _gaps(np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi))[1]
+    return gaps.size > 1 and not _leave_an_arc(gaps)
+
+
+def circle_weights(angles: ArrayLike) -> F64:
+    """Quadrature weight of each view: its Voronoi cell on the full circle, in radians; they sum to 2π.
+
+    Args:
+        angles: [view], radians, any order and range; equal ones share their cell.
+
+    Raises:
+        ValueError: for no angles, some that are not finite, or a missing arc (short scans need other weights:
+            Parker 1982).
+    """
+    theta = np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi)
+    if theta.size < 2 or not np.isfinite(theta).all():
+        raise ValueError(f"FDK needs at least two angles, all finite, got {theta.size}")
+    order, gaps = _gaps(theta)
+    if _leave_an_arc(gaps):
+        raise ValueError(
+            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; FDK needs the full circle: use an "
+            "iterative method (os-sirt-tv, sirt) for a short scan"
+        )
+    weights = np.empty_like(theta)
+    weights[order] = (gaps + np.roll(gaps, 1)) / 2
+    return weights
+
+
+def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
+    """Quadrature weight of each ray of a parallel beam, in radians, on a detector made wider by some columns of zeros.
+
+    Over a full turn the ray at u in a view is measured again at -u half a turn on, if the detector reaches so far: the
+    two share their weight. Where the axis stands off the middle the rays of the far columns are measured once and have
+    it all. In between shares rise from 0 to 1 as sin² does, over as many columns as are seen once (at most half of
+    those seen twice), so that columns just off the middle stay means of two (Wang 2002, Med. Phys. 29, 1634, for cone
+    beams). Views that, as they stand, end at some -u need zeros up to there: what filtering spreads into them belongs
+    to the integral.
+
+    Views that do not cover the full turn weigh as `angular_weights` says, whatever the column: what a far column sees
+    from one side only would be missing from the other.
+
+    Returns:
+        [view, col], and the columns of zeros wanted before and after these.
+    """
+    cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
+    both = np.repeat(angular_weights(geometry.angles)[:, None], cols, axis=1)
+    if not covers_the_circle(geometry.angles):
+        return both, (0, 0)
+    opposite = _nearest(geometry.angles, geometry.angles + np.pi)
+    left, right = -0.5 - axis, cols - 0.5 - axis
+    mirrored_left, mirrored_right = -right[opposite], -left[opposite]
+    low, high = np.maximum(left, mirrored_left), np.minimum(right, mirrored_right)
+    u = np.arange(cols) - axis[:, None]
+    share = 0.5 + _rise(u - high[:, None], right - mirrored_right, high - low)
+    share += _rise(low[:, None] - u, mirrored_left - left, high - low)
+    share[high <= low] = 1
+    alone = circle_weights(geometry.angles)[:, None]
+    weights = np.where(share <= 0.5, 2 * share * both, both + (2 * share - 1) * (alone - both))
+    before, after = (math.ceil(wanted.max() - 1e-6) for wanted in (left - mirrored_left, mirrored_right - right))
+    most = 2 * cols  # an axis farther off leaves a hole in the middle that no filter fills
+    return weights, (min(max(0, before), most), min(max(0, after), most))
+
+
+def _rise(beyond: F64, excess: F64, overlap: F64) -> F64:
+    """0 inside the overlap, ± 1/2 at its edge, where `beyond` [view, col] is 0; + where a view sees `excess` more."""
+    ramp = np.clip(np.minimum(np.abs(excess), overlap / 2), 1e-9, None)[:, None]
+    return np.asarray(np.sign(excess)[:, None] * np.sin(np.pi / 2 * np.clip(1 + beyond / ramp, 0, 1)) ** 2 / 2)
+
+
+def _nearest(angles: F64, wanted: F64) -> NDArray[np.intp]:
+    """Index of the view nearest to each wanted angle on the circle."""
+    theta, target = np.mod(angles, 2 * np.pi), np.mod(wanted, 2 * np.pi)
+    order = np.argsort(theta, kind="stable")
+    around = np.concatenate((theta[order[-1:]] - 2 * np.pi, theta[order], theta[order[:1]] + 2 * np.pi))
+    after = np.clip(np.searchsorted(around, target), 1, around.size - 1)
+    closer = after - (target - around[after - 1] < around[after] - target)
+    return order[(closer - 1) % theta.size]
+
+
+def _gaps(theta: F64) -> tuple[NDArray[np.intp], F64]:
+    """The order of angles on the circle, and the gap behind each."""
+    order = np.argsort(theta, kind="stable")
+    return order, np.diff(theta[order], append=theta[order[0]] + 2 * np.pi)
+
+
+def _leave_an_arc(gaps: F64) -> bool:
+    widest, typical = float(gaps.max()), float(np.median(gaps))
+    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
+    by_chance = 2 * np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
+    arc = widest > np.pi / 4 and widest > 3 * typical
+    return arc or widest >= np.pi or widest > max(_GAP_LIMIT * typical, by_chance)

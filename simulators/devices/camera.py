@@ -1,0 +1,281 @@
+"""Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, by the real camera's rules for time.
+
+Nothing runs in the background: the camera catches up with the trigger line and the clock whenever it is asked, and a
+frame is computed when it is taken. Triggers and frames are numbered over the camera's life for faults and noise, so
+that any frame can be made again alone; framestamps start at 0 with every arm.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Set
+from dataclasses import replace
+
+import numpy as np
+
+from drivers import orca_quest
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
+from simulators.devices.shutter import BeamGate, SimulatedSampleMover
+from simulators.devices.sight import Exposed, Sight
+from simulators.devices.trigger_line import TriggerLine
+from simulators.effects.chain import Label
+from simulators.frame.detector import Detector
+from simulators.frame.sensor import CONVERSION, OFFSET
+from simulators.frame.shot import CannotExposeError
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
+
+POLL = 0.02
+"""s between looks at the trigger line while waiting: a stop may cancel pulses, a move may add some."""
+TOLERANCE = 1e-6
+"""s by which a trigger may come early; a float64 of seconds since 1970 resolves 2e-7 s."""
+
+
+class SimulatedOrcaQuest:
+    """Implements drivers.protocols.Camera.
+
+    External triggers come from `line`; one that comes earlier than the least period after the last accepted one is
+    ignored without a word, as the camera does it. An internally triggered camera runs at the least period and stops
+    after the frames it was armed for.
+
+    Args:
+        scene: what stands in the beam.
+        seed: of all random numbers, with the effect's name and the frame's number over the camera's life.
+        shutter, sample: looked at when a frame is exposed: dark, flat or projection.
+        pixel_pitch: mm at the sample of an unbinned sensor pixel.
+        ring_frames: frames that the ring holds; a reader who falls further behind loses the oldest.
+        lost: frames (numbered over the camera's life) that are exposed and then lost: a gap in the framestamps.
+        ignored: external or software triggers that the camera does not react to: no frame and no framestamp. They are
+            numbered over the camera's life too, among the triggers that it was ready for (internal ones count).
+        unplug_at: frame at which the camera disappears.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        line: TriggerLine,
+        clock: Clock,
+        seed: int,
+        shutter: BeamGate,
+        sample: SimulatedSampleMover,
+        *,
+        pixel_pitch: float = orca_quest.PITCH_MM,
+        ring_frames: int = 128,
+        lost: Set[int] = frozenset(),
+        ignored: Set[int] = frozenset(),
+        unplug_at: int | None = None,
+        name: str = "camera",
+    ) -> None:
+        self.name = name
+        self._scene, self._line, self._clock, self._seed = scene, line, clock, seed
+        self._shutter, self._sample, self._pitch, self._ring_frames = shutter, sample, pixel_pitch, ring_frames
+        self._lost, self._ignored, self._unplug_at = lost, ignored, unplug_at
+        self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
+        self._timing = orca_quest.timing(self._settings)
+        self._connected = clock.now()
+        self._triggers = self._frames = self._views = 0  # over the camera's life
+        self._ring: deque[Exposed] = deque()
+        self._armed_for = self._framestamp = 0  # frames asked for (0: not armed), next framestamp
+        self._seen, self._accepted = 0.0, -np.inf  # time of the last trigger looked at, and of the last accepted
+        self._gone = ""
+        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame, where there are any
+        self._lock = threading.Lock()
+
+    @property
+    def timing(self) -> CameraTiming:
+        return self._timing
+
+    @property
+    def detector(self) -> Detector:
+        """Where the pixels of the present frames are, in mm from the rotation axis: the truth that alignment seeks."""
+        return self._sight().detector
+
+    def labels_at(self, time: float) -> tuple[Label, ...]:
+        """The anomalies in the frame, taken already, that was exposed at `time` (s since the Unix epoch)."""
+        return self._labels.get(time, ())
+
+    def rehearse(self) -> None:
+        """Make a frame of the sample with the present settings, which nobody gets and no number counts.
+
+        Raises:
+            CannotExposeError: the scene cannot be exposed so; the message says what would help.
+        """
+        now = self._clock.now()
+        expose(self._scene, self._sight().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        """Apply and read back; the exposure is rounded to 10 ns. Raises DeviceRefused: nothing has changed."""
+        with self._lock:
+            self._answer()
+            problem = orca_quest.refusal(settings)
+            if self._armed_for:
+                problem = "is capturing and takes no settings; disarm it first"
+            if problem:
+                raise DeviceRefused(self.name, problem, request=str(settings), state="Its settings are as they were")
+            self._settings = replace(settings, exposure=round(settings.exposure, 8))
+            self._timing = orca_quest.timing(self._settings)
+            return self._settings
+
+    def arm(self, n_frames: int) -> None:
+        """Framestamps start at 0; triggers that came before are forgotten."""
+        with self._lock:
+            self._answer()
+            if n_frames < 1 or self._armed_for:
+                problem = "is armed already" if self._armed_for else "cannot be armed for less than one frame"
+                raise DeviceRefused(self.name, problem, request=f"arm({n_frames})", advice="disarm() it first, n >= 1")
+            self._ring.clear()
+            self._armed_for, self._framestamp = n_frames, 0
+            self._seen, self._accepted = self._clock.now(), -np.inf
+
+    def software_trigger(self) -> None:
+        """Expose one frame now. Raises DeviceRefused where it is not armed for that, or not ready again."""
+        with self._lock:
+            self._answer(armed=True)
+            now, source = self._clock.now(), self._settings.trigger
+            wait = self._accepted + self._timing.min_period - now
+            if source is not TriggerSource.SOFTWARE:
+                raise DeviceRefused(
+                    self.name, f"waits for {source} triggers, not for software", state="Nothing was exposed"
+                )
+            if wait > TOLERANCE:
+                raise DeviceRefused(
+                    self.name, f"is ready for the next trigger in {wait * 1e3:.3g} ms", state="Nothing was exposed"
+                )
+            self._trigger(now, self._line.angle_at(now))
+
+    def next_frame(self, timeout: float) -> CameraFrame:
+        """The oldest frame not yet taken; waits on the clock.
+
+        Raises:
+            DeviceTimeout: none came within `timeout` s.
+            DeviceError: the ring was overrun (the lost framestamps are named; later frames can still be taken), or
+                the camera is gone.
+        """
+        deadline = self._clock.now() + timeout
+        while True:
+            with self._lock:
+                now = self._clock.now()
+                self._answer(armed=True)
+                self._catch_up(now)
+                self._check_overrun(now)
+                if self._ring and self._ring[0].ready <= now:
+                    return self._render(self._ring.popleft())
+                if not self._ring:
+                    self._answer()
+                due = min(self._due(), deadline, now + POLL)
+                exposed = self._framestamp
+            if now >= deadline:
+                raise DeviceTimeout(
+                    self.name,
+                    f"no frame came within {timeout:g} s; it was armed for {self._armed_for} and exposed {exposed}",
+                    expected=f"a frame by {self._settings.trigger} trigger",
+                    advice="Look whether the stage moves and its trigger output is connected",
+                )
+            self._clock.sleep(due - now)
+
+    def disarm(self) -> None:
+        """Stop and forget the frames not taken; legal in every state."""
+        with self._lock:
+            self._armed_for = 0
+            self._ring.clear()
+
+    def describe(self) -> dict[str, str | int | float]:
+        row0, col0, rows, cols = self._sight().roi
+        return {
+            "model": "C15550-20UP (simulated)",
+            "exposure": self._settings.exposure,
+            "trigger": str(self._settings.trigger),
+            "readout": self._settings.readout,
+            "binning": self._settings.binning,
+            "roi_row": row0,
+            "roi_col": col0,
+            "roi_rows": rows,
+            "roi_cols": cols,
+            "conversion_factor": CONVERSION[self._settings.readout],
+            "conversion_offset": OFFSET[self._settings.readout],
+            "sensor_pitch_mm": orca_quest.PITCH_MM,
+            "min_period": self._timing.min_period,
+            "row_period": self._timing.row_period,
+            "seed": self._seed,
+        }
+
+    def close(self) -> None:
+        self.disarm()
+        self._gone = self._gone or "was closed"
+
+    def _sight(self) -> Sight:
+        return Sight(self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected)
+
+    def _answer(self, armed: bool = False) -> None:
+        """Raises DeviceError where the camera is gone (once its last frame is taken) or not armed though it must be."""
+        if self._gone and not self._ring:
+            raise DeviceError(self.name, self._gone, advice="Connect it anew", state="Frames already taken are good")
+        if armed and not self._armed_for:
+            raise DeviceRefused(self.name, "is not armed", advice="arm(n) it before frames are taken or triggered")
+
+    def _catch_up(self, now: float) -> None:
+        """Look at every trigger up to `now`."""
+        if self._settings.trigger is TriggerSource.EXTERNAL:
+            while (pulse := self._line.next_after(self._seen)) and pulse.time <= now:
+                self._seen = pulse.time
+                if pulse.time - self._accepted > self._timing.min_period - TOLERANCE:
+                    self._trigger(pulse.time, pulse.angle)
+        elif self._settings.trigger is TriggerSource.INTERNAL:
+            while not self._gone and self._framestamp < self._armed_for and (time := self._free_run()) <= now:
+                self._trigger(time, self._line.angle_at(time))
+
+    def _free_run(self) -> float:
+        """Time of the next exposure of a free run; `_seen` is when it was armed."""
+        return max(self._seen, self._accepted + self._timing.min_period)
+
+    def _due(self) -> float:
+        """When something will happen, as far as is known now."""
+        if self._ring:
+            return self._ring[0].ready
+        after = self._settings.exposure + self._timing.readout
+        if self._settings.trigger is TriggerSource.INTERNAL and self._framestamp < self._armed_for:
+            return self._free_run() + after
+        pulse = self._line.next_after(self._seen) if self._settings.trigger is TriggerSource.EXTERNAL else None
+        return pulse.time + after if pulse else np.inf
+
+    def _trigger(self, time: float, angle: float) -> None:
+        """A trigger that the camera is ready for, unless it is one of the faults."""
+        number, self._triggers = self._triggers, self._triggers + 1
+        if self._gone or (number in self._ignored and self._settings.trigger is not TriggerSource.INTERNAL):
+            return
+        self._accepted = time
+        if self._unplug_at is not None and self._frames >= self._unplug_at:
+            self._gone = f"does not answer any more: it was unplugged at frame {self._frames}"
+            return
+        ready = time + self._settings.exposure + self._timing.readout
+        beam, sample = self._shutter.is_open(), self._sample.is_in()
+        if self._frames not in self._lost:
+            self._ring.append(Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
+        self._framestamp += 1
+        self._frames += 1
+        self._views += beam and sample
+
+    def _check_overrun(self, now: float) -> None:
+        over = sum(frame.ready <= now for frame in self._ring) - self._ring_frames
+        if over > 0:
+            gone = [self._ring.popleft().framestamp for _ in range(over)]
+            raise DeviceError(
+                self.name,
+                f"its ring of {self._ring_frames} frames was overrun and {over} frames are lost: framestamps {gone}",
+                advice="Take frames faster, trigger slower or use a larger ring",
+                state="Later frames can still be taken",
+            )
+
+    def _render(self, frame: Exposed) -> CameraFrame:
+        shot = self._sight().shot(frame)
+        try:
+            counts = expose(self._scene, shot)
+        except CannotExposeError as error:
+            advice = "Change the scene, or the settings that it does not go with"
+            raise DeviceRefused(self.name, f"cannot show the scene: {error}", advice=advice) from error
+        if labels := self._scene.chain.labels(shot):
+            self._labels[frame.time] = labels
+        return CameraFrame(counts, frame.framestamp, frame.time)

@@ -1,0 +1,243 @@
+"""Pulse motor: one axis that counts commanded pulses, with limits, stops and a position-synchronised trigger output.
+
+Nothing runs in the background: a move is a closed form of time, so its trigger pulses are put on the line, with their
+exact times, the moment it starts, and those still to come are taken away when it is stopped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Set
+from dataclasses import dataclass
+from enum import IntFlag, StrEnum
+
+from drivers.clock import Clock
+from simulators.devices.motion import TrapezoidMove
+from simulators.devices.trigger_line import Pulse, TriggerLine
+
+MOVES_REMEMBERED = 4096
+"""A camera on a virtual clock may ask for angles long past; this many moves back they are still known."""
+
+
+class Ended(IntFlag):
+    """Why the last move ended early; the values are the PM16C's status bits."""
+
+    LIMIT = 0x20
+    SLOW_STOP = 0x40
+    EMERGENCY = 0x80
+
+
+class Output(StrEnum):
+    """What the trigger output does between its start and its end."""
+
+    OFF = "off"
+    GATE = "gate"
+    PULSES = "pulses"
+
+
+@dataclass(frozen=True)
+class TriggerSettings:
+    """Pulses of `width` s at start, start + interval, ... not beyond end (counts); end < start turns the other way."""
+
+    output: Output = Output.PULSES
+    width: float = 1e-3
+    start: int = 1000
+    end: int = 10_000
+    interval: int = 200
+
+    @property
+    def sign(self) -> int:
+        return -1 if self.end < self.start else 1
+
+    @property
+    def points(self) -> range:
+        return range(self.start, self.end + self.sign, self.sign * self.interval)
+
+
+class TriggerOutput:
+    """The counter behind a trigger output: armed once, then each point fires once while the axis passes it forwards.
+
+    Stopping between points and going on fires the rest; going back over points that fired fires none. A pulse that
+    begins while the last one is still high gives no edge: with width >= interval time the output just stays high.
+
+    Args:
+        lost: pulses, counted from 0 since power-on, that never reach the line.
+        fires_at_start: the start point itself is one of the points.
+    """
+
+    def __init__(self, lost: Set[int], fires_at_start: bool = True) -> None:
+        self.settings = TriggerSettings()
+        self._lost, self._first = lost, 0 if fires_at_start else 1
+        self._armed = False
+        self._fired = 0
+        self._fired_before = 0
+        self._last_fired = -math.inf
+        self._coming: list[float] = []
+
+    def refusal(self, position: int) -> str:
+        """Why it cannot be armed with the axis standing at `position`; "" where it can."""
+        settings = self.settings
+        if settings.output is Output.OFF:
+            return "the output is off"
+        if settings.output is Output.PULSES and settings.sign * (settings.start - position) <= 0:
+            return "the axis stands inside or beyond the start point"
+        return ""
+
+    def arm(self) -> None:
+        self.clear()
+        self._armed = True
+
+    def clear(self) -> None:
+        self._fired_before += self._fired
+        self._fired, self._coming, self._armed = 0, [], False
+
+    def ready(self, now: float) -> bool:
+        """A pulse output is ready until its start point is passed; a gate stays so."""
+        self.settle(now)
+        return self._armed and (self.settings.output is Output.GATE or self._fired == 0)
+
+    def settle(self, now: float) -> None:
+        """Count as fired what has passed."""
+        fired = [time for time in self._coming if time <= now]
+        self._fired += len(fired)
+        self._last_fired = max(fired, default=self._last_fired)
+        self._coming = self._coming[len(fired) :]
+
+    def follow(self, move: TrapezoidMove, now: float) -> list[tuple[float, int]]:
+        """(time, count) of the edges that `move` gives from `now` on; what was foreseen for later is forgotten."""
+        self.settle(now)
+        self._coming = []
+        if not self._armed:
+            return []
+        forwards = move.direction == self.settings.sign
+        if self.settings.output is Output.GATE:
+            entry = self.settings.start if forwards else self.settings.end
+            time = _arrival(move, entry)
+            return [] if time is None or time <= now else [(time, entry)]
+        edges, high_until = [], self._last_fired + self.settings.width
+        points = self.settings.points[self._first :]
+        for index, point in enumerate(points[self._fired :] if forwards else (), self._fired):
+            arrival = _arrival(move, point)
+            if arrival is None:
+                break
+            time = max(arrival, math.nextafter(now, math.inf))  # not fired yet, so it is still to come
+            if time > high_until and self._fired_before + index not in self._lost:
+                edges.append((time, point))
+            high_until = time + self.settings.width
+            self._coming.append(time)
+        return edges
+
+
+def _arrival(move: TrapezoidMove, position: int) -> float | None:
+    """When a move arrives at `position`, if it does; it does not arrive where it starts."""
+    low, high = sorted((move.start, move.target))
+    return move.time_at(position) if low <= position <= high and position != move.start else None
+
+
+class PulseMotor:
+    """One axis. `line()` is where its trigger output goes, or None where no cable is plugged in.
+
+    Args:
+        counts_per_turn: pulses for 2π of true angle.
+        lost: trigger pulses, counted from 0 since power-on, that never reach the line.
+        stall_at: a move that would pass this count stops there at once (EMERGENCY), as when an interlock trips.
+        switch_at: a move that would pass this count stops there at once (LIMIT), as by a limit switch.
+        fires_at_start: a train's start point itself gives a pulse.
+
+    Places may be changed while it stands, as by a person who clears the way.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        line: Callable[[], TriggerLine | None],
+        *,
+        counts_per_turn: int,
+        lost: Set[int] = frozenset(),
+        stall_at: int | None = None,
+        switch_at: int | None = None,
+        fires_at_start: bool = True,
+    ) -> None:
+        self.stall_at, self.switch_at = stall_at, switch_at
+        self.trigger = TriggerOutput(lost, fires_at_start)
+        self.limits: tuple[int, int] | None = None
+        self.ended = Ended(0)
+        self._clock, self._line = clock, line
+        self._angle_of_count = 2 * math.pi / counts_per_turn
+        self.zero = 0
+        """Count of the place where it stood at power-on."""
+        self._moves = deque([(TrapezoidMove(clock.now(), 0.0, 0.0, ()), self.zero)], maxlen=MOVES_REMEMBERED)
+
+    @property
+    def move(self) -> TrapezoidMove:
+        """The move under way, or the last one."""
+        return self._moves[-1][0]
+
+    def moving(self) -> bool:
+        return self._clock.now() < self.move.end
+
+    def position(self) -> int:
+        """Pulses put out so far, signed."""
+        exact = self.move.position(self._clock.now())
+        return math.floor(exact) if self.move.direction >= 0 else math.ceil(exact)
+
+    def angle_at(self, time: float) -> float:
+        """True angle in radians at any time since the oldest move remembered."""
+        move, zero = next((past for past in reversed(self._moves) if past[0].begin <= time), self._moves[0])
+        return (move.position(time) - zero) * self._angle_of_count
+
+    def preset(self, count: int) -> None:
+        """Call the place where it stands `count`; nothing turns."""
+        now, here = self._clock.now(), self.position()
+        self.zero += count - here
+        self._moves.append((TrapezoidMove(now, count, count, ()), self.zero))
+
+    def start(self, target: int, speed: float, acceleration: float) -> None:
+        """Move from standing to `target` (counts; counts/s, counts/s²), or to the limit or stall on the way."""
+        now, here = self._clock.now(), self.position()
+        move = TrapezoidMove.between(here, target, speed, acceleration, begin=now)
+        self.ended = Ended(0)
+        low, high = self.limits or (-math.inf, math.inf)
+        faults = ((self.switch_at, Ended.LIMIT), (self.stall_at, Ended.EMERGENCY))
+        for stop, why in ((high, Ended.LIMIT), (low, Ended.LIMIT), *faults):
+            if stop is not None and min(here, move.target) < stop < max(here, move.target):
+                move, self.ended = move.halted(stop), why
+        if (here >= high and move.direction > 0) or (here <= low and move.direction < 0):
+            move, self.ended = TrapezoidMove(now, here, here, ()), Ended.LIMIT
+        self._moves.append((move, self.zero))
+        self._put_on_line(now)
+
+    def stop(self, acceleration: float) -> None:
+        """Slow down with `acceleration` (counts/s²) to the last pulse that still comes on the way."""
+        now, move = self._clock.now(), self.move
+        self.ended = Ended.SLOW_STOP
+        if not self.moving():
+            return
+        position, velocity = move.position(now), move.velocity(now)
+        stand = position + move.direction * velocity**2 / (2 * acceleration)
+        last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
+        if move.direction * (last - position) <= 0:
+            self._replace(move.halted(last))
+        else:
+            braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
+            self._replace(TrapezoidMove(braked.begin, braked.start, last, braked.phases))
+        self._put_on_line(now)
+
+    def halt(self) -> None:
+        """Stand at once, at the last pulse put out."""
+        now = self._clock.now()
+        if self.moving():
+            self._replace(self.move.halted(self.position()))
+            self._put_on_line(now)
+        self.ended = Ended.EMERGENCY
+
+    def _replace(self, move: TrapezoidMove) -> None:
+        """The move under way ends otherwise than it was to."""
+        self._moves[-1] = (move, self.zero)
+
+    def _put_on_line(self, now: float) -> None:
+        edges = self.trigger.follow(self.move, now)
+        if (line := self._line()) is not None:
+            line.cancel_after(now)
+            line.schedule(Pulse(time, (count - self.zero) * self._angle_of_count) for time, count in edges)

@@ -1,0 +1,98 @@
+"""Sight: what the simulated camera sees of a scene with its present settings: its pixels, and each frame's shot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers import orca_quest
+from drivers.protocols import CameraSettings
+from simulators.frame.detector import Detector
+from simulators.frame.sensor import CONVERSION
+from simulators.frame.shot import AngleAt, Shot
+from simulators.scenes.scene import Scene
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A frame that was exposed and is not computed yet.
+
+    Attributes:
+        framestamp: counts from 0 with every arm.
+        number: over the camera's life.
+        time: of the trigger, s since the Unix epoch.
+        angle: of the stage then, radians.
+        ready: when the frame can be taken, s since the Unix epoch.
+        beam, sample: whether the shutter was open, and the sample in.
+        view: projections exposed before this one.
+    """
+
+    framestamp: int
+    number: int
+    time: float
+    angle: float
+    ready: float
+    beam: bool
+    sample: bool
+    view: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A scene behind a camera.
+
+    Attributes:
+        scene: what stands in the beam.
+        settings: the camera's.
+        pitch: mm at the sample of an unbinned sensor pixel.
+        seed: of all random numbers.
+        angle_at: of the stage, radians at s since the Unix epoch.
+        connected: s since the Unix epoch, from which what ages with time is counted.
+    """
+
+    scene: Scene
+    settings: CameraSettings
+    pitch: float
+    seed: int
+    angle_at: AngleAt
+    connected: float
+
+    @property
+    def roi(self) -> tuple[int, int, int, int]:
+        """(row0, col0, rows, cols) of the sensor."""
+        return self.settings.roi or (0, 0, *orca_quest.SENSOR_SHAPE)
+
+    @property
+    def detector(self) -> Detector:
+        row0, col0, *_ = self.roi
+        binning = self.settings.binning
+        axis_row, axis_col = ((n - 1) / 2 for n in orca_quest.SENSOR_SHAPE)
+        axis_col += self.scene.axis_offset_px
+        middle = (binning - 1) / 2  # of a binned pixel, in sensor pixels from the middle of its first
+        return Detector(
+            shape=orca_quest.timing(self.settings).shape,
+            pitch=self.pitch * binning,
+            axis_col=(axis_col - col0 - middle) / binning,
+            axis_row=(axis_row - row0 - middle) / binning,
+            sod=self.scene.beam.source_distance,
+        )
+
+    def shot(self, frame: Exposed) -> Shot:
+        return Shot(
+            detector=self.detector,
+            exposure=self.settings.exposure,
+            time=frame.time,
+            angle=frame.angle,
+            angle_at=self.angle_at,
+            elapsed=frame.time - self.connected,
+            row_period=orca_quest.timing(self.settings).row_period,
+            roi=self.roi,
+            binning=self.settings.binning,
+            readout=self.settings.readout,
+            conversion=CONVERSION[self.settings.readout],
+            beam=frame.beam,
+            sample=frame.sample,
+            radius=self.scene.sample.radius,
+            seed=self.seed,
+            frame=frame.number,
+            view=frame.view,
+        )

@@ -1,0 +1,144 @@
+"""View: the rays of a frame as the kernels take them, and which bodies may cast a shadow on which rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.frame.shot import CannotExposeError
+from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed
+
+Reals = NDArray[np.float64]
+Wholes = NDArray[np.int64]
+
+
+class View(NamedTuple):
+    """Numba takes it as it is.
+
+    Attributes:
+        u, v: float64 [col], [row], mm.
+        pitch: mm.
+        sod: mm, infinite in a parallel beam.
+        axes: float64 [pose, 3, 3] and
+        origin: float64 [pose, 3], see Pose.frames; one pose for the frame, or one a row.
+        upright: parallel beam, and the sample's z is the laboratory's v: rows see a cylinder alike.
+        first: int64 [row + 1]; the bodies first[j] to first[j + 1] of the next may shadow row j.
+        bodies: int64, in their order.
+        first_round, round: the same for upright cylinders, which are in `bodies` where the view is not upright.
+    """
+
+    u: Reals
+    v: Reals
+    pitch: float
+    sod: float
+    axes: Reals
+    origin: Reals
+    upright: bool
+    first: Wholes
+    bodies: Wholes
+    first_round: Wholes
+    round: Wholes
+
+
+def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> View:
+    """The rays of a frame.
+
+    Args:
+        names: what each solid is called, for messages.
+
+    Raises:
+        ValueError: a pose that is not one a row.
+        CannotExposeError: a body at or behind the source of a cone.
+    """
+    rows = detector.shape[0]
+    if pose.angle.shape != (rows,):
+        raise ValueError(f"the pose has {pose.angle.size} angles and the detector {rows} rows; give one a row")
+    axes, origin = (pose if not _alike(pose) else _of_row(pose, 0)).frames()
+    upright = math.isinf(detector.sod) and (pose.tilt is None or not pose.tilt.any())
+    low, high = _reach(p, axes, origin, 2)
+    ahead = np.ones(p.kind.size, dtype=np.bool_)
+    if math.isfinite(detector.sod):
+        nearest, farthest = _reach(p, axes, origin, 1)
+        ahead = nearest > -detector.sod
+        _check_ahead(p, names, axes, origin, detector.sod, np.flatnonzero(~ahead))
+        large, small = (detector.sod / np.where(ahead, detector.sod + b, np.inf) for b in (nearest, farthest))
+        low, high = np.minimum(low * large, low * small), np.maximum(high * large, high * small)
+    above = np.clip(np.ceil(low / detector.pitch + detector.axis_row - 1e-9), 0, rows)
+    below = np.clip(np.floor(high / detector.pitch + detector.axis_row + 1e-9) + 1, 0, rows)
+    above, below = np.where(ahead, above, 0).astype(np.int64), np.where(ahead, below, rows).astype(np.int64)
+    is_round = (p.kind == CYLINDER) & upright
+    return View(
+        detector.u(), detector.v(), float(detector.pitch), float(detector.sod), axes, origin, bool(upright),
+        *_by_row(above, below, ~is_round, rows), *_by_row(above, below, is_round, rows),
+    )  # fmt: skip
+
+
+def _alike(pose: Pose) -> bool:
+    """Whether all rows see the sample alike."""
+    return all(a is None or bool((a == a[:1]).all()) for a in (pose.angle, pose.shift, pose.tilt))
+
+
+def _of_row(pose: Pose, j: int) -> Pose:
+    part = slice(j, j + 1)
+    return Pose(
+        pose.angle[part],
+        None if pose.shift is None else pose.shift[part],
+        None if pose.tilt is None else pose.tilt[part],
+    )
+
+
+def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]:
+    """Bounds of each body along the laboratory's k-th axis in all poses, mm: its box in the first pose, and as much
+    more as the poses differ."""
+    axis, at = axes[:, :, k], np.einsum("ri,ri->r", axes[:, :, k], origin)
+    drift = np.linalg.norm(axis - axis[0], axis=1).max(initial=0.0)
+    far = np.linalg.norm(p.centre, axis=1) + np.linalg.norm(p.extent, axis=1)
+    reach = p.extent @ np.abs(axis[0]) + drift * far + np.abs(at - at[0]).max(initial=0.0)
+    middle = p.centre @ axis[0] - at[0]
+    return middle - reach, middle + reach
+
+
+def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, sod: float, doubtful: Wholes) -> None:
+    """Raises CannotExposeError where one of the doubtful bodies, seen exactly, is not wholly in front of the source."""
+    for i in doubtful:
+        axis = axes[:, :, 1]
+        if p.kind[i] == CYLINDER:
+            reach = p.size[i, 0] * np.hypot(axis[:, 0], axis[:, 1]) + p.size[i, 1] * np.abs(axis[:, 2])
+        elif p.kind[i] == ELLIPSOID:
+            reach = np.linalg.norm(np.linalg.solve(p.matrix[i].T, axis.T), axis=0)
+        else:
+            corners = p.vertices[p.first_vertex[i] : p.first_vertex[i + 1]]
+            reach = -(axis @ corners.T).min(axis=1)
+        gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
+        if not gap > 1e-9 * sod:
+            raise CannotExposeError(
+                f"solid {p.owner[i]} ({names[p.owner[i]]}) reaches {-gap:.3g} mm behind the source, which stands "
+                f"{sod:g} mm before the rotation axis; it must lie wholly in front: move it, or raise sod. "
+                f"No frame was computed"
+            )
+
+
+@njit(cache=True)
+def _by_row(above: Wholes, below: Wholes, wanted: NDArray[np.bool_], rows: int) -> tuple[Wholes, Wholes]:
+    """The wanted bodies that touch each row, and where each row's begin: as much work as there are entries."""
+    first = np.zeros(rows + 1, np.int64)
+    for b in range(above.size):
+        if wanted[b]:
+            for j in range(above[b], below[b]):
+                first[j + 1] += 1
+    for j in range(rows):
+        first[j + 1] += first[j]
+    filled, bodies = first.copy(), np.empty(first[rows], np.int64)
+    for b in range(above.size):
+        if wanted[b]:
+            for j in range(above[b], below[b]):
+                bodies[filled[j]] = b
+                filled[j] += 1
+    return first, bodies

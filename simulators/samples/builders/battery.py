@@ -1,0 +1,114 @@
+"""A battery in miniature: a can with a wall, filled with electrolyte and ~150 dense particles that do not overlap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
+
+# Attenuation times the can's radius. Whatever the can's size, its largest line integral lies between 1.5 and 3, so that
+# at least 5 % of the beam comes through.
+WALL, ELECTROLYTE, PARTICLE = 0.9, 0.15, 1.9
+
+CANDIDATES, ROUNDS = 256, 40
+MOST_PARTICLES = 5000
+"""Each looks at all that have their places: so many take a minute."""
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Arguments of `battery`, with the seed of its generator, as a scene gives them."""
+
+    field_of_view: tuple[float, float]
+    n_particles: int = 150
+    fill: float = 0.12
+    seed: int = 0
+
+    def solids(self) -> tuple[Solid, ...]:
+        return battery(np.random.default_rng(self.seed), self.field_of_view, self.n_particles, self.fill)
+
+
+def battery(
+    rng: np.random.Generator,
+    field_of_view: tuple[float, float] = (0.9, 0.9),
+    n_particles: int = 150,
+    fill: float = 0.12,
+) -> tuple[Solid, ...]:
+    """Solids of a cylindrical cell that fits into the field of view, with air on all sides.
+
+    Half of the particles are ellipsoids, a third octahedra and the rest plates (the habits of LiCoO2 crystals), in any
+    orientation, their sizes spread log-normally. A particle's attenuation is its contrast to the electrolyte.
+
+    Args:
+        field_of_view: (width, height) in mm.
+        n_particles: how many.
+        fill: share of the electrolyte's volume that spheres of the particles' median radius would take.
+
+    Raises:
+        ValueError: for a field of view that is not positive or not of this world, too many particles, or where they do
+            not fit without overlap.
+    """
+    width, height = field_of_view
+    if not (width > 0 and height > 0):
+        raise ValueError(f"field_of_view must be (width, height) > 0 in mm, got {field_of_view}")
+    if not (LEAST <= width <= MOST and LEAST <= height <= MOST):
+        raise ValueError(f"field_of_view must lie in {LEAST:g} ... {MOST:g} mm, got {field_of_view}")
+    if not (0 <= n_particles <= MOST_PARTICLES and 0 < fill <= 1):
+        raise ValueError(
+            f"n_particles must be 0 ... {MOST_PARTICLES}, fill above 0 and 1 at most, got {n_particles} and {fill}"
+        )
+    radius, inside, tall = 0.44 * width, 0.95 * 0.44 * width, 0.9 * height
+    can = (Tube(radius, inside, tall, WALL / radius), Cylinder(inside, tall, ELECTROLYTE / radius))
+    if n_particles < 1:
+        return can
+    median = (fill * inside**2 * tall / (4 / 3 * n_particles)) ** (1 / 3)
+    sizes = np.sort(median * np.exp(np.clip(rng.normal(0, 0.25, n_particles), -0.6, 0.45)))[::-1]
+    shapes = [_particle(rng, size, PARTICLE / radius) for size in sizes]
+    centres = _place(rng, np.array([reach for _, reach in shapes]), inside, tall / 2, gap=0.05 * median)
+    return can + tuple(
+        replace(body, centre=(x, y, z)) for (body, _), (x, y, z) in zip(shapes, centres.tolist(), strict=True)
+    )
+
+
+def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tuple[Ellipsoid | Octahedron | Box, float]:
+    """A particle at the origin and the radius of the sphere around it; `size` is about its own radius in mm."""
+    kind = rng.choice(3, p=(1 / 2, 1 / 3, 1 / 6))
+    a, b, c = (size * rng.uniform(0.8, 1.2, 3)).tolist()
+    w, x, y, z = rng.normal(size=4).tolist()
+    if kind == 0:
+        return Ellipsoid((a, b, c), attenuation, quaternion=(w, x, y, z)), max(a, b, c)
+    if kind == 1:
+        half = (1.2 * a, 1.2 * b, 1.2 * c)
+        return Octahedron(half, attenuation, quaternion=(w, x, y, z)), max(half)
+    edges = (1.7 * a, 1.7 * b, 0.7 * c)
+    return Box(edges, attenuation, quaternion=(w, x, y, z)), float(np.linalg.norm(edges)) / 2
+
+
+def _place(
+    rng: np.random.Generator, reach: NDArray[np.float64], radius: float, half_height: float, gap: float
+) -> NDArray[np.float64]:
+    """Centres (x, y, z) [n, 3] of spheres that keep `gap` between each other and the wall: random sequential addition,
+    in the order given (large ones first fill best).
+
+    Raises:
+        ValueError: no room is found for one of them.
+    """
+    centres = np.empty((reach.size, 3))
+    for i, own in enumerate(reach):
+        for _ in range(ROUNDS):
+            point = rng.uniform(-1, 1, (CANDIDATES, 3)) * (radius, radius, half_height - own - gap)
+            clear = np.hypot(point[:, 0], point[:, 1]) < radius - own - gap
+            distance = np.linalg.norm(point[:, None] - centres[None, :i], axis=2)
+            clear &= (distance > own + reach[:i] + gap).all(axis=1)
+            if half_height - own - gap > 0 and clear.any():
+                centres[i] = point[np.argmax(clear)]
+                break
+        else:
+            raise ValueError(
+                f"only {i} of {reach.size} particles find room in a can of {radius:.3g} x {2 * half_height:.3g} mm "
+                f"(radius x height); lower fill or n_particles"
+            )
+    return centres

@@ -1,0 +1,177 @@
+"""Cathode: grains packed in electrolyte in a can, with a current collector below and a separator above if asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from simulators.samples.bodies.solids import LEAST, MOST, Cylinder, Tube
+from simulators.samples.builders.arrangement import arrange, bodies_of
+from simulators.samples.builders.grains import HABITS, Sizes, core, crack, grains
+from simulators.samples.builders.piece import Piece, check_roles
+
+WIDEST = 2.0
+"""Of the logarithm of the grains' diameters: the largest are 20 000 times the smallest."""
+
+MADE_OF: Mapping[str, str] = MappingProxyType(
+    {
+        "wall": "Al",
+        "electrolyte": "electrolyte",
+        "collector": "Al",
+        "separator": "separator",
+        "particle": "LiCoO2",
+        "pore": "electrolyte",
+        "crack": "electrolyte",
+    }
+)
+"""What each part is made of where the scene does not say."""
+
+GREY: Mapping[str, float] = MappingProxyType(
+    {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
+)
+"""Attenuation times the can's radius, in a beam without energies: whatever the can's size, about 5 % come through where
+a cathode of 0.45 is thickest."""
+
+
+@dataclass(frozen=True)
+class Cathode:
+    """A cell around the rotation axis.
+
+    How much fits depends on the grains: spheres go up to a fill of 0.55, the default habits to 0.45, octahedra or
+    plates alone to 0.35.
+
+    Attributes:
+        diameter, height: mm, of the can outside; it has neither lid nor bottom.
+        wall_um: thickness of the can's wall.
+        size_um: median diameter of spheres of the grains' volumes.
+        spread: standard deviation of the logarithm of the diameter, 2 at most; none is farther than 2.5 of them from
+            the median.
+        fill: share of the volume between collector and separator that grains take, pores and cracks included.
+        habits: shares of the number of sphere, ellipsoid, octahedron, truncated_octahedron and plate.
+        irregularity: axes are longer or shorter by up to this share.
+        aspect: width over thickness of plates.
+        hollow, cracked: shares of the grains that have a hole, of half their size, or a crack.
+        gap_um: between two grains at least.
+        collector_um, separator_um: thickness of the foil below and of the film above; 0: none.
+        made_of: other materials for parts: {particle: NMC622, wall: steel}; they are looked at in a beam with energies.
+        attenuation: 1/mm of parts, in a beam without, or in place of all materials.
+        seed: of all random numbers.
+    """
+
+    diameter: float = 0.6
+    height: float = 0.5
+    wall_um: float = 20.0
+    size_um: float = 25.0
+    spread: float = 0.25
+    fill: float = 0.4
+    habits: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType(
+            {"octahedron": 0.4, "truncated_octahedron": 0.25, "ellipsoid": 0.2, "plate": 0.15}
+        )
+    )
+    irregularity: float = 0.1
+    aspect: float = 3.0
+    hollow: float = 0.0
+    cracked: float = 0.0
+    gap_um: float = 0.0
+    collector_um: float = 0.0
+    separator_um: float = 0.0
+    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("diameter", "height", "wall_um", "size_um"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("spread", "gap_um", "collector_um", "separator_um"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        if not LEAST <= self.size_um * 1e-3 <= MOST:
+            raise ValueError(f"size_um must lie in {LEAST * 1e3:g} ... {MOST * 1e3:g}, got {self.size_um}")
+        if self.gap_um * 1e-3 > MOST:
+            raise ValueError(f"gap_um must be {MOST * 1e3:g} at most, got {self.gap_um}")
+        if self.spread > WIDEST:
+            raise ValueError(f"spread must be {WIDEST:g} at most, got {self.spread}")
+        if not 0 <= self.fill < 0.64:
+            raise ValueError(f"fill must be >= 0 and below 0.64, where balls jam, got {self.fill}")
+        if not 0 <= self.irregularity < 1 or not self.aspect > 0:
+            raise ValueError(
+                f"irregularity must be in 0 ... 1, aspect positive, got {self.irregularity}, {self.aspect}"
+            )
+        if not (min(self.hollow, self.cracked) >= 0 and self.hollow + self.cracked <= 1):
+            raise ValueError(f"hollow and cracked are shares, 1 at most in sum, got {self.hollow} and {self.cracked}")
+        if unknown := [habit for habit in self.habits if habit not in HABITS]:
+            raise ValueError(f"habits: {unknown[0]!r} is unknown; known: {', '.join(HABITS)}")
+        if not (sum(self.habits.values()) > 0 and min(self.habits.values()) >= 0):
+            raise ValueError(f"habits are shares >= 0, not all 0, got {dict(self.habits)}")
+        if sum(self.habits.values()) > MOST:
+            raise ValueError(f"habits are shares, {MOST:g} at most in sum, got {dict(self.habits)}")
+        if not (self.inner_radius > 0 and self.bed_height > 0):
+            raise ValueError(f"nothing is left inside {self.diameter} x {self.height} mm for the cathode")
+        check_roles("made_of", MADE_OF, self.made_of)
+        check_roles("attenuation", MADE_OF, self.attenuation)
+
+    @property
+    def inner_radius(self) -> float:
+        """mm, of the can."""
+        return self.diameter / 2 - self.wall_um * 1e-3
+
+    @property
+    def bed_height(self) -> float:
+        """mm, of the room for the grains."""
+        return self.height - (self.collector_um + self.separator_um) * 1e-3
+
+    @property
+    def materials(self) -> Mapping[str, str]:
+        return {**MADE_OF, **self.made_of}
+
+    @property
+    def greys(self) -> Mapping[str, float]:
+        """1/mm."""
+        return {**{role: value * 2 / self.diameter for role, value in GREY.items()}, **self.attenuation}
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """The can, what is in it, and the grains.
+
+        Raises:
+            ValueError: a grain is larger than the cell, or they do not find room; see `arrange`.
+        """
+        rng = np.random.default_rng(self.seed)
+        radius, bed = self.inner_radius, self.bed_height
+        below, above = self.collector_um * 1e-3, self.separator_um * 1e-3
+        cell = [
+            Piece(Tube(self.diameter / 2, radius, self.height, 1.0), "wall"),
+            Piece(Cylinder(radius, self.height, 1.0), "electrolyte"),
+        ]
+        if below:
+            foil = Cylinder(radius, below, 1.0, (0.0, 0.0, (below - self.height) / 2))
+            cell.append(Piece(foil, "collector", "electrolyte"))
+        if above:
+            film = Cylinder(radius, above, 1.0, (0.0, 0.0, (self.height - above) / 2))
+            cell.append(Piece(film, "separator", "electrolyte"))
+        sizes = Sizes(self.size_um * 1e-3, self.spread)
+        wanted = self.fill * math.pi * radius**2 * bed
+        loose = grains(rng, wanted, sizes, self.habits, self.irregularity, self.aspect)
+        if not loose and self.fill:
+            raise ValueError(
+                f"a grain of {self.size_um:g} um is more than the fill of {self.fill:g} asks for; make the cell larger "
+                "or the grains smaller"
+            )
+        if not loose:
+            return tuple(cell)
+        centres = arrange(rng, bodies_of(loose), radius, bed, self.gap_um * 1e-3)
+        centres[:, 2] += (below - above) / 2
+        for grain, (x, y, z) in zip(loose, centres.tolist(), strict=True):
+            placed = replace(grain, centre=(x, y, z))
+            cell.append(Piece(placed, "particle", "electrolyte"))
+            fate = rng.uniform()
+            if fate < self.hollow:
+                cell.append(Piece(core(placed), "pore", "particle"))
+            elif fate < self.hollow + self.cracked:
+                cell.append(Piece(crack(rng, placed), "crack", "particle"))
+        return tuple(cell)

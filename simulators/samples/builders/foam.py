@@ -1,0 +1,186 @@
+"""Foam: a cylinder or box of matter with many round holes that do not touch, from large to as small as still fit in.
+
+Each hole is put where the largest one fits, of all of many random points (the idea of Pelt, Hendriksen and Batenburg,
+"Foam-like phantoms for comparing tomography algorithms", J. Synchrotron Rad. 29, 2022).
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid
+from simulators.samples.builders.piece import Piece, check_roles
+
+Reals = NDArray[np.float64]
+
+MADE_OF: Mapping[str, str] = MappingProxyType({"matter": "polypropylene", "hole": "air"})
+MOST_HOLES, MOST_CANDIDATES = 200_000, 10_000_000
+"""They take minutes, and 2 GB of memory."""
+POINTS_A_CELL = 8
+GREY = 2.0
+"""Attenuation of the matter times half its width, in a beam without energies."""
+
+
+@dataclass(frozen=True)
+class Foam:
+    """A foam around the rotation axis.
+
+    Attributes:
+        diameter, height: mm, of a cylinder.
+        edges: mm (x, y, z), of a box instead.
+        n_holes: at most; fewer where none of `smallest_um` fits any more.
+        largest_um, smallest_um: diameters of holes.
+        gap_um: of matter, between holes and to the outside, at least.
+        candidates: random points among which the places are sought; more of them make a denser foam.
+        made_of: other materials for matter and hole, in a beam with energies.
+        attenuation: 1/mm of them, in a beam without, or in place of materials.
+        seed: of all random numbers.
+    """
+
+    diameter: float = 0.6
+    height: float = 0.5
+    edges: tuple[float, float, float] | None = None
+    n_holes: int = 1000
+    largest_um: float = 60.0
+    smallest_um: float = 5.0
+    gap_um: float = 1.0
+    candidates: int = 200_000
+    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not min(self.diameter, self.height, *(self.edges or ())) > 0:
+            raise ValueError(
+                f"diameter, height and edges must be positive, got {self.diameter}, {self.height}, {self.edges}"
+            )
+        if not (self.largest_um >= self.smallest_um > 0 and self.gap_um >= 0):
+            raise ValueError(
+                f"holes go from largest_um down to smallest_um > 0 with gap_um >= 0 between them, got "
+                f"{self.largest_um}, {self.smallest_um} and {self.gap_um}"
+            )
+        lengths = (self.diameter, self.height, *(self.edges or ()))
+        if not LEAST <= min(lengths) <= max(lengths) <= MOST:
+            raise ValueError(f"diameter, height and edges must lie in {LEAST:g} ... {MOST:g} mm, got {lengths}")
+        if not (self.smallest_um * 0.5e-3 >= LEAST and self.gap_um * 1e-3 <= MOST):
+            raise ValueError(
+                f"smallest_um must be {2e3 * LEAST:g} at least and gap_um {1e3 * MOST:g} at most, got "
+                f"{self.smallest_um} and {self.gap_um}"
+            )
+        if not (self.n_holes >= 0 and self.candidates >= 1):
+            raise ValueError(f"n_holes must be >= 0, candidates positive, got {self.n_holes} and {self.candidates}")
+        if self.n_holes > MOST_HOLES or self.candidates > MOST_CANDIDATES:
+            raise ValueError(
+                f"n_holes must be {MOST_HOLES} and candidates {MOST_CANDIDATES} at most, got {self.n_holes} and "
+                f"{self.candidates}"
+            )
+        check_roles("made_of", MADE_OF, self.made_of)
+        check_roles("attenuation", MADE_OF, self.attenuation)
+
+    @property
+    def materials(self) -> Mapping[str, str]:
+        return {**MADE_OF, **self.made_of}
+
+    @property
+    def greys(self) -> Mapping[str, float]:
+        """1/mm."""
+        width = self.diameter if self.edges is None else max(self.edges[:2])
+        return {"matter": GREY * 2 / width, "hole": 0.0, **self.attenuation}
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """The matter and its holes, the largest first."""
+        rng = np.random.default_rng(self.seed)
+        x, y, z = self.edges or (self.diameter, self.diameter, self.height)
+        points = rng.uniform(-0.5, 0.5, (self.candidates, 3)) * (x, y, z)
+        if self.edges is None:
+            points = points[np.hypot(points[:, 0], points[:, 1]) < self.diameter / 2]
+            wall = self.diameter / 2 - np.hypot(points[:, 0], points[:, 1])
+            room = np.minimum(wall, z / 2 - np.abs(points[:, 2]))
+            matter: Cylinder | Box = Cylinder(self.diameter / 2, self.height, 1.0)
+        else:
+            room = (np.array([x, y, z]) / 2 - np.abs(points)).min(axis=1)
+            matter = Box(self.edges, 1.0)
+        gap, largest = self.gap_um * 1e-3, self.largest_um * 0.5e-3
+        radii = np.minimum(room - gap, largest)
+        found = holes(points, radii, self.smallest_um * 0.5e-3, gap, self.n_holes)
+        return (
+            Piece(matter, "matter"),
+            *(
+                Piece(Ellipsoid((radius,) * 3, 1.0, (px, py, pz)), "hole", "matter")
+                for px, py, pz, radius in found.tolist()
+            ),
+        )
+
+
+def holes(points: Reals, radii: Reals, smallest: float, gap: float, n: int) -> Reals:
+    """Balls (x, y, z, radius), float64 [ball, 4] in mm, from the largest to the smallest; n at most.
+
+    Args:
+        points: float64 [point, 3], where they may be.
+        radii: float64 [point], how large each may be for all that is not a ball.
+        gap: between two balls at least.
+    """
+    low = points.min(axis=0)
+    span = np.maximum(points.max(axis=0) - low, 1e-12)
+    edge = float((span.prod() * POINTS_A_CELL / len(points)) ** (1 / 3))
+    while np.maximum(1, span / edge).prod() > len(points):  # of what is thin or flat there were too many
+        edge *= 1.5
+    cells = np.maximum(1, np.floor(span / edge)).astype(np.int64)
+    size = span / cells * (1 + 1e-9)
+    at = np.floor((points - low) / size).astype(np.int64)
+    at = (at[:, 0] * cells[1] + at[:, 1]) * cells[2] + at[:, 2]
+    order = np.argsort(at, kind="stable")
+    first = np.searchsorted(at[order], np.arange(cells.prod() + 1))
+    return _holes(points[order], radii[order].copy(), low, size, cells, first, smallest, gap, n)
+
+
+@njit(cache=True, nogil=True)
+def _holes(
+    points: Reals,
+    radii: Reals,
+    low: Reals,
+    size: Reals,
+    cells: NDArray[np.int64],
+    first: NDArray[np.int64],
+    smallest: float,
+    gap: float,
+    n: int,
+) -> Reals:
+    """Points stand cell after cell. A new ball is no smaller than any that may yet come, so that it concerns points
+    within two of its radii (and the gap) only."""
+    queue = [(-radii[i], i) for i in range(radii.size) if radii[i] >= smallest]
+    heapq.heapify(queue)
+    out = np.empty((n, 4))
+    found = 0
+    start, stop = np.empty(3, np.int64), np.empty(3, np.int64)
+    while found < n and len(queue) > 0:
+        said, i = heapq.heappop(queue)
+        radius = radii[i]
+        if radius < -said:  # a ball came nearer since
+            if radius >= smallest:
+                heapq.heappush(queue, (-radius, i))
+            continue
+        for a in range(3):
+            out[found, a] = points[i, a]
+            reach = 2 * radius + gap
+            start[a] = max(math.floor((points[i, a] - reach - low[a]) / size[a]), 0)
+            stop[a] = min(math.floor((points[i, a] + reach - low[a]) / size[a]) + 1, cells[a])
+        out[found, 3] = radius
+        found += 1
+        for a in range(start[0], stop[0]):
+            for b in range(start[1], stop[1]):
+                row = (a * cells[1] + b) * cells[2]
+                for j in range(first[row + start[2]], first[row + stop[2]]):
+                    d2 = 0.0
+                    for k in range(3):
+                        d2 += (points[j, k] - points[i, k]) ** 2
+                    radii[j] = min(radii[j], math.sqrt(d2) - radius - gap)
+    return out[:found].copy()

@@ -1,0 +1,144 @@
+"""Grains: crystals and secondary particles of a battery's cathode: sizes, habits, orientations, pores and cracks.
+
+The habits are those of layered oxides by the synthesis (Ariyoshi et al.): octahedra and such with cut corners, plates,
+and the nearly spherical secondary particles of NMC.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from simulators.samples.bodies.solids import Ellipsoid, Octahedron, Plate, Quaternion, TruncatedOctahedron, Vector
+
+Grain = Ellipsoid | Octahedron | Plate | TruncatedOctahedron
+
+HABITS = ("sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate")
+TAIL = 2.5
+"""Standard deviations beyond which no size is drawn."""
+HOLLOW, CRACK = 0.5, (0.95, 0.06)
+"""Size of the core of a hollow grain, of the grain's; radius and half width of a crack, of the sphere inside."""
+MOST = 100_000
+"""Grains of a cell: so many take minutes to arrange."""
+ROUNDEST, FLATTEST = 0.6, 0.85
+"""The least and the most that truncated octahedra keep of their corners."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Diameters of spheres of the grains' volumes: log-normal, cut off at 2.5 standard deviations.
+
+    Attributes:
+        median: mm.
+        spread: standard deviation of the logarithm.
+    """
+
+    median: float
+    spread: float
+
+    def draw(self, rng: np.random.Generator) -> float:
+        while abs(deviation := rng.normal()) > TAIL:
+            pass
+        return self.median * math.exp(self.spread * deviation)
+
+
+def grain(rng: np.random.Generator, habit: str, diameter: float, irregularity: float, aspect: float) -> Grain:
+    """A grain at the origin, of the volume of a sphere of `diameter` (mm), in any orientation.
+
+    Args:
+        irregularity: largest share by which each of its axes is longer or shorter than it should be, before the
+            volume is put right.
+        aspect: width over thickness of plates.
+    """
+    volume = math.pi / 6 * diameter**3
+    w, x, y, z = rng.normal(size=4).tolist()
+    turned: Quaternion = (w, x, y, z)
+    skew = rng.uniform(1 - irregularity, 1 + irregularity, 3)
+    skew /= np.prod(skew) ** (1 / 3)
+
+    def axes(size: float) -> Vector:
+        a, b, c = (size * skew).tolist()
+        return a, b, c
+
+    match habit:
+        case "sphere":
+            return Ellipsoid((diameter / 2,) * 3, 1.0)
+        case "ellipsoid":
+            return Ellipsoid(axes(diameter / 2), 1.0, quaternion=turned)
+        case "octahedron":
+            return Octahedron(axes((3 * volume / 4) ** (1 / 3)), 1.0, quaternion=turned)
+        case "truncated_octahedron":
+            cut = rng.uniform(ROUNDEST, FLATTEST)
+            size = (volume / 4 / (1 / 3 - (1 - cut) ** 3)) ** (1 / 3)
+            return TruncatedOctahedron(axes(size), 1.0, cut, quaternion=turned)
+    width = (8 * aspect * volume / 3 / math.sqrt(3)) ** (1 / 3)
+    return Plate(width, width / aspect, 1.0, quaternion=turned)
+
+
+def grains(
+    rng: np.random.Generator,
+    volume: float,
+    sizes: Sizes,
+    habits: Mapping[str, float],
+    irregularity: float,
+    aspect: float,
+) -> list[Grain]:
+    """Grains until they take `volume` (mm³), to half a grain.
+
+    Args:
+        habits: shares of the grains' number, of any sum.
+
+    Raises:
+        ValueError: that were more than MOST.
+    """
+    names = list(habits)
+    shares = np.array([habits[name] for name in names])
+    largest = math.pi / 6 * (sizes.median * math.exp(TAIL * sizes.spread)) ** 3
+    made: list[Grain] = []
+    taken = 0.0
+    while True:
+        diameter = sizes.draw(rng)
+        own = math.pi / 6 * diameter**3
+        if taken + own / 2 > volume:
+            return made
+        if len(made) == MOST or volume > MOST * largest:
+            raise ValueError(
+                f"{volume:.3g} mm3 of grains of {1e3 * sizes.median:g} um are more than {MOST} grains; make the cell "
+                "smaller, the grains larger or the fill lower"
+            )
+        made.append(grain(rng, str(rng.choice(names, p=shares / shares.sum())), diameter, irregularity, aspect))
+        taken += own
+
+
+def core(grain: Grain) -> Grain:
+    """What a hollow grain lacks: its own shape, in small."""
+    match grain:
+        case Ellipsoid():
+            a, b, c = grain.semi_axes
+            return replace(grain, semi_axes=(HOLLOW * a, HOLLOW * b, HOLLOW * c))
+        case Plate():
+            return replace(grain, width=HOLLOW * grain.width, thickness=HOLLOW * grain.thickness)
+    a, b, c = grain.half_diagonals
+    return replace(grain, half_diagonals=(HOLLOW * a, HOLLOW * b, HOLLOW * c))
+
+
+def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
+    """A crack through a grain's middle: a flat ellipsoid, wholly in the sphere that the grain holds."""
+    radius = inner_radius(grain)
+    w, x, y, z = rng.normal(size=4).tolist()
+    wide, thin = CRACK[0] * radius, CRACK[1] * radius
+    return Ellipsoid((wide, wide, thin), 1.0, grain.centre, (w, x, y, z))
+
+
+def inner_radius(grain: Grain) -> float:
+    """mm, of the largest sphere around a grain's centre that is all in it."""
+    match grain:
+        case Ellipsoid():
+            return min(grain.semi_axes)
+        case Plate():
+            return min(grain.thickness / 2, math.sqrt(3) / 4 * grain.width)
+    to_face = 1 / math.sqrt(sum(1 / half**2 for half in grain.half_diagonals))
+    return to_face if isinstance(grain, Octahedron) else min(to_face, grain.cut * min(grain.half_diagonals))

@@ -1,0 +1,152 @@
+"""Resolution pattern: bars of given widths, a Siemens star and balls of falling size, in a carrier of another material.
+
+From below: balls in a row along x; the star across the rotation axis; and groups of bars, upright ones (side by side
+along x) at y > 0 and lying ones (above each other) at y < 0. Bars and the gaps between them are equally wide: a pair of
+them is twice a width. Everything has its place by the sizes asked for; nothing is random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Vector
+from simulators.samples.builders.piece import Piece, check_roles
+
+MADE_OF: Mapping[str, str] = MappingProxyType({"carrier": "polypropylene", "bar": "Al", "star": "Al", "ball": "Al"})
+GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star": 2.0, "ball": 2.0})
+"""Attenuation times the carrier's radius, in a beam without energies."""
+MOST_BARS, MOST_SPOKES = 100, 1000
+MARGIN = 1.1
+"""The carrier's size over that of what it holds."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """A pattern around the rotation axis.
+
+    Attributes:
+        widths_um: of the bars of each group; none: no bars.
+        bars: in a group, which is a cube.
+        star_um: diameter of the star; 0: none. At a radius r a pair of spoke and gap is 2 π r / spokes wide.
+        spokes: of the star.
+        star_height_um: its thickness.
+        balls_um: diameters; none: no balls.
+        made_of: other materials for carrier, bar, star and ball, in a beam with energies.
+        attenuation: 1/mm of them, in a beam without, or in place of materials.
+    """
+
+    widths_um: tuple[float, ...] = (30.0, 20.0, 14.0, 10.0, 7.0, 5.0)
+    bars: int = 4
+    star_um: float = 500.0
+    spokes: int = 36
+    star_height_um: float = 60.0
+    balls_um: tuple[float, ...] = (60.0, 40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
+    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        if not min(*self.widths_um, *self.balls_um, self.star_height_um, 1.0) > 0:
+            raise ValueError(f"widths, diameters and heights must be positive in um, got {self}")
+        lengths = [um * 1e-3 for um in (*self.widths_um, *self.balls_um, self.star_height_um, self.star_um or 1.0)]
+        if not LEAST <= min(map(abs, lengths)) <= max(lengths) <= MOST:
+            raise ValueError(
+                f"widths, diameters and heights must lie in {1e3 * LEAST:g} ... {1e3 * MOST:g} um, got {self}"
+            )
+        if max(len(self.widths_um), len(self.balls_um), self.bars) > MOST_BARS or self.spokes > MOST_SPOKES:
+            raise ValueError(
+                f"a pattern has {MOST_BARS} widths, bars of each and balls at most, and {MOST_SPOKES} spokes, got "
+                f"{len(self.widths_um)}, {self.bars}, {len(self.balls_um)} and {self.spokes}"
+            )
+        if self.bars < 2 or self.spokes < 3 or self.star_um < 0:
+            raise ValueError(f"a group needs 2 bars and a star 3 spokes, got {self.bars} and {self.spokes}")
+        if not (self.widths_um or self.balls_um or self.star_um):
+            raise ValueError("a pattern needs widths_um, a star_um or balls_um")
+        check_roles("made_of", MADE_OF, self.made_of)
+        check_roles("attenuation", MADE_OF, self.attenuation)
+
+    @property
+    def materials(self) -> Mapping[str, str]:
+        return {**MADE_OF, **self.made_of}
+
+    @property
+    def greys(self) -> Mapping[str, float]:
+        """1/mm."""
+        radius = self._size()[0]
+        return {**{role: value / radius for role, value in GREY.items()}, **self.attenuation}
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """The carrier, and what it holds."""
+        radius, height = self._size()
+        z = -height / MARGIN / 2
+        made = [Piece(Cylinder(radius, height, 1.0), "carrier")]
+        for solids, role, tall in self._layers():
+            made += [Piece(_raised(solid, z + tall / 2), role, "carrier") for solid in solids]
+            z += tall
+        return tuple(made)
+
+    def _size(self) -> tuple[float, float]:
+        """Radius and height of the carrier, mm."""
+        layers = self._layers()
+        reach = max(_reach(solid) for solids, _, _ in layers for solid in solids)
+        return MARGIN * reach, MARGIN * sum(tall for _, _, tall in layers)
+
+    def _layers(self) -> list[tuple[list[Box | Ellipsoid | Polyhedron], str, float]]:
+        """Solids about the middle of their layer, their role, and the layer's height with the space around, mm."""
+        layers: list[tuple[list[Box | Ellipsoid | Polyhedron], str, float]] = []
+        if self.balls_um:
+            sizes = [um * 1e-3 for um in self.balls_um]
+            places = _row(sizes, max(sizes) / 2)
+            balls = [Ellipsoid((d / 2,) * 3, 1.0, (x, 0.0, 0.0)) for d, x in zip(sizes, places, strict=True)]
+            layers.append(([*balls], "ball", 1.5 * max(sizes)))
+        if self.star_um:
+            tall = self.star_height_um * 1e-3
+            layers.append(([*self._star(tall)], "star", 1.5 * tall))
+        if self.widths_um:
+            cubes = [(2 * self.bars - 1) * um * 1e-3 for um in self.widths_um]
+            groups: list[Box | Ellipsoid | Polyhedron] = []
+            for um, cube, x in zip(self.widths_um, cubes, _row(cubes, max(cubes) / 4), strict=True):
+                width, y = um * 1e-3, 0.625 * max(cubes)
+                for bar in range(self.bars):
+                    step = (2 * bar + 1 - self.bars) * width
+                    groups.append(Box((width, cube, cube), 1.0, (x + step, y, 0.0)))
+                    groups.append(Box((cube, cube, width), 1.0, (x, -y, step)))
+            layers.append((groups, "bar", 1.25 * max(cubes)))
+        return layers
+
+    def _star(self, tall: float) -> list[Polyhedron]:
+        """Spokes as prisms over triangles with a corner in the middle, each as wide as the gap beside it."""
+        radius, half = self.star_um * 0.5e-3, math.pi / self.spokes / 2
+        spokes = []
+        for spoke in range(self.spokes):
+            turn = 2 * math.pi * spoke / self.spokes
+            triangle = [(0.0, 0.0)] + [
+                (radius * math.cos(turn + side), radius * math.sin(turn + side)) for side in (-half, half)
+            ]
+            corners: tuple[Vector, ...] = tuple((x, y, z) for z in (-tall / 2, tall / 2) for x, y in triangle)
+            spokes.append(Polyhedron(1.0, corners))
+        return spokes
+
+
+def _row(sizes: list[float], space: float) -> list[float]:
+    """Middles of things of these sizes side by side with a space between, about 0."""
+    ends = [sum(sizes[: i + 1]) + i * space for i in range(len(sizes))]
+    return [end - size / 2 - ends[-1] / 2 for end, size in zip(ends, sizes, strict=True)]
+
+
+def _reach(solid: Box | Ellipsoid | Polyhedron) -> float:
+    """mm from the axis to the farthest of a solid (of the ball around it, where it is one)."""
+    x, y, _ = solid.centre
+    match solid:
+        case Box():
+            return math.hypot(abs(x) + solid.edges[0] / 2, abs(y) + solid.edges[1] / 2)
+        case Ellipsoid():
+            return math.hypot(x, y) + max(solid.semi_axes)
+    return max(math.hypot(px, py) for px, py, _ in solid.vertices or ())
+
+
+def _raised(solid: Box | Ellipsoid | Polyhedron, z: float) -> Box | Ellipsoid | Polyhedron:
+    x, y, own = solid.centre
+    return replace(solid, centre=(x, y, own + z))

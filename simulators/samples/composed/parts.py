@@ -1,0 +1,148 @@
+"""Parts: solids that are made of something, and the sample that they are in a beam.
+
+Where solids overlap they add up, so a part that displaces another material counts with the difference of the two. Grey
+parts have one attenuation at every energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recon.base.volume import Grid
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.light.beam import Beam
+from simulators.light.effective_depth import effective_depth
+from simulators.light.materials import Material
+from simulators.light.palette import Palette
+from simulators.light.spectrum import Attenuation, Spectrum, light
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Solid, kind_of
+from simulators.samples.sample import Sample
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid of something.
+
+    Attributes:
+        solid: without a material its attenuation is in 1/mm; with one it is the share of the solid's volume that the
+            material takes, 1 where there is nothing else in it.
+        material: what it is made of; None: grey.
+        instead_of: what the material displaces; None: nothing.
+        name: of its label; None: the material's, or the solid's kind.
+    """
+
+    solid: Solid
+    material: Material | None = None
+    instead_of: Material | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.material is None and self.instead_of is not None:
+            raise ValueError(f"instead_of {self.instead_of.name!r} needs a material that displaces it")
+
+    @property
+    def label(self) -> str:
+        return self.name or (self.material.name if self.material else kind_of(self.solid))
+
+
+@dataclass(frozen=True, eq=False)
+class Constituent:
+    """One kind of matter in a sample.
+
+    Attributes:
+        chords: thickness of it along a ray, mm (a depth already, where it is grey).
+        material: None: grey.
+        instead_of: what it displaces.
+    """
+
+    chords: Sample
+    material: Material | None = None
+    instead_of: Material | None = None
+
+    def attenuation(self, energies: ArrayLike) -> Reals:
+        """1/mm at energies in keV, of their shape; less what is displaced."""
+        if self.material is None:
+            return np.ones(np.shape(energies))
+        own = self.material.attenuation(energies)
+        return own if self.instead_of is None else own - self.instead_of.attenuation(energies)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Constituents under a spectrum: each one's chords are paid for once, whatever the number of energies.
+
+    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam: the slope with
+    which the effective depth begins. Thicker matter shows less than that: beam hardening.
+
+    Attributes:
+        constituents: what there is.
+        spectrum: energies and weights.
+        whole: the sample with its attenuation in the thin limit.
+    """
+
+    constituents: tuple[Constituent, ...]
+    spectrum: Spectrum
+    whole: Sample
+
+    @property
+    def radius(self) -> float:
+        return self.whole.radius
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.whole.names
+
+    def thickness(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
+        """mm of each constituent along each ray, float64 [constituent, row, col]."""
+        return np.stack([c.chords.line_integrals(angle, detector) for c in self.constituents])
+
+    def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
+        """The effective depth; see simulators.light.effective_depth and Sample.line_integrals."""
+        attenuation = np.stack([c.attenuation(self.spectrum.energies) for c in self.constituents], axis=1)
+        return effective_depth(self.thickness(angle, detector), attenuation, self.spectrum.weights)
+
+    def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
+        return self.whole.attenuation(grid, supersample)
+
+    def labels(self, grid: Grid) -> NDArray[np.uint8]:
+        return self.whole.labels(grid)
+
+    def under(self, spectrum: Spectrum) -> Mixture:
+        """The same matter in other light; its truth stays that of the light it was made for."""
+        return replace(self, spectrum=spectrum)
+
+
+def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation] | None = None) -> Sample:
+    """The parts as they are seen in the beam: of one energy a plain phantom, of more a mixture.
+
+    Args:
+        filters: the attenuation of a material by its name, for a tube; None: of those known by name.
+
+    Raises:
+        ValueError: a material, but a beam that does not say its energies or says some that are not tabulated.
+    """
+    names = [part.label for part in parts]
+    kinds = dict.fromkeys((part.material, part.instead_of) for part in parts)
+    if all(material is None for material, _ in kinds):
+        return Phantom.of([part.solid for part in parts], names)
+    groups = tuple(
+        Constituent(Phantom.of([part.solid for part in parts if (part.material, part.instead_of) == kind]), *kind)
+        for kind in kinds
+    )
+    reach = 2 * Phantom.of([part.solid for part in parts]).radius
+    matter = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
+    spectrum = light(beam, [material.attenuation for material in matter], reach, filters or Palette().filters)
+    thin = {kind: spectrum.mean(group.attenuation) for kind, group in zip(kinds, groups, strict=True)}
+    solids = [
+        replace(part.solid, attenuation=part.solid.attenuation * thin[part.material, part.instead_of]) for part in parts
+    ]
+    whole = Phantom.of(solids, names)
+    return whole if spectrum.energies.size == 1 else Mixture(groups, spectrum, whole)

@@ -1,0 +1,195 @@
+"""Voxels: a sample that is a volume of attenuation, from a file or from a reconstruction, with labels.
+
+The sample is the function that the voxels' centres interpolate linearly; so is what is projected, and what is true.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from recon.base.volume import Grid
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.frame.shot import CannotExposeError
+from simulators.samples.bodies.solids import LEAST, MOST
+from simulators.samples.voxels.projector import padded, project
+
+MOST_LABELS = 255
+ON = 1e-9
+"""Voxels: a point so close to a centre is on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """A volume around the rotation axis. Make one with `Voxels.of`.
+
+    Attributes:
+        padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of nothing on all sides.
+        spacing: mm from voxel to voxel along (z, y, x).
+        thresholds: 1/mm, ascending: label k from the k-th on; None where `label_volume` says what is where.
+        label_volume: uint8 [z, y, x].
+        names: what labels 1, 2, ... stand for.
+        radius: mm from the rotation axis to the farthest matter.
+    """
+
+    padded: NDArray[np.float32]
+    spacing: tuple[float, float, float]
+    thresholds: tuple[float, ...] | None
+    label_volume: NDArray[np.uint8] | None
+    names: tuple[str, ...]
+    radius: float
+
+    @classmethod
+    def of(
+        cls,
+        attenuation: NDArray[np.floating],
+        spacing: float | tuple[float, float, float],
+        thresholds: Sequence[float] | None = None,
+        labels: NDArray[np.generic] | None = None,
+        names: Sequence[str] = (),
+    ) -> Voxels:
+        """
+        Args:
+            attenuation: [z, y, x] in 1/mm; the rotation axis goes up through the middle.
+            spacing: mm from voxel to voxel, one for all or along (z, y, x).
+            thresholds: 1/mm, ascending: a label begins at each. Without them and `labels`, matter is what attenuates.
+            labels: [z, y, x], 0 ... 255; 0 is air.
+            names: of the labels from 1 on; numbered where there are none.
+
+        Raises:
+            ValueError: no volume, values that are not finite, lengths that are not positive, thresholds that do not
+                ascend, labels of another shape, or names that do not go with them.
+        """
+        along = spacing if isinstance(spacing, tuple) else (spacing, spacing, spacing)
+        if attenuation.ndim != 3 or 0 in attenuation.shape:
+            raise ValueError(f"a volume has three axes [z, y, x], not the shape {attenuation.shape}")
+        if not all(math.isfinite(step) and step > 0 for step in along):
+            raise ValueError(f"voxels must be of positive size in mm, got {spacing}")
+        if not all(LEAST <= step <= MOST for step in along):
+            raise ValueError(f"voxels must be {LEAST:g} ... {MOST:g} mm in size, got {spacing}")
+        volume = padded(attenuation)
+        if not np.isfinite(volume).all():
+            raise ValueError("the volume holds values that are not finite")
+        label_volume, steps = None, None
+        if labels is not None:
+            if thresholds:
+                raise ValueError("labels come from thresholds or from a volume, not from both")
+            if labels.shape != attenuation.shape:
+                raise ValueError(f"labels of shape {labels.shape} do not go with a volume of {attenuation.shape}")
+            if not np.issubdtype(labels.dtype, np.integer):
+                raise ValueError(f"labels must be whole numbers, got {labels.dtype}")
+            low, n = int(labels.min()), int(labels.max())
+            if not 0 <= low <= n <= MOST_LABELS:
+                raise ValueError(f"labels must be 0 ... {MOST_LABELS}, got {low} ... {n}")
+            label_volume = labels.astype(np.uint8)
+        else:
+            steps = tuple(float(t) for t in thresholds) if thresholds else (float(np.finfo(np.float32).tiny),)
+            if list(steps) != sorted(set(steps)) or len(steps) > MOST_LABELS:
+                raise ValueError(f"thresholds must ascend and be {MOST_LABELS} at most, got {thresholds}")
+            n = len(steps)
+        if names and len(names) < n:
+            raise ValueError(f"{n} labels need as many names, got {', '.join(names)}")
+        named = tuple(names) if names else ("matter",) if n == 1 else tuple(f"phase_{k}" for k in range(1, n + 1))
+        return cls(volume, along, steps, label_volume, named, _radius(volume, along))
+
+    @property
+    def first(self) -> tuple[float, float, float]:
+        """mm (z, y, x), centre of the first voxel."""
+        z, y, x = (-(n - 3) / 2 * step for n, step in zip(self.padded.shape, self.spacing, strict=True))
+        return z, y, x
+
+    def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> NDArray[np.float64]:
+        """See Sample.line_integrals.
+
+        Raises:
+            ValueError: a pose of another number of rows.
+            CannotExposeError: a cone's source that is not outside of the volume.
+        """
+        pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
+        if pose.angle.size != detector.shape[0]:
+            raise ValueError(f"the pose has {pose.angle.size} angles and the detector {detector.shape[0]} rows")
+        if math.isfinite(detector.sod):
+            self._check_ahead(pose, detector.sod)
+        return project(self.padded, np.array(self.spacing[::-1]), np.array(self.first[::-1]), pose, detector)
+
+    def _check_ahead(self, pose: Pose, sod: float) -> None:
+        """Raises CannotExposeError where a corner of the volume is not in front of the source."""
+        ends = [(first - step, -(first - step)) for first, step in zip(self.first, self.spacing, strict=True)]
+        corners = np.array([(x, y, z) for z in ends[0] for y in ends[1] for x in ends[2]])
+        axes, origin = pose.frames()
+        along = axes[:, :, 1]
+        nearest = float((along @ corners.T - np.einsum("ri,ri->r", along, origin)[:, None]).min())
+        if not nearest > -sod:
+            raise CannotExposeError(
+                f"the volume begins {-nearest:.3g} mm before the rotation axis, the source {sod:g} mm before it; "
+                "it must lie wholly in front of the source: raise sod, or make voxel_mm smaller. No frame was computed"
+            )
+
+    def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
+        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume, where voxels are larger than its own
+        averaged over as many points a side as there are of its own across (`supersample` is for surfaces)."""
+        points = [
+            max(1, math.ceil(wanted / own - 1e-6)) for wanted, own in zip(grid.spacing, self.spacing, strict=True)
+        ]
+        return self._mean(grid, points)
+
+    def labels(self, grid: Grid) -> NDArray[np.uint8]:
+        """See Sample.labels: of the nearest voxel, or from the attenuation at the centre."""
+        if self.label_volume is None:
+            steps = np.array(self.thresholds, dtype=np.float32)
+            return np.searchsorted(steps, self._mean(grid, [1, 1, 1]), side="right").astype(np.uint8)
+        out = np.zeros(grid.shape, np.uint8)
+        inside, nearest = [], []
+        for centres, first, step, n in zip(
+            grid.coordinates(), self.first, self.spacing, self.label_volume.shape, strict=True
+        ):
+            index = np.floor((centres - first) / step + 0.5).astype(np.int64)
+            inside.append((index >= 0) & (index < n))
+            nearest.append(index[inside[-1]])
+        out[np.ix_(*inside)] = self.label_volume[np.ix_(*nearest)]
+        return out
+
+    def _mean(self, grid: Grid, points: Sequence[int]) -> NDArray[np.float32]:
+        """Mean over `points` a side (z, y, x) in each voxel. Linear interpolation and the mean are products over the
+        axes: each is one sparse matrix, float32 [z, y, x]."""
+        values = self.padded
+        for axis, centres in enumerate(grid.coordinates()):
+            weights = _weights(
+                centres, grid.spacing[axis], points[axis], self.first[axis], self.spacing[axis], values.shape[0]
+            )
+            rest = values.shape[1:]
+            # The axis in front is replaced and goes to the back: after three turns all are where they were.
+            values = np.moveaxis((weights @ values.reshape(values.shape[0], -1)).reshape(-1, *rest), 0, 2)
+        return np.ascontiguousarray(values)
+
+
+def _weights(centres: NDArray[np.float64], edge: float, points: int, first: float, step: float, n: int) -> csr_array:
+    """Matrix [target, padded voxel] that interpolates along one axis and takes the mean over each target voxel."""
+    within = (np.arange(points) + 0.5) / points - 0.5
+    place = (centres[:, None] + within * edge - first) / step + 1.0
+    # On a voxel's centre it is the voxel's value, to the bit: what rounding takes of its neighbour would be matter.
+    place = np.where(np.abs(place - np.rint(place)) < ON, np.rint(place), place)
+    below = np.floor(place)
+    rows = np.repeat(np.arange(centres.size), points)
+    entries = []
+    for column, weight in ((below, 1 - (place - below)), (below + 1, place - below)):
+        seen = ((column >= 0) & (column < n)).ravel()
+        entries.append((weight.ravel()[seen] / points, rows[seen], column.ravel()[seen].astype(np.int64)))
+    data, row, column = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    return csr_array((data.astype(np.float32), (row, column)), shape=(centres.size, n))
+
+
+def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) -> float:
+    """mm to the farthest voxel that holds matter; the interpolation ends one voxel beyond it."""
+    y, x = np.nonzero((volume != 0).any(axis=0))
+    if not x.size:
+        return 0.0
+    across = (np.abs(x - (volume.shape[2] - 1) / 2) + 1) * spacing[2]
+    down = (np.abs(y - (volume.shape[1] - 1) / 2) + 1) * spacing[1]
+    return float(np.hypot(across, down).max())

@@ -1,0 +1,161 @@
+"""Explain: what a scene computes for one frame, in order, and what each step costs; and what it does not compute.
+
+Steps are timed where they run, but for effects of motion, which make the others run again: what one of these costs is
+the time of a frame with it less that of a frame without it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tracemalloc
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from simulators.effects.catalogue import CATALOGUE
+from simulators.effects.chain import Chain
+from simulators.frame.domain import Domain
+from simulators.frame.shot import Shot
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene
+
+Seconds = Callable[[], float]
+
+STEPS = {
+    "ideal": "rays, exp(-depth) and whole counts in one go",
+    "line_integrals": "rays through the sample",
+    "beer_lambert": "photons x exp(-depth)",
+    "digitise": "electrons to whole counts",
+}
+"""What every frame of a sample needs, whatever the scene names."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step of a frame costs.
+
+    Attributes:
+        name: of the step or effect.
+        domain: what it acts on; None for the steps that every frame needs.
+        ms: median.
+        size: bytes of memory taken at most while it ran.
+        says: what happens.
+    """
+
+    name: str
+    domain: Domain | None
+    ms: float
+    size: int
+    says: str
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What a frame of a scene costs.
+
+    Attributes:
+        costs: in the order in which the steps run.
+        ms: median of a whole frame.
+        not_called_for: effects of the catalogue that the scene does not name, with what they would do.
+    """
+
+    costs: tuple[Cost, ...]
+    ms: float
+    not_called_for: tuple[tuple[str, str], ...]
+
+
+def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explained:
+    """Make the frame `repeats` times in each way that is needed, after one that does not count (it compiles).
+
+    Args:
+        now: s, of a clock for short times.
+    """
+    motion = [effect for effect in scene.chain.effects if effect.domain is Domain.MOTION]
+    rest = [effect for effect in scene.chain.effects if effect.domain is not Domain.MOTION]
+    # From the standing sample to the whole scene, one effect of motion more each time.
+    growing = [replace(scene, chain=Chain.of([*motion[:n], *rest])) for n in range(len(motion) + 1)]
+    rounds = [_round(growing, shot, now) for _ in range(repeats + 1)][1:]
+    seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
+    sizes, peaks = _sizes(growing[0], shot), [_peak(each, shot) for each in growing]
+    costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
+    for n, effect in enumerate(motion):
+        more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
+        costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))
+    order = [effect.name for effect in rest]
+    depth = [effect.name for effect in rest if effect.domain is Domain.OPTICAL_DEPTH]
+    for name in [*depth, "beer_lambert", *order[len(depth) :], "digitise"]:
+        if name in seconds:
+            costs.append(_cost(name, seconds[name], sizes[name]))
+    named = {effect.name for effect in scene.chain.effects}
+    left = tuple((name, entry.says) for name, entry in CATALOGUE.items() if name not in named)
+    return Explained(tuple(costs), statistics.median(each.whole[-1] for each in rounds) * 1e3, left)
+
+
+def _cost(name: str, seconds: float, size: int) -> Cost:
+    if name in STEPS:
+        return Cost(name, None, seconds * 1e3, size, STEPS[name])
+    return Cost(name, CATALOGUE[name].domain, seconds * 1e3, size, CATALOGUE[name].says)
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """Seconds of one round: of the steps of the first scene by name, and of a whole frame of each."""
+
+    steps: Mapping[str, float]
+    whole: Sequence[float]
+
+
+def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> _Round:
+    """All that is compared in turns, so that a machine that slows down does so for all of it."""
+    steps: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def timed(name: str) -> Iterator[None]:
+        start = now()
+        yield
+        steps[name] += now() - start
+
+    expose(scenes[0], shot, timed)
+    whole = []
+    for scene in scenes:
+        start = now()
+        expose(scene, shot)
+        whole.append(now() - start)
+    return _Round(steps, whole)
+
+
+def _sizes(scene: Scene, shot: Shot) -> dict[str, int]:
+    """Bytes that each step of a frame takes at most."""
+    sizes: dict[str, int] = defaultdict(int)
+
+    @contextmanager
+    def weighed(name: str) -> Iterator[None]:
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        yield
+        sizes[name] = max(sizes[name], tracemalloc.get_traced_memory()[1] - before)
+
+    with _traced():
+        expose(scene, shot, weighed)
+    return sizes
+
+
+def _peak(scene: Scene, shot: Shot) -> int:
+    with _traced():
+        expose(scene, shot)
+        return tracemalloc.get_traced_memory()[1]
+
+
+@contextmanager
+def _traced() -> Iterator[None]:
+    """Memory is followed within, and as before after it."""
+    if tracemalloc.is_tracing():
+        tracemalloc.reset_peak()
+        yield
+        return
+    tracemalloc.start()
+    try:
+        yield
+    finally:
+        tracemalloc.stop()

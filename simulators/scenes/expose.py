@@ -1,0 +1,111 @@
+"""Exposure: one frame of a scene, from the turning sample to counts; only the effects that it names are computed.
+
+Without effects a frame is photons x exposure x exp(-line integral) / conversion, rounded: Beer-Lambert and no more.
+"""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.effects.chain import Watch
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.sensor import digitise, largest_count
+from simulators.frame.shot import Image, Shot
+from simulators.samples.sample import Counted
+from simulators.scenes.scene import Scene
+
+
+def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.uint16]:
+    """One frame, counts uint16 [row, col].
+
+    Args:
+        shot: the circumstances; the same shot makes the same frame again.
+        watch: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
+            or "ideal", where there are no effects and the sample can make a frame in one go, with the same counts.
+    """
+    chain = scene.chain
+    if not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):
+        with watch("ideal"):
+            return _ideal(scene, scene.sample, shot)
+    if shot.beam:
+        photons = _photons(scene, shot, watch)
+        electrons = chain.apply(Domain.PHOTONS, photons, shot, watch)
+    else:
+        electrons = np.zeros(shot.detector.shape)
+    electrons = chain.apply(Domain.ELECTRONS, electrons, shot, watch)
+    with watch("digitise"):
+        electrons /= shot.conversion
+    counts = chain.apply(Domain.COUNTS, electrons, shot, watch)
+    with watch("digitise"):
+        return digitise(counts, largest_count(shot.readout, shot.binning))
+
+
+def _ideal(scene: Scene, sample: Counted, shot: Shot) -> NDArray[np.uint16]:
+    """The same as step by step, by a sample that can do it in one go."""
+    open_beam = _open_beam(scene, shot)
+
+    def rule(depth: Image) -> NDArray[np.uint16]:
+        photons = _transmitted(depth, open_beam)
+        photons /= shot.conversion
+        return digitise(photons, largest_count(shot.readout, shot.binning))
+
+    return sample.counts(shot.angle, shot.detector, open_beam / shot.conversion, rule)
+
+
+def _open_beam(scene: Scene, shot: Shot) -> float:
+    """Photons that a pixel gets where nothing stands in the way."""
+    return scene.beam.photons_per_s * shot.exposure * shot.binning**2
+
+
+def _photons(scene: Scene, shot: Shot, watch: Watch) -> Image:
+    """Photons that arrive, averaged over the moments at which the effects of motion look; float64 [row, col]."""
+    open_beam = _open_beam(scene, shot)
+    if not shot.sample:
+        with watch("beer_lambert"):
+            return np.full(shot.detector.shape, open_beam)
+    if not scene.chain.moves:
+        angle = np.full(shot.detector.shape[0], shot.angle)
+        return _seen(scene, shot, angle, np.zeros_like(angle), open_beam, watch)
+    moments = scene.chain.moments(shot)
+    seen = (
+        _seen(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
+        for times, weight in zip(moments.times, moments.weights, strict=True)
+    )
+    photons = next(seen)
+    for more in seen:
+        photons += more
+    return photons
+
+
+def _seen(
+    scene: Scene, shot: Shot, angles: NDArray[np.float64], times: NDArray[np.float64], open_beam: float, watch: Watch
+) -> Image:
+    """open_beam x exp(-line integral) with the sample as it stands at one moment of each row."""
+    pose = scene.chain.pose(Pose(angles), times, shot)
+    with watch("line_integrals"):
+        depth = scene.sample.line_integrals(pose, shot.detector)
+    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot.later(float(times[0])), watch)
+    with watch("beer_lambert"):
+        return _transmitted(depth, open_beam)
+
+
+def _transmitted(depth: Image, open_beam: float) -> Image:
+    """open_beam x exp(-line integral), written over the line integrals."""
+    np.exp(np.negative(depth, out=depth), out=depth)
+    depth *= open_beam
+    return depth
+
+
+def _row_angles(times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
+    """Angles of the rows at `times` after the trigger, float64 [row].
+
+    Only the first and the last row are asked for: within the milliseconds of a readout the angle is straight to 1e-5
+    rad even while the stage speeds up at 1 rad/s2.
+    """
+    first, last = shot.angle_at(shot.time + times[0]), shot.angle_at(shot.time + times[-1])
+    span = times[-1] - times[0]
+    return first + (last - first) * (times - times[0]) / (span if span > 0 else 1.0)

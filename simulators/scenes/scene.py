@@ -1,0 +1,79 @@
+"""Scene: what stands in the beam and which departures from Beer-Lambert are simulated; read from a YAML mapping.
+
+Only what a scene names is imported. Keys are the field names of the dataclasses; mm, s, 1/mm and electrons throughout:
+
+    phantom: {kind: battery, field_of_view: [0.9, 0.9], n_particles: 150, seed: 7}
+    # or:    {kind: solids, solids: [{kind: cylinder, radius: 0.3, height: 0.6, attenuation: 1.5}, ...]}
+    # or:    kind cathode, foam or resolution (samples.builders.cathode, ...), or volume, from a file (voxels.scene)
+    beam: {photons_per_s: 1.0e5}        # detected a second and sensor pixel (quantum efficiency included)
+    axis_offset_px: 3.4                 # rotation axis right of the sensor's middle, in sensor pixels
+    effects: [photon_noise, {kind: zingers, rate: 5.0}]
+    detector: {shape: [512, 512]}       # for `beamline simulate`; an instrument's configuration brings its own
+    scan: {views: 180}                  # likewise
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from simulators.effects.catalogue import CATALOGUE, load_effect
+from simulators.effects.chain import Chain
+from simulators.frame.mapping import SceneError, build, items, keys, named, number
+from simulators.light.beam import Beam
+from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.sample import Sample
+from simulators.samples.voxels.stored import ReadVolume
+from simulators.scenes.settings import DetectorSettings, ScanSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stands in the beam.
+
+    Attributes:
+        sample: what is looked at.
+        beam: the light.
+        chain: the effects, in order; with none a frame is exactly Beer-Lambert.
+        axis_offset_px: columns by which the rotation axis lies right of the sensor's middle, in sensor pixels.
+        detector, scan: how `beamline simulate` looks at it; a configured run has settings of its own.
+    """
+
+    sample: Sample
+    beam: Beam
+    chain: Chain
+    axis_offset_px: float = 0.0
+    detector: DetectorSettings = field(default_factory=DetectorSettings)
+    scan: ScanSettings = field(default_factory=ScanSettings)
+
+
+def load_scene(mapping: Mapping[str, Any], read: ReadVolume | None = None) -> Scene:
+    """A scene from a mapping as YAML gives it; the keys are shown at the head of this module.
+
+    Args:
+        read: reads the files of volumes that the scene names; None: none can be named.
+
+    Raises:
+        SceneError: an unknown or missing key, a wrong value, or effects in an order that physics does not allow.
+    """
+    legal = ("phantom", "beam", "axis_offset_px", "effects", "detector", "scan")
+    mapping = keys("scene", mapping, legal=legal, needed=("phantom", "beam"))
+    beam = build(Beam, "scene.beam", mapping["beam"])
+    effects = []
+    for i, entry in items("scene", "effects", mapping):
+        where = f"scene.effects[{i}]"
+        kind, rest = named(where, list(CATALOGUE), entry)
+        effects.append(build(load_effect(kind), f"{where} ({kind})", rest))
+    try:
+        chain = Chain.of(effects)
+    except ValueError as error:
+        raise SceneError(f"scene.effects: {error}") from None
+    return Scene(
+        sample=build_sample("scene.phantom", mapping["phantom"], beam, read),
+        beam=beam,
+        chain=chain,
+        axis_offset_px=number("scene.axis_offset_px", mapping.get("axis_offset_px", 0.0)),
+        detector=build(DetectorSettings, "scene.detector", mapping.get("detector", {})),
+        scan=build(ScanSettings, "scene.scan", mapping.get("scan", {})),
+    )

@@ -1,0 +1,266 @@
+"""Simulated PI GCS 2.0 (C-863 class), the axis behind the wire: servo, reference, moves, stops, limits, trigger line.
+
+Inside, positions are encoder counts from the reference switch ("true"); on the wire they are degrees from the axis'
+own zero, which before a reference move is wherever it was switched on. Nothing runs in the background: what a move
+will do at its end is done when somebody next looks. Strict where a manual is silent: a move during a move is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field
+
+from drivers.clock import Clock
+from simulators.devices.motion import Phase, TrapezoidMove
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pi_gcs.output import Firmware, Output, WiredOutput
+from simulators.wires.pi_gcs.trigger import FirstPulse
+
+MOVES_REMEMBERED = 4096
+
+
+class GcsError(Exception):
+    """A command that does nothing but set the error register."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+@dataclass(frozen=True)
+class Build:
+    """How this specimen is built, and its faults.
+
+    Attributes:
+        low, high: travel range and limit switches, degrees.
+        found_at: degrees of true angle at which it is switched on.
+        referenced: its zero is the reference switch already; else its zero is where it was found.
+        reference_switch, limit_switches: it has them.
+        reference_fails: a reference move ends with error 45.
+        first_pulse: see `FirstPulse`.
+        pulse_width: s that the firmware holds a pulse.
+        rising: the camera in the trigger output takes rising edges, else falling ones.
+        servo_period: s; positions are compared and read once a period. 0 compares at every instant.
+        settle: s after a move until the axis reports to be on target.
+        max_velocity, max_acceleration: degrees/s, degrees/s².
+        lost: trigger pulses, counted from 0 since power-on, that never reach the line.
+        stall_at: a move that would pass this true count ends there with error 1024 and the servo off.
+        switch_at: a move that would pass this true count ends there by a limit switch, the servo on.
+    """
+
+    counts_per_turn: int = 360_000
+    low: float = -720.0
+    high: float = 720.0
+    found_at: float = 0.0
+    referenced: bool = True
+    reference_switch: bool = True
+    limit_switches: bool = True
+    reference_fails: bool = False
+    first_pulse: FirstPulse = FirstPulse.AT_THRESHOLD
+    pulse_width: float = 50e-6
+    rising: bool = True
+    servo_period: float = 0.0
+    settle: float = 0.02
+    max_velocity: float = 720.0
+    max_acceleration: float = 10_000.0
+    lost: Set[int] = field(default_factory=frozenset)
+    stall_at: int | None = None
+    switch_at: int | None = None
+
+
+class GcsAxis:
+    """Not safe from several threads. `line` is the cable in the output that has the settings `wired`."""
+
+    def __init__(self, clock: Clock, line: TriggerLine, build: Build, wired: Output) -> None:
+        self.build = build
+        self.per_degree = build.counts_per_turn / 360.0
+        self.error = 0
+        self.referenced = build.referenced
+        self.velocity, self.acceleration, self.deceleration, self.reference_velocity = 10.0, 100.0, 100.0, 5.0
+        self._servo = False
+        self._clock = clock
+        firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost, build.rising)
+        self._wired = WiredOutput(wired, line, firmware, self.per_degree)
+        found = round(build.found_at * self.per_degree)
+        self._zero = 0 if build.referenced else found
+        self._target = 0.0
+        self._moves = deque([TrapezoidMove(clock.now(), found, found, ())], maxlen=MOVES_REMEMBERED)
+        self._at_end: Callable[[], None] | None = None
+        self._referencing = False
+        self._hit = 0
+
+    # what it tells
+
+    @property
+    def move(self) -> TrapezoidMove:
+        return self._moves[-1]
+
+    def moving(self) -> bool:
+        self.catch_up()
+        return self._clock.now() < self.move.end
+
+    def referencing(self) -> bool:
+        return self.moving() and self._referencing
+
+    def servo(self) -> bool:
+        self.catch_up()
+        return self._servo
+
+    def on_target(self) -> bool:
+        return self.servo() and not self.moving() and self._clock.now() >= self.move.end + self.build.settle
+
+    def position(self) -> float:
+        """Degrees from the axis' zero, in whole counts, as of the last servo cycle."""
+        self.catch_up()
+        return (self._counts(self._clock.now() - self.build.servo_period) - self._zero) / self.per_degree
+
+    def target(self) -> float:
+        self.catch_up()
+        return self._target
+
+    def switches(self) -> tuple[bool, bool, bool]:
+        """Negative limit, reference, positive limit: which are on."""
+        self.catch_up()
+        here = self._counts(self._clock.now()) / self.per_degree
+        return here <= self.build.low or self._hit < 0, here >= 0, here >= self.build.high or self._hit > 0
+
+    def angle_at(self, time: float) -> float:
+        """True angle in radians at any time since the oldest move remembered."""
+        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
+        return move.position(time) * 2 * math.pi / self.build.counts_per_turn
+
+    # what it does
+
+    def switch_servo(self, on: bool) -> None:
+        if not on and self.moving():
+            self._stand_at(self._counts(self._clock.now()))
+        self._servo = on
+
+    def move_to(self, degrees: float) -> None:
+        if self.moving():
+            raise GcsError(93)
+        if not self._servo or not self.referenced:
+            raise GcsError(5)
+        if not self.build.low <= degrees <= self.build.high:
+            raise GcsError(7)
+        self._target = degrees
+        counts = round(degrees * self.per_degree) + self._zero
+        self._begin(counts, self.velocity)
+        for place, act in ((self.build.stall_at, self._stalled), (self.build.switch_at, self._ran_into_switch)):
+            way = self.move.direction * ((place or 0) - self.move.start)
+            if place is not None and 0 < way < abs(self.move.target - self.move.start):
+                self._replace(self.move.halted(place))
+                self._at_end = act
+
+    def reference(self, kind: str) -> None:
+        """FRF, FNL or FPL."""
+        if not self.build.reference_switch and kind == "FRF":
+            raise GcsError(31)
+        if not self.build.limit_switches and kind != "FRF":
+            raise GcsError(32)
+        if self.moving():
+            raise GcsError(93)
+        if not self._servo:
+            raise GcsError(5)
+        at = {"FRF": 0.0, "FNL": self.build.low, "FPL": self.build.high}[kind]
+        self.referenced, self._referencing = False, True
+        self._begin(round(at * self.per_degree), self.reference_velocity)
+        self._at_end = self._found
+
+    def brake(self) -> None:
+        """HLT: slow down to a whole count and stand."""
+        if self.moving():
+            now, move = self._clock.now(), self.move
+            position, velocity = move.position(now), move.velocity(now)
+            stand = position + move.direction * velocity**2 / (2 * self.deceleration * self.per_degree)
+            last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
+            if move.direction * (last - position) <= 0:
+                self._stand_at(self._counts(now))
+            else:
+                braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
+                self._cut(TrapezoidMove(braked.begin, braked.start, last, braked.phases))
+        self.error = 10
+
+    def halt(self) -> None:
+        """STP, #24: stand at once."""
+        if self.moving():
+            self._stand_at(self._counts(self._clock.now()))
+        self.error = 10
+
+    def switch_trigger(self, output: Output, on: bool) -> None:
+        """TRO."""
+        self.catch_up()
+        if output is self._wired.settings:
+            self._wired.switch(on, self.move, self._zero, self._clock.now())
+        output.on = on
+
+    def catch_up(self) -> None:
+        """Do what was due when the last move ended."""
+        if self._at_end is not None and self._clock.now() >= self.move.end:
+            act, self._at_end = self._at_end, None
+            act()
+
+    def _counts(self, time: float) -> int:
+        """True encoder counts: the last edge passed on the way."""
+        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
+        exact = move.position(time)
+        return math.floor(exact) if move.direction >= 0 else math.ceil(exact)
+
+    def _begin(self, counts: int, velocity: float) -> None:
+        move = profile(
+            self._counts(self._clock.now()),
+            counts,
+            velocity * self.per_degree,
+            self.acceleration * self.per_degree,
+            self.deceleration * self.per_degree,
+            self._clock.now(),
+        )
+        self._hit = 0
+        self._moves.append(move)
+        self._wired.begin(move, self._zero, move.begin)
+
+    def _replace(self, move: TrapezoidMove) -> None:
+        self._moves[-1] = move
+        self._wired.cut(move, self._clock.now())
+
+    def _stand_at(self, counts: int) -> None:
+        self._cut(self.move.halted(counts))
+
+    def _cut(self, move: TrapezoidMove) -> None:
+        """End the move otherwise than it was begun."""
+        self._referencing, self._at_end = False, None
+        self._replace(move)
+        self._target = (move.target - self._zero) / self.per_degree
+
+    def _stalled(self) -> None:
+        self._servo, self.error = False, 1024
+
+    def _ran_into_switch(self) -> None:
+        self._hit = self.move.direction
+        self._target = (self.move.target - self._zero) / self.per_degree
+
+    def _found(self) -> None:
+        self._referencing = False
+        if self.build.reference_fails:
+            self.error = 45
+        else:
+            self._zero, self.referenced = 0, True
+        self._target = (self.move.target - self._zero) / self.per_degree
+
+
+def profile(start: int, target: int, speed: float, up: float, down: float, begin: float) -> TrapezoidMove:
+    """From standing to standing with an acceleration and a deceleration of their own (counts, s)."""
+    sign, distance = (1 if target > start else -1), abs(target - start)
+    if distance == 0:
+        return TrapezoidMove(begin, start, target, ())
+    peak = min(speed, math.sqrt(2 * distance * up * down / (up + down)))
+    rise, fall = peak / up, peak / down
+    cruise = max(0.0, (distance - peak * (rise + fall) / 2) / peak)
+    phases = (
+        Phase(0.0, rise, start, 0.0, sign * up),
+        Phase(rise, cruise, start + sign * peak * rise / 2, sign * peak, 0.0),
+        Phase(rise + cruise, fall, target - sign * peak * fall / 2, sign * peak, -sign * down),
+    )
+    return TrapezoidMove(begin, start, target, tuple(phase for phase in phases if phase.duration > 0))

@@ -1,0 +1,132 @@
+"""Simulated PI GCS 2.0, an output line with a cable in it: its CTO settings, and the pulses of the move under way.
+
+A move is a closed form of time, so its pulses go on the cable with their exact times the moment it begins, and those
+still to come are taken away when it is cut short.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Set
+from dataclasses import dataclass
+
+from simulators.devices.motion import TrapezoidMove
+from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.wires.pi_gcs.trigger import Crossing, FirstPulse, Progress, Window, crossings, switched_on
+
+
+@dataclass
+class Output:
+    """The CTO settings of one output line, in the units of the wire, and TRO. Only mode 0 gives pulses."""
+
+    axis: str = "1"
+    mode: int = 0
+    step: float = 0.1
+    start: float = 0.0
+    stop: float = 0.0
+    position: float = 0.0
+    polarity: int = 1
+    on: bool = False
+
+
+@dataclass(frozen=True)
+class Firmware:
+    """What no command changes.
+
+    Attributes:
+        first_pulse: see `FirstPulse`.
+        width: s that a pulse is held.
+        period: s of a servo cycle; positions are compared once in it. 0 compares at every instant.
+        lost: pulses, counted from 0 since power-on, that never reach the cable.
+        rising: the camera at the cable's end takes rising edges, else falling ones.
+    """
+
+    first_pulse: FirstPulse
+    width: float
+    period: float
+    lost: Set[int]
+    rising: bool = True
+
+
+@dataclass(frozen=True)
+class _Coming:
+    """Something that the line will do at `time` if nobody stops the move; the edge that it gives the camera, if any."""
+
+    time: float
+    crossing: Crossing
+    edge: Pulse | None
+
+
+class WiredOutput:
+    """The line that the camera's cable is in. Positions are true counts.
+
+    Args:
+        per_degree: counts.
+    """
+
+    def __init__(self, settings: Output, line: TriggerLine, firmware: Firmware, per_degree: float) -> None:
+        self.settings = settings
+        self._line, self._firmware, self._per_degree = line, firmware, per_degree
+        self._progress, self._coming = Progress(), list[_Coming]()
+        self._done_until, self._zero = 0.0, 0.0
+        self._high_until, self._pulses = -math.inf, 0
+
+    def switch(self, on: bool, move: TrapezoidMove, zero: int, now: float) -> None:
+        """TRO. `zero` is the count of the axis' position 0."""
+        owed = self._settle(now)
+        self.settings.on, self._zero = on, zero
+        self._done_until = move.position(now)
+        self._progress = switched_on(self._window(), self._done_until)
+        self._schedule(move, now, owed)
+
+    def begin(self, move: TrapezoidMove, zero: int, now: float) -> None:
+        """The axis begins a move."""
+        owed = self._settle(now)
+        self._done_until, self._zero = move.start, zero
+        self._schedule(move, now, owed)
+
+    def cut(self, move: TrapezoidMove, now: float) -> None:
+        """The move under way will end otherwise than it was begun."""
+        self._schedule(move, now, self._settle(now))
+
+    def _window(self) -> Window:
+        at, scale = self.settings, self._per_degree
+        start, stop = at.start * scale + self._zero, at.stop * scale + self._zero
+        return Window(at.step * scale, start, stop, self._zero, self._firmware.first_pulse)
+
+    def _settle(self, now: float) -> list[Pulse]:
+        """Take for done what has passed and forget the rest; edges that are still to come of pulses begun."""
+        done = [coming for coming in self._coming if coming.time <= now]
+        self._coming = []
+        for coming in done:
+            self._progress, self._done_until = coming.crossing.after, coming.crossing.position
+            if coming.crossing.pulse:
+                self._pulses, self._high_until = self._pulses + 1, coming.time + self._firmware.width
+        return [coming.edge for coming in done if coming.edge is not None and coming.edge.time > now]
+
+    def _schedule(self, move: TrapezoidMove, now: float, owed: list[Pulse]) -> None:
+        self._line.cancel_after(now)
+        ahead = move.direction * (move.target - self._done_until) > 0 and now < move.end
+        if self.settings.on and self.settings.mode == 0 and ahead:
+            self._foresee(move, now)
+        self._line.schedule([*owed, *(coming.edge for coming in self._coming if coming.edge is not None)])
+
+    def _foresee(self, move: TrapezoidMove, now: float) -> None:
+        """A pulse that begins while the last is held gives no edge.
+
+        Where pulses are the other way round than the camera takes them, its edge is a pulse's end.
+        """
+        number, high_until, firmware = self._pulses, self._high_until, self._firmware
+        for crossing in crossings(self._window(), self._progress, self._done_until, float(move.target)):
+            time, edge = self._noticed(move.time_at(crossing.position), now), None
+            if crossing.pulse:
+                if time > high_until and number not in firmware.lost:
+                    at = time if bool(self.settings.polarity) is firmware.rising else time + firmware.width
+                    edge = Pulse(at, move.position(at) * 2 * math.pi / (360.0 * self._per_degree))
+                high_until, number = time + firmware.width, number + 1
+            self._coming.append(_Coming(time, crossing, edge))
+
+    def _noticed(self, time: float, now: float) -> float:
+        """When the servo sees a crossing: not before now, for it has not happened yet."""
+        period = self._firmware.period
+        return max(math.ceil(time / period) * period if period else time, math.nextafter(now, math.inf))

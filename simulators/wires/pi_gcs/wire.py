@@ -1,0 +1,116 @@
+"""Simulated PI GCS 2.0 controller (C-863 class), the wire: bytes to commands of its one axis, and its replies back.
+
+A command line ends with LF (CR is ignored, case does not matter) and is one item; single control bytes act at once.
+Settings are not answered: what is wrong with a line, the error register says (ERR?, which clears it; the last error
+wins). An unknown query is not answered either. Of a reply of several lines all but the last end with SPACE LF.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Set
+from dataclasses import replace
+
+from drivers.clock import Clock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pi_gcs.axis import Build, GcsAxis, GcsError
+from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
+from simulators.wires.pi_gcs.output import Output
+
+OUTPUTS = 4
+LONGEST_LINE = 256
+
+Spoil = Callable[[int, bytes], bytes]
+
+
+class PiGcsController:
+    """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
+
+    Args:
+        line: the cable in output `output` (1 to 4); it also learns the sample's true angle.
+        axis: its identifier.
+        build: how the specimen is built, and its faults; `counts_per_turn` and `referenced` here go before.
+        latency: s until a reply is there.
+        unknown: commands (like "ACC" or "TMN?") that this model does not know.
+        spoil: what becomes of a reply on its way: its number since power-on and its bytes -> the bytes that arrive.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        line: TriggerLine,
+        *,
+        axis: str = "1",
+        output: int = 1,
+        counts_per_turn: int | None = None,
+        referenced: bool | None = None,
+        build: Build | None = None,
+        latency: float = 0.0,
+        unknown: Set[str] = frozenset(),
+        spoil: Spoil = lambda number, reply: reply,
+    ) -> None:
+        build = build or Build()
+        if counts_per_turn is not None:
+            build = replace(build, counts_per_turn=counts_per_turn)
+        if referenced is not None:
+            build = replace(build, referenced=referenced)
+        if build.counts_per_turn < 1:
+            raise ValueError(f"a turn cannot have {build.counts_per_turn} counts")
+        self.clock = clock
+        self.replies = 0
+        outputs = {number: Output(axis=axis) for number in range(1, OUTPUTS + 1)}
+        self.box = PiGcsBox(axis, GcsAxis(clock, line, build, outputs[output]), outputs)
+        self._latency, self._unknown, self._spoil = latency, unknown, spoil
+        self._in = bytearray()
+        self._out: deque[tuple[float, bytes]] = deque()
+        self._lock = threading.RLock()
+        line.attach_angle(self._angle_at)
+
+    def receive(self, data: bytes) -> None:
+        """Bytes from the host, in pieces of any size."""
+        with self._lock:
+            for byte in data:
+                if byte == 0x0A:
+                    line, self._in = bytes(self._in), bytearray()
+                    self._do_line(line)
+                elif byte in SINGLE:
+                    self._answer(SINGLE[byte](self.box))
+                elif byte != 0x0D and len(self._in) <= LONGEST_LINE:
+                    self._in.append(byte)
+
+    def transmit(self) -> bytes:
+        """Bytes for the host that are there by now and were not taken yet."""
+        with self._lock:
+            taken = bytearray()
+            while self._out and self._out[0][0] <= self.clock.now():
+                taken += self._out.popleft()[1]
+            return bytes(taken)
+
+    def _do_line(self, line: bytes) -> None:
+        words = line.decode("cp1252", errors="replace").split()
+        if not words:
+            return
+        command, arguments = words[0].upper(), words[1:]
+        try:
+            if len(line) > LONGEST_LINE:
+                raise GcsError(3)
+            action = None if command in self._unknown else COMMANDS.get(command)
+            if action is None:
+                raise GcsError(2)
+            self.box.axis.catch_up()
+            self._answer(action(self.box, arguments))
+        except GcsError as error:
+            self.box.axis.error = error.code
+
+    def _answer(self, reply: list[str] | None) -> None:
+        if reply is None:
+            return
+        number, self.replies = self.replies, self.replies + 1
+        data = self._spoil(number, (" \n".join(reply) + "\n").encode("cp1252"))
+        if data:
+            self._out.append((self.clock.now() + self._latency, data))
+
+    def _angle_at(self, time: float) -> float:
+        with self._lock:
+            return self.box.axis.angle_at(time)

@@ -1,0 +1,266 @@
+"""Simulated Tsuji PM16C-04XD, the box behind the wire: sixteen motors, four position controllers, error flags.
+
+Behaviour as in the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Where the manual is
+silent this box is strict: a setting sent in LOCAL, to a moving motor, or (TMG*) while armed sets the command-error flag
+and does nothing more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from enum import IntFlag
+
+from drivers.clock import Clock
+from simulators.devices.motor import Output, PulseMotor, TriggerSettings
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.home import HomeSwitch
+
+MAX_COUNT = 2_147_483_647
+MAX_SPEED = 5_000_000
+MAX_PULSES = 200_000
+"""Of a train; a limit of this stand-in, which works all of them out when a move begins."""
+MODES = (
+    (Output.OFF, 0.0),
+    (Output.GATE, 0.0),
+    (Output.PULSES, 200e-9),
+    (Output.PULSES, 10e-6),
+    (Output.PULSES, 100e-6),
+    (Output.PULSES, 1e-3),
+)
+"""TMGM digit -> what the output does and its pulse width in s."""
+
+_E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
+
+
+def ms_per_1000_pps(code: int) -> float:
+    """What the acceleration code 0..115 means: the E24 preferred numbers (IEC 60063) downwards from 1000 to 0.016."""
+    decade, step = divmod(code + 23, 24)
+    return float(f"{_E24[23 - step]}e{2 - decade}")
+
+
+class Error(IntFlag):
+    """ERRF? flags; the lowest one set names the text of ERR?."""
+
+    COMMAND = 1
+    BUSY = 2
+    BAD_ABS = 4
+
+
+class Refused(Exception):  # noqa: N818 - not an error of this program
+    """A command that does nothing but set an error flag."""
+
+    def __init__(self, flag: Error) -> None:
+        super().__init__(flag)
+        self.flag = flag
+
+
+class Channel:
+    """A motor and what the box keeps for it."""
+
+    def __init__(self, motor: PulseMotor, home_at: int | None = None) -> None:
+        self.motor = motor
+        self.home = HomeSwitch(motor, home_at)
+        self.speeds = {"H": 1000, "M": 500, "L": 100}
+        self.selected = "H"
+        self.rate = 24
+        self.soft = {"F": MAX_COUNT, "B": -MAX_COUNT}
+        self.switches = "00000000"
+
+    @property
+    def acceleration(self) -> float:
+        """pps²."""
+        return 1e6 / ms_per_1000_pps(self.rate)
+
+    @property
+    def letter(self) -> str:
+        """P, N or S: turns CW, CCW, stands."""
+        return "SPN"[self.motor.move.direction] if self.motor.moving() else "S"
+
+    def status(self, now: float) -> int:
+        """b7 emergency stop, b6 slow stop, b5 limit, b3 decelerating, b2 accelerating, b1 driving, b0 busy."""
+        if not self.motor.moving():
+            return int(self.motor.ended)
+        gaining = self.motor.move.acceleration(now) * self.motor.move.direction
+        return 0b11 | (0b100 if gaining > 0 else 0) | (0b1000 if gaining < 0 else 0)
+
+
+class PM16CBox:
+    """State and actions; methods take the channel as the hex digit of the protocol. Not safe from several threads.
+
+    Args:
+        channel: the motor that turns the sample; the others turn nothing.
+        line: what the TP0 connector, the output of position controller A, is wired to.
+        home_at: where its home switch is, in pulses since power-on; None plugs none in.
+        lost, stall_at, switch_at, fires_at_start: of the sample's motor, see `PulseMotor`.
+        version: what it says of its firmware.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        line: TriggerLine,
+        *,
+        channel: int,
+        counts_per_turn: int,
+        lost: Set[int],
+        stall_at: int | None,
+        switch_at: int | None,
+        home_at: int | None,
+        version: str,
+        fires_at_start: bool,
+    ) -> None:
+        self.clock, self.version = clock, version
+        self.remote = False
+        self.errors = Error(0)
+        self.mapped = "0123"
+        sample = f"{channel:X}"
+        self.channels = {
+            name: Channel(PulseMotor(clock, _unplugged, counts_per_turn=counts_per_turn)) for name in "0123456789ABCDEF"
+        }
+
+        def tp0() -> TriggerLine | None:
+            return line if self.mapped[0] == sample else None
+
+        self.sample = PulseMotor(
+            clock,
+            tp0,
+            counts_per_turn=counts_per_turn,
+            lost=lost,
+            stall_at=stall_at,
+            switch_at=switch_at,
+            fires_at_start=fires_at_start,
+        )
+        self.channels[sample] = Channel(self.sample, home_at)
+
+    def moving(self) -> int:
+        """How many motors move."""
+        return sum(channel.motor.moving() for channel in self.channels.values())
+
+    def standing(self, c: str) -> Channel:
+        """The channel, which must not move."""
+        if self.channels[c].motor.moving():
+            raise Refused(Error.COMMAND)
+        return self.channels[c]
+
+    def set_remote(self, remote: bool) -> None:
+        if self.moving():
+            raise Refused(Error.COMMAND)
+        self.remote = remote
+
+    def map(self, wanted: str) -> None:
+        """Channels to position controllers A..D; `-` leaves one as it is. A channel that sat elsewhere swaps places."""
+        if any(self.channels[c].motor.moving() for c in (*wanted.replace("-", ""), *self.mapped)):
+            raise Refused(Error.COMMAND)
+        places = list(self.mapped)
+        for at, c in enumerate(wanted):
+            if c in places:
+                places[places.index(c)] = places[at]
+            if c != "-":
+                places[at] = c
+        self.mapped = "".join(places)
+
+    def start(self, c: str, target: int) -> None:
+        """Move with the selected speed; at most four motors at once."""
+        channel = self._ready_to_move(c, target)
+        channel.motor.start(target, channel.speeds[channel.selected], channel.acceleration)
+
+    def find_home(self, c: str) -> None:
+        """Search for the home switch with the selected speed."""
+        if self.channels[c].home.at is None:
+            raise Refused(Error.COMMAND)
+        channel = self._ready_to_move(c, 0)
+        channel.home.search(channel.speeds[channel.selected], channel.acceleration)
+
+    def go_home(self, c: str) -> None:
+        home = self.channels[c].home.found()
+        if home is None:
+            raise Refused(Error.COMMAND)
+        self.start(c, home)
+
+    def home(self, c: str) -> str:
+        """The reply to SHP?x."""
+        found = self.channels[c].home.found()
+        return "NO H.P" if found is None else f"{found:+08d}"
+
+    def preset(self, c: str, count: int) -> None:
+        """Call the place where it stands `count`."""
+        motor = self.standing(c).motor
+        if abs(count) > MAX_COUNT or motor.trigger.ready(self.clock.now()):
+            raise Refused(Error.COMMAND)
+        self.channels[c].home.forget_search()
+        motor.preset(count)
+
+    def _ready_to_move(self, c: str, target: int) -> Channel:
+        channel = self.channels[c]
+        if abs(target) > MAX_COUNT:
+            raise Refused(Error.BAD_ABS)
+        if channel.motor.moving() or self.moving() >= 4:
+            raise Refused(Error.BUSY)
+        channel.home.forget_search()
+        channel.motor.limits = (channel.soft["B"], channel.soft["F"]) if channel.switches[0] == "1" else None
+        return channel
+
+    def slow_stop(self, c: str) -> None:
+        self.channels[c].motor.stop(self.channels[c].acceleration)
+
+    def for_moving(self, stop: Callable[[str], None]) -> None:
+        for c, channel in self.channels.items():
+            if channel.motor.moving():
+                stop(c)
+
+    def set_speed(self, level: str, c: str, value: str) -> None:
+        """Without a value: select that speed for the next moves."""
+        channel = self.standing(c)
+        if not value:
+            channel.selected = level
+        elif 1 <= int(value) <= MAX_SPEED:
+            channel.speeds[level] = int(value)
+        else:
+            raise Refused(Error.COMMAND)
+
+    def set_rate(self, c: str, code: int) -> None:
+        channel = self.standing(c)
+        if code > 115:
+            raise Refused(Error.COMMAND)
+        channel.rate = code
+
+    def set_trigger(self, c: str, change: Callable[[TriggerSettings], TriggerSettings]) -> None:
+        """Change the trigger settings of a motor that stands and is not armed."""
+        trigger = self.standing(c).motor.trigger
+        settings = change(trigger.settings)
+        if trigger.ready(self.clock.now()) or settings.interval < 1:
+            raise Refused(Error.COMMAND)
+        trigger.settings = settings
+
+    def arm(self, c: str) -> None:
+        motor = self.standing(c).motor
+        too_many = len(motor.trigger.settings.points) > MAX_PULSES
+        if c not in self.mapped or motor.trigger.refusal(motor.position()) or too_many:
+            raise Refused(Error.COMMAND)
+        motor.trigger.arm()
+
+    def mode(self, c: str) -> int:
+        settings = self.channels[c].motor.trigger.settings
+        return MODES.index((settings.output, settings.width))
+
+    @property
+    def place(self) -> str:
+        return "R" if self.remote else "L"
+
+    def status(self) -> str:
+        """The reply to STS?, for the four mapped channels."""
+        now, shown = self.clock.now(), [self.channels[c] for c in self.mapped]
+        letters = "".join(channel.letter for channel in shown)
+        bits = "".join(f"{channel.status(now):02X}" for channel in shown)
+        positions = "/".join(f"{channel.motor.position():+08d}" for channel in shown)
+        return f"{self.place}{self.mapped}/{letters}/0000/{bits}/{positions}"
+
+    def channel_status(self, c: str) -> str:
+        """The reply to STSx?; a channel without a position controller shows no switches and no status."""
+        channel = self.channels[c]
+        bits = f"0{channel.status(self.clock.now()):02X}" if c in self.mapped else "---"
+        return f"{self.place}{c}{channel.letter}{bits}{channel.motor.position():+08d}"
+
+
+def _unplugged() -> None:
+    """The trigger output of a motor that no cable is plugged into."""

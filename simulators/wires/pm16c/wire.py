@@ -1,0 +1,210 @@
+"""Simulated Tsuji PM16C-04XD, the wire: bytes to lines to commands of the box, and its replies back to bytes.
+
+ASCII lines end with CR LF both ways. Queries are answered, settings are not. A line that is no command, or a setting
+that the box refuses, sets an error flag (ERRF?, ERR?) and nothing else.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Set
+from dataclasses import replace
+from typing import TypeVar
+
+from drivers.clock import Clock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.box import MODES, Error, PM16CBox, Refused
+
+VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
+END = b"\r\n"
+LONGEST_LINE = 256
+ERROR_TEXT = {Error.COMMAND: "COMMAND ERROR", Error.BUSY: "MCC06 BUSY ERROR", Error.BAD_ABS: "BAD ABS COMMAND"}
+
+_C = "([0-9A-F])"
+_D = r"([+-]?\d{1,12})"
+T = TypeVar("T")
+Query = Callable[..., str]
+Setting = Callable[..., None]
+
+
+def _error_text(box: PM16CBox) -> str:
+    return next((text for flag, text in ERROR_TEXT.items() if flag in box.errors), "NO ERROR")
+
+
+def _clear_errors(box: PM16CBox) -> None:
+    box.errors = Error(0)
+
+
+def _set_limit(box: PM16CBox, side: str, c: str, value: str) -> None:
+    box.standing(c).soft[side] = int(value)
+
+
+def _set_switches(box: PM16CBox, c: str, bits: str) -> None:
+    box.standing(c).switches = bits
+
+
+def _set_mode(box: PM16CBox, c: str, digit: str) -> None:
+    output, width = MODES[int(digit)]
+    box.set_trigger(c, lambda settings: replace(settings, output=output, width=width))
+
+
+QUERIES: tuple[tuple[str, Query], ...] = (
+    (r"VER\?", lambda box: box.version),
+    (r"VERH\?", lambda box: "HD-VER2"),
+    (r"SETCH\?", lambda box: box.mapped),
+    (rf"PS\?{_C}", lambda box, c: f"{box.channels[c].motor.position():+08d}"),
+    (rf"SHP\?{_C}", PM16CBox.home),
+    (rf"SPD\?{_C}", lambda box, c: f"{box.channels[c].selected}SPD"),
+    (rf"SPD([HML])\?{_C}", lambda box, level, c: f"{box.channels[c].speeds[level]:07d}"),
+    (rf"RTE\?{_C}", lambda box, c: f"{box.channels[c].rate:03d}"),
+    (rf"([FB])L\?{_C}", lambda box, side, c: f"{box.channels[c].soft[side]:+08d}"),
+    (rf"SETLS\?{_C}", lambda box, c: box.channels[c].switches),
+    (r"STS\?", PM16CBox.status),
+    (rf"STS{_C}\?", PM16CBox.channel_status),
+    (r"STQ\?", lambda box: f"{box.place}{4 - box.moving()}"),
+    (r"ERR\?", _error_text),
+    (r"ERRF\?", lambda box: f"{box.errors:02X}"),
+    (rf"TMGM\?{_C}", lambda box, c: f"{box.mode(c)}"),
+    (rf"TMGS\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.start:+08d}"),
+    (rf"TMGE\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.end:+08d}"),
+    (rf"TMGI\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.interval:07d}"),
+    (rf"TMGR\?{_C}", lambda box, c: "YES" if box.channels[c].motor.trigger.ready(box.clock.now()) else "NO"),
+)
+
+ALWAYS: tuple[tuple[str, Setting], ...] = (
+    (r"REM", lambda box: box.set_remote(True)),
+    (r"LOC", lambda box: box.set_remote(False)),
+    (rf"SSTP{_C}", PM16CBox.slow_stop),
+    (rf"ESTP{_C}", lambda box, c: box.channels[c].motor.halt()),
+    (r"ASSTP", lambda box: box.for_moving(box.slow_stop)),
+    (r"AESTP", lambda box: box.for_moving(lambda c: box.channels[c].motor.halt())),
+    (r"ERRC", _clear_errors),
+)
+"""Settings that LOCAL accepts too."""
+
+REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
+    (r"SETCH([0-9A-F-]{4})", PM16CBox.map),
+    (rf"ABS{_C}{_D}", lambda box, c, d: box.start(c, int(d))),
+    (rf"REL{_C}{_D}", lambda box, c, d: box.start(c, box.channels[c].motor.position() + int(d))),
+    (rf"PS{_C}{_D}", lambda box, c, d: box.preset(c, int(d))),
+    (rf"FDHP{_C}", PM16CBox.find_home),
+    (rf"GTHP{_C}", PM16CBox.go_home),
+    (rf"SPD([HML]){_C}(\d*)", PM16CBox.set_speed),
+    (rf"RTE{_C}(\d{{1,3}})", lambda box, c, d: box.set_rate(c, int(d))),
+    (rf"([FB])L{_C}{_D}", _set_limit),
+    (rf"SETLS{_C}([01]{{4}}0[01]{{3}})", _set_switches),
+    (rf"TMGM{_C}([0-5])", _set_mode),
+    (rf"TMGS{_C}{_D}", lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, start=int(d)))),
+    (rf"TMGE{_C}{_D}", lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, end=int(d)))),
+    (
+        rf"TMGI{_C}(\d{{1,10}})",
+        lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, interval=int(d))),
+    ),
+    (rf"TMGR{_C}", PM16CBox.arm),
+    (rf"TMGC{_C}", lambda box, c: box.standing(c).motor.trigger.clear()),
+)
+
+
+class PM16CController:
+    """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
+
+    Args:
+        line: what the TP0 connector (position controller A) is wired to; it also learns the sample's true angle.
+        channel: the motor that turns the sample.
+        counts_per_turn: its pulses for 2π.
+        home_at: where the sample's home switch is, in pulses since power-on; None plugs none in.
+        lost: trigger pulses (from 0, since power-on) that never reach the line.
+        stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
+            interlock or a limit switch.
+        version: what it says of its firmware.
+        fires_at_start: a train's start point itself gives a pulse [from memory: it does].
+        silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        line: TriggerLine,
+        *,
+        channel: int = 0,
+        counts_per_turn: int = 360_000,
+        home_at: int | None = 0,
+        lost: Set[int] = frozenset(),
+        stall_at: int | None = None,
+        switch_at: int | None = None,
+        version: str = VERSION,
+        fires_at_start: bool = True,
+        silent: Set[int] = frozenset(),
+        garbled: Set[int] = frozenset(),
+    ) -> None:
+        if channel not in range(16):
+            raise ValueError(f"there is no channel {channel}; there are 0 to 15")
+        self.clock = clock
+        self.queries = 0
+        self.box = PM16CBox(
+            clock,
+            line,
+            channel=channel,
+            counts_per_turn=counts_per_turn,
+            lost=lost,
+            stall_at=stall_at,
+            switch_at=switch_at,
+            home_at=home_at,
+            version=version,
+            fires_at_start=fires_at_start,
+        )
+        self._silent, self._garbled = silent, garbled
+        self._in, self._out = bytearray(), bytearray()
+        self._lock = threading.RLock()
+        line.attach_angle(self._angle_at)
+
+    def receive(self, data: bytes) -> None:
+        """Bytes from the host, in pieces of any size."""
+        with self._lock:
+            self._in += data
+            while END in self._in:
+                line, _, rest = bytes(self._in).partition(END)
+                self._in = bytearray(rest)
+                self._do(line)
+            if len(self._in) > LONGEST_LINE:
+                self._in.clear()
+                self.box.errors |= Error.COMMAND
+
+    def transmit(self) -> bytes:
+        """Bytes for the host that were not taken yet."""
+        with self._lock:
+            out = bytes(self._out)
+            self._out.clear()
+            return out
+
+    def _do(self, line: bytes) -> None:
+        text = line.decode("ascii", errors="replace")
+        if (found := _find(QUERIES, text)) is not None:
+            self._reply(found(self.box))
+        elif (act := _find(ALWAYS, text) or (_find(REMOTE_ONLY, text) if self.box.remote else None)) is not None:
+            try:
+                act(self.box)
+            except Refused as refusal:
+                self.box.errors |= refusal.flag
+        else:
+            self.box.errors |= Error.COMMAND
+
+    def _reply(self, text: str) -> None:
+        at, self.queries = self.queries, self.queries + 1
+        if at in self._garbled:
+            self._out += b"\xfe\x00" + text[::-1].encode("ascii") + END
+        elif at not in self._silent:
+            self._out += text.encode("ascii") + END
+
+    def _angle_at(self, time: float) -> float:
+        with self._lock:
+            return self.box.sample.angle_at(time)
+
+
+def _find(table: tuple[tuple[str, Callable[..., T]], ...], text: str) -> Callable[[PM16CBox], T] | None:
+    """The action for a line, with the line's fields bound to it."""
+    for pattern, action in table:
+        if match := re.fullmatch(pattern, text):
+            return lambda box: action(box, *match.groups())
+    return None

@@ -1,0 +1,128 @@
+"""Serial URL: `sim://name` opens a simulated device through pyserial, by the code path that opens a real port.
+
+pyserial finds the scheme in `simulators.wires.protocol_sim` once this module is imported. Names are process-wide, as
+the ports of a computer are. A name that nobody registered is a device by itself on the system's clock, made when it is
+first opened: `sim://pm16c`, or with options `sim://pm16c?channel=3&counts_per_turn=360000`; see `wires.kinds`.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import serial
+from serial.serialutil import PortNotOpenError, SerialBase, SerialException, to_bytes
+
+from drivers.clock import SystemClock
+from simulators.wires.kinds import KINDS, stand_alone
+from simulators.wires.wire import Wire
+
+SCHEME = "sim://"
+POLL = 1e-3
+"""s on the device's clock between looks for a reply that has not come yet."""
+
+if "simulators.wires" not in serial.protocol_handler_packages:
+    serial.protocol_handler_packages.append("simulators.wires")
+
+
+class _Ports:
+    """The simulated ports of this process: what is plugged in, and which are open."""
+
+    def __init__(self) -> None:
+        self._wires: dict[str, Wire] = {}
+        self._open: dict[str, Wire] = {}
+        self._lock = threading.Lock()
+
+    def plug(self, name: str, wire: Wire) -> None:
+        with self._lock:
+            self._wires[name] = wire
+            self._open.pop(name, None)
+
+    def open(self, name: str) -> Wire:
+        with self._lock:
+            if name in self._open:
+                raise SerialException(f"could not open port {SCHEME}{name}: it is open already")
+            if name not in self._wires and name.partition("?")[0] not in KINDS:
+                known = ", ".join(SCHEME + known for known in sorted({*self._wires, *KINDS}))
+                raise SerialException(f"could not open port {SCHEME}{name}: no such simulated port; there are {known}")
+            if name not in self._wires:
+                try:
+                    self._wires[name] = stand_alone(name, SystemClock())
+                except ValueError as problem:
+                    raise SerialException(f"could not open port {SCHEME}{name}: {problem}") from problem
+            self._open[name] = self._wires[name]
+            return self._wires[name]
+
+    def close(self, name: str, wire: Wire) -> None:
+        with self._lock:
+            if self._open.get(name) is wire:
+                del self._open[name]
+
+
+_PORTS = _Ports()  # pyserial hands a URL to its handler and nothing else, so the names have to live beside it
+
+
+def register(name: str, wire: Wire) -> str:
+    """Plug a simulated device in; the URL that opens it. An older device of that name is unplugged."""
+    _PORTS.plug(name, wire)
+    return SCHEME + name
+
+
+class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no types
+    """pyserial's side of a simulated port. Bytes arrive at once, whatever the baud rate; timeouts run on the device's
+    clock, so that a virtual second costs nothing."""
+
+    is_open: bool
+
+    def open(self) -> None:
+        if self.is_open:
+            raise SerialException("port is already open")
+        self._name = self.port[len(SCHEME) :]
+        self._wire = _PORTS.open(self._name)
+        self._wire.transmit()  # a port that is opened forgets what had come before, as an operating system's does
+        self._received = bytearray()
+        self.is_open = True
+
+    def close(self) -> None:
+        if self.is_open:
+            self.is_open = False
+            _PORTS.close(self._name, self._wire)
+
+    @property
+    def in_waiting(self) -> int:
+        self._take()
+        return len(self._received)
+
+    def read(self, size: int = 1) -> bytes:
+        self._take()
+        deadline = None if self.timeout is None else self._wire.clock.now() + self.timeout
+        while len(self._received) < size and (deadline is None or self._wire.clock.now() < deadline):
+            self._wire.clock.sleep(POLL)
+            self._take()
+        taken = bytes(self._received[:size])
+        del self._received[:size]
+        return taken
+
+    def write(self, data: bytes) -> int:
+        if not self.is_open:
+            raise PortNotOpenError()
+        sent = to_bytes(data)
+        self._wire.receive(sent)
+        return len(sent)
+
+    def reset_input_buffer(self) -> None:
+        self._take()
+        self._received.clear()
+
+    def _take(self) -> None:
+        if not self.is_open:
+            raise PortNotOpenError()
+        self._received += self._wire.transmit()
+
+    def _reconfigure_port(self) -> None:
+        """pyserial calls it when a setting changes; this port has none that matter."""
+
+    def _update_dtr_state(self) -> None:
+        """No modem lines."""
+
+    def _update_rts_state(self) -> None:
+        """No modem lines."""

@@ -1,0 +1,164 @@
+"""Simulated Zaber axis: moves in microsteps in closed form, homing, stops, limits and the warning flags they leave.
+
+Native units by the vendor's convention (from memory, not confirmed): speed is microsteps/s times 1.6384, acceleration
+microsteps/s² times 1.6384 / 10 000. A real axis re-plans a move under way; this one says STATUSBUSY.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+
+from simulators.devices.motion import TrapezoidMove
+
+SPEED_UNIT = 1.6384
+ACCELERATION_UNIT = 1.6384e-4
+MOVES_REMEMBERED = 4096
+PRIORITY = "FF FN FZ FH FV FO FC FM FD FQ FI FA FR FS FB FP FE FT WL WV WT WS WM WP WR WH NC NI ND NR NT NU NJ NB"
+"""Warning flags, the gravest first."""
+
+
+class Rejected(Exception):  # noqa: N818 - not an error of this program
+    """A command that the device answers with RJ and this reason."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class ZaberAxis:
+    """One axis. Times are s on the device's clock, positions whole microsteps.
+
+    Args:
+        counts_per_turn: microsteps for 2π of true angle.
+        low, high: its own travel limits.
+        homed: it knows its reference since power-on.
+        stall_at: a move that would pass this count stops there (FS), as when something blocks it.
+        switch_at: a move that would pass this count runs into a limit there (WL, FE).
+
+    Both may be changed while it stands, as by a person who clears the way.
+    """
+
+    def __init__(
+        self,
+        now: float,
+        *,
+        counts_per_turn: int,
+        low: int,
+        high: int,
+        homed: bool,
+        stall_at: int | None,
+        switch_at: int | None,
+    ) -> None:
+        self.settings: dict[str, int] = {
+            "maxspeed": round(counts_per_turn / 36 * SPEED_UNIT),
+            "motion.accelonly": 100,
+            "motion.decelonly": 100,
+            "limit.min": low,
+            "limit.max": high,
+        }
+        self.homed, self.enabled = homed, True
+        self.flags: set[str] = set()
+        self.stall_at, self.switch_at = stall_at, switch_at
+        self._angle_of_count = 2 * math.pi / counts_per_turn
+        self._moves = deque([TrapezoidMove(now, 0.0, 0.0, ())], maxlen=MOVES_REMEMBERED)
+        self._at_end: Callable[[], None] | None = None
+
+    @property
+    def move(self) -> TrapezoidMove:
+        """The move under way, or the last one."""
+        return self._moves[-1]
+
+    def moving(self, now: float) -> bool:
+        return now < self.move.end
+
+    def position(self, now: float) -> int:
+        exact = self.move.position(now)
+        return math.floor(exact) if self.move.direction >= 0 else math.ceil(exact)
+
+    def angle_at(self, time: float) -> float:
+        """True angle in radians at any time since the oldest move remembered."""
+        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
+        return move.position(time) * self._angle_of_count
+
+    def settle(self, now: float) -> bool:
+        """Let a move that has ended leave its flags; whether one has ended since the last look."""
+        if self._at_end is None or self.moving(now):
+            return False
+        ending, self._at_end = self._at_end, None
+        ending()
+        return True
+
+    def warnings(self) -> list[str]:
+        """Standing flags, the gravest first."""
+        standing = self.flags | (set() if self.homed else {"WR"}) | (set() if self.enabled else {"FO"})
+        return sorted(standing, key=PRIORITY.index)
+
+    def start(self, now: float, target: int, speed: float | None = None) -> None:
+        """Move to `target`, with `speed` (microsteps/s) where one is given, or to where it is blocked on the way."""
+        self._ready(now)
+        if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
+            raise Rejected("BADDATA")
+        move, ending = self._planned(now, target, speed), self._nothing
+        for blocked, flags in ((self.stall_at, {"FS"}), (self.switch_at, {"WL", "FE"})):
+            if blocked is not None and min(move.start, move.target) < blocked < max(move.start, move.target):
+                move, ending = move.halted(blocked), partial(self.flags.update, flags)
+        self._begin(move, ending)
+
+    def drive(self, now: float, speed: float) -> None:
+        """Turn at `speed` (microsteps/s, signed) until stopped or at the end of the travel."""
+        self.start(now, self.settings["limit.max" if speed > 0 else "limit.min"], abs(speed))
+
+    def home(self, now: float) -> None:
+        """Turn to the reference, count 0, from which on the position is known."""
+        self._ready(now)
+        self._begin(self._planned(now, 0, None), self._found_home)
+
+    def stop(self, now: float) -> None:
+        """Slow down to the last microstep that still comes on the way."""
+        if not self.moving(now):
+            return
+        move, deceleration = self.move, self.settings["motion.decelonly"] / ACCELERATION_UNIT
+        position, velocity = move.position(now), move.velocity(now)
+        stand = position + move.direction * velocity**2 / (2 * deceleration)
+        last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
+        if move.direction * (last - position) <= 0:
+            self._moves[-1] = move.halted(self.position(now))
+        elif move.direction * (move.target - last) > 0:  # otherwise it stands by itself before that
+            braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
+            self._moves[-1] = TrapezoidMove(braked.begin, braked.start, last, braked.phases)
+        self._interrupt()
+
+    def halt(self, now: float) -> None:
+        """Stand at once, at the last microstep done."""
+        if self.moving(now):
+            self._moves[-1] = self.move.halted(self.position(now))
+            self._interrupt()
+
+    def _ready(self, now: float) -> None:
+        if self.moving(now):
+            raise Rejected("STATUSBUSY")
+        if not self.enabled:
+            raise Rejected("DRIVERDISABLED")
+
+    def _planned(self, now: float, target: int, speed: float | None) -> TrapezoidMove:
+        speed = self.settings["maxspeed"] / SPEED_UNIT if speed is None else speed
+        acceleration = min(self.settings["motion.accelonly"], self.settings["motion.decelonly"]) / ACCELERATION_UNIT
+        return TrapezoidMove.between(self.position(now), target, speed, acceleration, begin=now)
+
+    def _begin(self, move: TrapezoidMove, ending: Callable[[], None]) -> None:
+        self._moves.append(move)
+        self._at_end = ending
+
+    def _nothing(self) -> None:
+        """A move that arrives leaves no flag."""
+
+    def _found_home(self) -> None:
+        self.homed = True
+
+    def _interrupt(self) -> None:
+        """The flag stands at once, also in the reply to what interrupts: the vendor's library clears it there."""
+        self._at_end = self._nothing
+        self.flags.add("NI")

@@ -1,0 +1,273 @@
+"""Simulated Zaber device behind its wire: settings, commands, and the trigger cable from one digital output.
+
+A controller with one rotary axis, X-RSW style. What it does not know it rejects with BADCOMMAND, as a device does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence, Set
+
+from drivers.clock import Clock
+from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.wires.zaber.axis import SPEED_UNIT, Rejected, ZaberAxis
+from simulators.wires.zaber.conditions import INPUTS, OUTPUTS, is_output, number_in
+from simulators.wires.zaber.triggers import ACTIONS, TRIGGERS, Edge, Triggers
+
+LOOK_AHEAD = 10.0
+"""s beyond the end of a move for which edges are foretold."""
+WRITABLE = {"maxspeed", "motion.accelonly", "motion.decelonly", "limit.min", "limit.max"}
+NOTHING = "0"
+
+
+class ZaberDevice:
+    """State and actions of the device; `do` raises Rejected with the device's reason. Not safe from several threads.
+
+    Args: see `simulators.wires.zaber.wire.ZaberController`.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        line: TriggerLine,
+        *,
+        counts_per_turn: int,
+        output: int,
+        active_high: bool,
+        firmware: str,
+        can_schedule: bool,
+        can_chain: bool,
+        identity: str,
+        low: int,
+        high: int,
+        homed: bool,
+        stall_at: int | None,
+        switch_at: int | None,
+        latency: float,
+        fires_when_enabled: bool,
+        lost: Set[int],
+    ) -> None:
+        now = clock.now()
+        self.axis = ZaberAxis(
+            now,
+            counts_per_turn=counts_per_turn,
+            low=low,
+            high=high,
+            homed=homed,
+            stall_at=stall_at,
+            switch_at=switch_at,
+        )
+        self.triggers = Triggers(self.axis.move, self.axis.settings, latency, fires_when_enabled, now)
+        self.alerts, self.checksums = False, False
+        self._clock, self._line, self._lost = clock, line, lost
+        self._output, self._active = output - 1, int(active_high)
+        self.triggers.outputs[self._output] = 1 - self._active
+        self._can_schedule, self._can_chain = can_schedule, can_chain
+        self._has_triggers = tuple(map(int, firmware.split("."))) >= (7, 6)
+        self._angle_of_count = 2 * math.pi / counts_per_turn
+        self._sent: set[Pulse] = set()
+        self._looked, self._counted = 0, 0  # edges that happened and were looked at; pulses among them
+        self._fixed: dict[str, str] = {
+            identity: "50952",
+            "system.serial": "123456",
+            "version": firmware,
+            "version.build": "1",
+            "system.axiscount": "1",
+            "device.hw.modified": "0",
+            "comm.address": "1",
+            "comm.packet.size.max": "80",
+            "comm.word.size.max": "50",
+            "comm.command.packets.max": "2",
+            "get.settings.max": "10",
+            "trigger.numtriggers": str(TRIGGERS),
+            "trigger.numactions": str(ACTIONS),
+        }
+        self._fixed_of_axis: dict[str, str] = {
+            "limit.cycle.dist": str(counts_per_turn),
+            "resolution": "64",
+            "peripheralid": "0",
+            "peripheral.id": "0",
+            "peripheral.hw.modified": "0",
+        }
+
+    def settle(self) -> bool:
+        """Let happen what has happened by now; whether a move has ended since the last look."""
+        now = self._clock.now()
+        self.triggers.advance(now)
+        self._emit(now, self._happened())
+        return self.axis.settle(now)
+
+    def do(self, axis: int, words: Sequence[str]) -> str:
+        """One command; the data of its reply."""
+        match words:
+            case []:
+                return NOTHING
+            case ["get", setting]:
+                return self._get(axis, setting)
+            case ["warnings", *clear] if clear in ([], ["clear"]):
+                flags = self.axis.warnings()
+                if clear:
+                    self.axis.flags.clear()
+                return " ".join([f"{len(flags):02d}", *flags])
+            case ["trigger", "show"] if self._has_triggers:
+                return " ".join(_shown(trigger.left) for trigger in self.triggers.triggers)
+            case ["io", "get", "do", channel] if number_in(channel, OUTPUTS):
+                return str(self.triggers.outputs[int(channel) - 1])
+            case ["io", "get", "do"]:
+                return " ".join(map(str, self.triggers.outputs))
+            case ["io", "info"]:
+                return f"0 {OUTPUTS} 0 {INPUTS}"
+            case ["tools", "echo", *text]:
+                return " ".join(text) or NOTHING
+        self._change(axis, words)
+        self._foretell()
+        return NOTHING
+
+    def information(self, words: Sequence[str]) -> list[str]:
+        """The info lines of a command that has some."""
+        match words:
+            case ["trigger", number, "print"] if self._has_triggers and number_in(number, TRIGGERS):
+                trigger = self.triggers.triggers[int(number) - 1]
+                actions = [f"action {letter} {text}" for letter, text in zip("ab", trigger.actions, strict=True)]
+                enabled = f"enable {trigger.total if trigger.total > 0 else ''}".rstrip() if trigger.left else "disable"
+                return [f"when {trigger.text}", *actions, enabled]
+        return []
+
+    def _get(self, axis: int, setting: str) -> str:
+        now = self._clock.now()
+        if setting in self._fixed or setting in ("comm.alert", "comm.checksum"):
+            if axis:
+                raise Rejected("DEVICEONLY")
+            live = {"comm.alert": str(int(self.alerts)), "comm.checksum": str(int(self.checksums))}
+            return self._fixed.get(setting) or live[setting]
+        if setting in ("pos", "encoder.pos"):
+            return str(self.axis.position(now))
+        if setting == "accel":
+            setting = "motion.accelonly"
+        if setting in self.axis.settings:
+            return str(self.axis.settings[setting])
+        if setting == "driver.enabled":
+            return str(int(self.axis.enabled))
+        if setting in self._fixed_of_axis:
+            return self._fixed_of_axis[setting]
+        raise Rejected("BADCOMMAND")
+
+    def _change(self, axis: int, words: Sequence[str]) -> None:
+        now, here = self._clock.now(), self.axis.move.position(self._clock.now())
+        match words:
+            case ["home"]:
+                self.axis.home(now)
+            case ["move", "abs", position]:
+                self.axis.start(now, _whole(position))
+            case ["move", "rel", distance]:
+                self.axis.start(now, self.axis.position(now) + _whole(distance))
+            case ["move", "vel", speed]:
+                self._drive(now, _whole(speed))
+            case ["move", ("min" | "max") as end]:
+                self.axis.start(now, self.axis.settings[f"limit.{end}"])
+            case ["stop"]:
+                self.axis.stop(now)
+            case ["estop"]:
+                self.axis.halt(now)
+            case ["driver", ("enable" | "disable") as wanted]:
+                self.axis.halt(now)
+                self.axis.enabled = wanted == "enable"
+            case ["set", setting, value]:
+                self._set(axis, setting, _whole(value))
+            case ["io", "set", "do", channel, value, *schedule] if is_output(channel, value, schedule):
+                self._check_schedule(schedule)
+                self.triggers.act(list(words), here)
+            case ["trigger", number, *rest] if self._has_triggers:
+                if not number_in(number, TRIGGERS):
+                    raise Rejected("BADDATA")
+                self._set_trigger(int(number) - 1, rest, here)
+            case _:
+                raise Rejected("BADCOMMAND")
+        self.triggers.move = self.axis.move
+
+    def _drive(self, now: float, speed: int) -> None:
+        if self.axis.moving(now):
+            raise Rejected("STATUSBUSY")
+        if speed:
+            self.axis.drive(now, speed / SPEED_UNIT)
+
+    def _set(self, axis: int, setting: str, value: int) -> None:
+        if setting in ("comm.alert", "comm.checksum"):
+            if axis:
+                raise Rejected("DEVICEONLY")
+            if value not in (0, 1):
+                raise Rejected("BADDATA")
+            if setting == "comm.alert":
+                self.alerts = bool(value)
+            else:
+                self.checksums = bool(value)
+            return
+        names = ["motion.accelonly", "motion.decelonly"] if setting == "accel" else [setting]
+        if not set(names) <= WRITABLE:
+            raise Rejected("BADCOMMAND")
+        if value < 1 and not setting.startswith("limit"):
+            raise Rejected("BADDATA")
+        self.axis.settings.update(dict.fromkeys(names, value))
+
+    def _set_trigger(self, number: int, words: Sequence[str], here: float) -> None:
+        match words:
+            case ["when", *condition]:
+                self.triggers.configure(number, condition)
+            case ["action", ("a" | "b") as letter, *action]:
+                self._check_schedule(action)
+                if "trigger" in action and not self._can_chain:
+                    raise Rejected("BADDATA")
+                self.triggers.set_action(number, letter, action)
+            case ["enable", *count] if not count or (len(count) == 1 and count[0].isdigit()):
+                self.triggers.enable(number, int(count[0]) if count else 0, here)
+            case ["disable"]:
+                self.triggers.disable(number)
+            case _:
+                raise Rejected("BADDATA")
+
+    def _check_schedule(self, words: Sequence[str]) -> None:
+        if "schedule" in words and not self._can_schedule:
+            raise Rejected("BADDATA")
+
+    def _foretell(self) -> None:
+        """Put the pulses on the line that are still to come as things stand now, in place of those foretold before."""
+        now = self._clock.now()
+        happened = self._happened()
+        coming = self.triggers.foretold(max(now, self.axis.move.end) + LOOK_AHEAD)
+        self._line.cancel_after(now)
+        self._emit(now, happened + self._pulses(coming, self._counted))
+
+    def _happened(self) -> list[Pulse]:
+        """Pulses since the last look."""
+        new = self.triggers.edges[self._looked :]
+        pulses, self._looked = self._pulses(new, self._counted), self._looked + len(new)
+        self._counted += sum(map(self._is_pulse, new))
+        return pulses
+
+    def _emit(self, now: float, pulses: list[Pulse]) -> None:
+        """Put pulses on the line but for those of the past that it has already."""
+        if new := [pulse for pulse in pulses if pulse.time > now or pulse not in self._sent]:
+            self._line.schedule(new)
+            self._sent.update(new)
+
+    def _pulses(self, edges: Sequence[Edge], first: int) -> list[Pulse]:
+        """The pulses that do not get lost, the first one having the number `first` since power-on."""
+        active = enumerate(filter(self._is_pulse, edges), first)
+        return [
+            Pulse(edge.time, edge.position * self._angle_of_count) for index, edge in active if index not in self._lost
+        ]
+
+    def _is_pulse(self, edge: Edge) -> bool:
+        return (edge.channel, edge.value) == (self._output, self._active)
+
+
+def _shown(left: int) -> str:
+    """`d` disabled, `e` enabled without end, or the fires that are left."""
+    return {0: "d", -1: "e"}.get(left, str(left))
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise Rejected("BADDATA") from None

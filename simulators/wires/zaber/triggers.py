@@ -1,0 +1,239 @@
+"""Simulated Zaber triggers and digital outputs: conditions on a moving axis, two actions each, edges with their times.
+
+Nothing runs in the background: `advance` goes from event to event up to a time, and a copy that is advanced beyond it
+foretells the edges still to come. As the vendor's library has it, a trigger fires when its condition turns true, at
+once where it is true when enabled, and COUNT fires disable it. From memory, not confirmed: a distance is counted, in
+both directions, from where the trigger was enabled or last fired; a new value of an output cancels its schedule.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from simulators.devices.motion import TrapezoidMove
+from simulators.wires.zaber.axis import Rejected
+from simulators.wires.zaber.conditions import (
+    INPUTS,
+    OPERATORS,
+    OUTPUTS,
+    Compare,
+    Condition,
+    Distance,
+    Every,
+    Input,
+    condition_of,
+    is_output,
+    number_in,
+)
+
+TRIGGERS, ACTIONS = 6, 2
+UNLIMITED = -1
+DEEPEST = 2 * TRIGGERS
+"""Triggers that set each other off at one moment, before it is taken for a circle."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A digital output takes a new value; where the axis was then, in microsteps."""
+
+    time: float
+    channel: int
+    value: int
+    position: float
+
+
+@dataclass
+class Trigger:
+    """What is set up, and how it stands. `left` fires remain; `origin` is the position, or the time, counted from."""
+
+    text: str = "none"
+    condition: Condition | None = None
+    actions: list[str] = field(default_factory=lambda: ["none"] * ACTIONS)
+    left: int = 0
+    total: int = 0
+    origin: float = 0.0
+    met: bool = False
+
+
+@dataclass
+class Triggers:
+    """The triggers and outputs of a device with one axis. Times are s, positions microsteps.
+
+    Attributes:
+        latency: s from a condition to its actions.
+        fires_when_enabled: a distance trigger fires at the very point of enabling, too.
+        settings: of the axis, for actions that change one.
+    """
+
+    move: TrapezoidMove
+    settings: dict[str, int]
+    latency: float = 0.0
+    fires_when_enabled: bool = False
+    now: float = -math.inf
+    triggers: list[Trigger] = field(default_factory=lambda: [Trigger() for _ in range(TRIGGERS)])
+    outputs: list[int] = field(default_factory=lambda: [0] * OUTPUTS)
+    inputs: list[int] = field(default_factory=lambda: [0] * INPUTS)
+    edges: list[Edge] = field(default_factory=list)
+    queue: list[tuple[float, int, str]] = field(default_factory=list)
+    """Commands for later, the next one first."""
+    serial: int = 0
+    depth: int = 0
+
+    # what a host sets up
+
+    def configure(self, number: int, words: Sequence[str]) -> None:
+        """`when` with its condition; the trigger is disabled by it."""
+        condition = condition_of(words)
+        trigger = self.triggers[number]
+        trigger.condition, trigger.text, trigger.left, trigger.total = condition, " ".join(words), 0, 0
+
+    def set_action(self, number: int, letter: str, words: Sequence[str]) -> None:
+        text = " ".join(words)
+        if text != "none" and not self._known(list(words)):
+            raise Rejected("BADDATA")
+        self.triggers[number].actions["ab".index(letter)] = text
+
+    def enable(self, number: int, count: int, position: float) -> None:
+        """Begin; `count` 0 is without end."""
+        trigger = self.triggers[number]
+        if trigger.condition is None:
+            raise Rejected("BADDATA")
+        trigger.left = trigger.total = count or UNLIMITED
+        trigger.origin = self.now if isinstance(trigger.condition, Every) else position
+        trigger.met = self._holds(trigger.condition, position)
+        if trigger.met or (self.fires_when_enabled and isinstance(trigger.condition, Distance)):
+            self._fire(trigger, position)
+
+    def disable(self, number: int) -> None:
+        self.triggers[number].left = 0
+
+    def set_input(self, channel: int, value: int) -> None:
+        """Somebody else's signal on a digital input (from 0)."""
+        self.inputs[channel] = value
+        for trigger in self.triggers:
+            if isinstance(trigger.condition, Input) and trigger.left:
+                was, trigger.met = trigger.met, self._holds(trigger.condition, 0.0)
+                if trigger.met and not was:
+                    self._fire(trigger, self.move.position(self.now))
+
+    # time
+
+    def advance(self, to: float) -> None:
+        """Let everything happen that happens by the time `to`."""
+        while (event := self._next()) is not None and event[0] <= to:
+            time, position, trigger = event
+            self.now = max(self.now, time)
+            if trigger is None:
+                self.act(heapq.heappop(self.queue)[2].split(), position)
+            elif isinstance(trigger.condition, Compare):
+                trigger.met = trigger.condition.holds(position)
+                if trigger.met:
+                    self._fire(trigger, position)
+            else:
+                trigger.origin = time if isinstance(trigger.condition, Every) else position
+                self._fire(trigger, position)
+        self.now = max(self.now, to)
+
+    def foretold(self, until: float) -> list[Edge]:
+        """The edges from now to `until` if nobody does anything."""
+        coming = replace(
+            self,
+            settings=dict(self.settings),
+            triggers=[replace(trigger, actions=list(trigger.actions)) for trigger in self.triggers],
+            outputs=list(self.outputs),
+            queue=list(self.queue),
+            edges=[],
+        )
+        coming.advance(until)
+        return coming.edges
+
+    def act(self, words: list[str], position: float) -> None:
+        """A command of an action, a host or a schedule, known to be well formed, with the axis at `position`."""
+        match words:
+            case ["io", "set", "do", channel, value, *schedule]:
+                at = int(channel) - 1
+                self.queue = [entry for entry in self.queue if not entry[2].startswith(f"io set do {channel} ")]
+                heapq.heapify(self.queue)
+                new = 1 - self.outputs[at] if value == "t" else int(value)
+                if new != self.outputs[at]:
+                    self.outputs[at] = new
+                    self.edges.append(Edge(self.now, at, new, position))
+                if schedule:
+                    self._later(float(schedule[1]) / 1000, f"io set do {channel} {schedule[2]}")
+            case ["trigger", number, "enable", *count]:
+                self.enable(int(number) - 1, int(count[0]) if count else 0, position)
+            case ["trigger", number, "disable"]:
+                self.disable(int(number) - 1)
+            case [_, setting, sign, value]:
+                old = self.settings[setting]
+                self.settings[setting] = {"=": 0, "+=": old, "-=": old}[sign] + int(value) * (-1 if sign == "-=" else 1)
+
+    def _known(self, words: list[str]) -> bool:
+        """An action that this stand-in can do: outputs, other triggers, settings of the axis."""
+        match words:
+            case ["0", *rest] if rest and not rest[0].isdigit():
+                return self._known(rest)
+            case ["io", "set", "do", channel, value, *schedule]:
+                return is_output(channel, value, schedule)
+            case ["trigger", number, "enable", *count]:
+                return number_in(number, TRIGGERS) and (not count or (len(count) == 1 and count[0].isdigit()))
+            case ["trigger", number, "disable"]:
+                return number_in(number, TRIGGERS)
+            case [("0" | "1"), setting, ("=" | "+=" | "-="), value]:
+                return setting in self.settings and value.lstrip("-").isdigit()
+        return False
+
+    def _later(self, seconds: float, command: str) -> None:
+        self.serial += 1
+        heapq.heappush(self.queue, (self.now + seconds, self.serial, command))
+
+    def _fire(self, trigger: Trigger, position: float) -> None:
+        if self.depth > DEEPEST:
+            return
+        if trigger.left > 0:
+            trigger.left -= 1
+        self.depth += 1
+        for action in trigger.actions:
+            words = action.removeprefix("0 ").split()
+            if self.latency > 0 and action != "none":
+                self._later(self.latency, " ".join(words))
+            elif action != "none":
+                self.act(words, position)
+        self.depth -= 1
+
+    def _holds(self, condition: Condition, position: float) -> bool:
+        if isinstance(condition, Compare):
+            return condition.holds(position)
+        if isinstance(condition, Input):
+            return OPERATORS[condition.sign](self.inputs[condition.channel], condition.value)
+        return False
+
+    def _next(self) -> tuple[float, float, Trigger | None] | None:
+        """(time, position, trigger) of the next event; no trigger where it is a command for later."""
+        found: list[tuple[float, float, Trigger | None]] = []
+        if self.queue:
+            found.append((self.queue[0][0], self.move.position(self.queue[0][0]), None))
+        for trigger in self.triggers:
+            if trigger.left and (event := self._change(trigger)) is not None:
+                found.append((*event, trigger))
+        return min(found, key=lambda event: event[0], default=None)
+
+    def _change(self, trigger: Trigger) -> tuple[float, float] | None:
+        """When and where an enabled trigger's condition changes next."""
+        condition, move, here = trigger.condition, self.move, self.move.position(self.now)
+        if isinstance(condition, Every):
+            time = trigger.origin + condition.seconds
+            return time, move.position(time)
+        points: list[float] = []
+        if isinstance(condition, Distance):
+            points = [trigger.origin + move.direction * condition.step]
+        elif isinstance(condition, Compare):
+            around = {at + by for at in (condition.value, -condition.value) for by in (-1, 0, 1)}
+            points = sorted(around, key=lambda at: move.direction * at)
+            points = [at for at in points if condition.holds(at) != trigger.met and move.direction * (at - here) > -0.5]
+        if not points or self.now >= move.end or move.direction * (move.target - points[0]) < 0:
+            return None
+        return max(move.time_at(points[0]), self.now), points[0]

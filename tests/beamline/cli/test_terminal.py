@@ -1,0 +1,194 @@
+"""A bar where a terminal is, few plain lines where there is none, and every event as words or nothing."""
+
+from __future__ import annotations
+
+import errno
+import io
+import math
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from beamline.cli.terminal import Terminal, fit, rates
+from beamline.core.events import Event
+from beamline.core.narration import UserLog, sentence
+
+FRAME = {
+    "n": 90,
+    "of": 360,
+    "kind": "projection",
+    "frames_per_s": 9.97,
+    "mb_per_s": 188.2,
+    "eta_s": 3725.4,
+    "mean": 1.0,
+}
+
+
+class Tty(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(autouse=True)
+def _plain_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for name in ("FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE", "COLUMNS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    yield
+
+
+def shown(stream: io.StringIO, *events: tuple[str, dict[str, Any]]) -> str:
+    with Terminal(stream) as terminal:
+        for event, data in events:
+            terminal(Event(event, 0.0, data))
+    return stream.getvalue()
+
+
+class HungUp(io.StringIO):
+    """A stream whose terminal has closed, or whose disk is full."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+    def write(self, text: str) -> int:
+        raise OSError(self.number, "no")
+
+
+def test_a_terminal_that_closes_does_not_end_the_work() -> None:
+    said = ("state", {"state": "acquiring", "message": "Acquiring"})
+    shown(HungUp(errno.EIO), said, ("frame", FRAME), said)
+    with pytest.raises(OSError, match="no"):
+        shown(HungUp(errno.ENOSPC), said)
+
+
+def test_the_figures_an_operator_watches() -> None:
+    assert rates(FRAME) == "90/360  10.0 frames/s  188.2 MB/s  1:02:05 left"
+
+
+def test_without_a_terminal_there_are_plain_lines_and_not_too_many() -> None:
+    frames = [("frame", {**FRAME, "n": n}) for n in range(1, 361)]
+    text = shown(io.StringIO(), ("state", {"state": "acquiring", "message": "Acquiring"}), *frames)
+    assert "\x1b" not in text
+    lines = text.splitlines()
+    assert lines[0] == "Acquiring"
+    assert lines[1].startswith("scan: 1/360")
+    assert lines[-1].startswith("scan: 360/360")
+    assert len(lines) <= 5
+
+
+def test_a_terminal_gets_a_bar_that_is_gone_at_the_end() -> None:
+    text = shown(Tty(), ("frame", FRAME), ("warning", {"message": "[dark] ring overrun"}))
+    assert "10.0 frames/s" in text
+    assert "Warning: [dark] ring overrun" in text  # brackets are not markup
+    assert "\x1b[2K" in text[text.rindex("frames/s") :]  # the line is erased
+
+
+def test_a_question_is_asked_with_the_bar_out_of_the_way() -> None:
+    stream = Tty()
+    with Terminal(stream) as terminal:
+        terminal(Event("frame", 0.0, FRAME))
+
+        def put(request: str) -> None:
+            assert "\x1b[2K" in stream.getvalue()[stream.getvalue().rindex("frames/s") :]  # the bar's line is erased
+            before = stream.getvalue()
+            terminal(Event("progress", 0.0, {"step": 5, "steps": 0, "n_views": 4, "n_gaussians": 2, "residual": 0.1}))
+            assert stream.getvalue() == before  # and nothing overwrites the question
+            stream.write(f"{request}\n")
+
+        terminal.ask("Open the beam shutter.", put)
+        terminal(Event("frame", 0.0, {**FRAME, "n": 91}))
+    assert "91/360" in stream.getvalue().split("Open the beam shutter.")[1]
+
+
+def test_the_fit_has_a_bar_of_its_own() -> None:
+    progress = {"step": 5, "steps": 0, "n_views": 40, "n_gaussians": 2000, "residual": None}
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown(Tty(), ("frame", FRAME), ("progress", progress)))
+    assert "40 views, 2000 Gaussians" in text
+    assert "90/360" in text
+
+
+def test_a_fit_with_an_end_says_how_far_it_is() -> None:
+    progress = {
+        "step": 500, "steps": 2000, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344, "held_out": None,
+        "per_s": 20.0, "eta_s": 75.0,
+    }  # fmt: skip
+    said = "500/2000 steps, 20 steps/s, 91 views, 2000 Gaussians, residual 0.1234, 0:01:15 left"
+    assert fit(progress) == said
+    assert shown(io.StringIO(), ("progress", progress)) == f"volume: {said}\n"
+    assert "residual 0.1234, held out 0.2000, 0:01" in fit({**progress, "held_out": 0.2})
+
+
+def test_the_end_is_said_once() -> None:
+    progress = {"step": 9, "steps": 9, "n_views": 9, "n_gaussians": 9, "residual": 0.1}
+    again = ("progress", {**progress, "residual": 0.2})
+    text = shown(io.StringIO(), ("progress", {**progress, "step": 8}), ("progress", progress), again)
+    assert [line[:11] for line in text.splitlines()] == ["volume: 8/9", "volume: 9/9"]
+
+
+def test_iterations_are_told_as_such() -> None:
+    progress = {
+        "step": 3, "steps": 40, "n_views": 60, "n_gaussians": 0, "residual": 0.2, "held_out": math.nan,
+        "per_s": 0.5, "eta_s": 74.0,
+    }  # fmt: skip
+    assert fit(progress) == "3/40 iterations, 0.5 iterations/s, 60 views, residual 0.2000, 0:01:14 left"
+
+
+def test_the_same_snapshot_is_said_once() -> None:
+    snapshot = ("snapshot", {"n_views": 40, "path": "v.h5"})
+    text = shown(io.StringIO(), snapshot, ("frame", FRAME), snapshot, ("snapshot", {"n_views": 60, "path": "v.h5"}))
+    assert text.count("from 40 views") == 1
+    assert text.count("from 60 views") == 1
+
+
+EVENTS = [
+    ("run_started", {"folder": "runs/x", "n_frames": 390, "total_bytes": 18e6, "duration": 44.5}, "390 frames, 18 MB"),
+    ("state", {"state": "done", "message": "Finished"}, "Finished"),
+    ("state", {"message": "Waiting"}, "Waiting"),
+    ("block_started", {"n": 10, "kind": "dark", "mode": "static", "exposure": 0.05}, "10 dark frames (static, 0.05 s"),
+    ("block_done", {"n": 9, "kind": "flat", "missing": [], "extra": 0}, None),
+    ("block_done", {"n": 9, "kind": "flat", "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
+    ("frame", FRAME, None),
+    ("progress", {}, None),
+    ("flag", {"check": "beam", "level": "alarm", "view": 7, "advice": "The beam is lost."}, "Alarm (beam, row 7)"),
+    ("warning", {"message": "hot"}, "Warning: hot"),
+    (
+        "recon_started",
+        {"method": "r2", "n_views": 26, "axis_col": 81.987, "source": "recon"},
+        "r2: 26 views, rotation axis at column 81.99",
+    ),
+    (
+        "recon_started",
+        {"method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
+        "r2 again, from the start: 40 views, rotation axis at column 82.50",
+    ),
+    ("snapshot", {"n_views": 40, "path": "v.h5"}, "Volume so far, from 40 views: v.h5"),
+    (
+        "scan_done",
+        {"status": "complete", "n_frames": 3, "bytes": 2e3, "seconds": 1, "path": "s.h5"},
+        "Scan complete: 3",
+    ),
+    ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),
+    ("failed", {"message": "no beam"}, "Failed: no beam"),
+    ("done", {"folder": "runs/x"}, "Done: runs/x"),
+]
+
+
+@pytest.mark.parametrize(("event", "data", "words"), EVENTS)
+def test_events_in_words(event: str, data: dict[str, Any], words: str | None) -> None:
+    text = sentence(Event(event, 0.0, data))
+    if words is None:
+        assert text is None
+    else:
+        assert text is not None
+        assert words in text
+
+
+def test_the_user_log_has_a_line_and_a_time_for_each_sentence() -> None:
+    stream = io.StringIO()
+    log = UserLog(stream)
+    log(Event("warning", 1_795_152_000.5, {"message": "hot"}))
+    log(Event("frame", 1_795_152_001.0, FRAME))
+    assert stream.getvalue() == "2026-11-20T05:20:00Z  Warning: hot\n"

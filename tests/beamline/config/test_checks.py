@@ -1,0 +1,81 @@
+"""What no single value's type can say is refused with its line: files, regions, outputs, triggers, controllers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from beamline.config import load as config
+from beamline.core.errors import ConfigError
+from tests.beamline.config_file import GOOD, faults, load, write
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[0, 0, 8, 8]", "[0, 0, 8, 9]", r"my\.yaml:\d+: devices\.camera: roi .* steps of 4"),
+        (
+            "simulation: {}",
+            "simulation: {scene: no.yaml}",
+            r"my\.yaml:\d+: simulation\.scene: there is no file no\.yaml",
+        ),
+        (
+            "simulation: {}",
+            "simulation: {}\nrecon: {axis: 8.5}",
+            r"my\.yaml:\d+: recon\.axis 8\.5 .* columns 0 \.\.\. 7",
+        ),
+        ("simulation: {}", "simulation: &a {scene: {x: *a}}", "holds itself"),
+        ("simulation: {}", "simulation: " + 3000 * "[", "nested beyond reason"),
+    ],
+)
+def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in GOOD
+    with pytest.raises(ConfigError, match=said):
+        load(write(tmp_path, GOOD.replace(old, new)))
+    with pytest.raises(ConfigError, match=r"--set .*: scan\.angles\.path: there is no file .*no\.txt"):
+        load(write(tmp_path), "scan.angles={scheme: file, path: no.txt}")
+
+
+@pytest.mark.parametrize(
+    ("stage", "taken"),
+    [("{kind: pi_gcs, port: 'sim://pi_gcs', trigger_line: 3", 3), ("{kind: zaber, port: 'sim://zaber', output: 3", 3)],
+)
+def test_a_shutter_does_not_share_the_trigger_output(tmp_path: Path, stage: str, taken: int) -> None:
+    text = GOOD.replace('{kind: pm16c, port: "sim://pm16c"', stage)
+    assert text != GOOD
+    with_shutter = "devices.shutter={kind: stage_output, output: %d}"
+    assert load(write(tmp_path, text), with_shutter % (taken + 1)).devices.shutter.kind == "stage_output"
+    assert f"shutter.output {taken} is the output" in faults(tmp_path, text, with_shutter % taken)
+
+
+@pytest.mark.parametrize("option", ["trigger_mode=start", "trigger_active=sync_readout", "trigger_times=2"])
+def test_what_breaks_one_frame_a_pulse_is_not_for_fly_scans(option: str) -> None:
+    path = config.config_folder() / "instrument.yaml"
+    key = option.split("=")[0]
+    with pytest.raises(ConfigError, match=rf"devices\.camera\.{key} .* one frame a pulse"):
+        load(path, f"devices.camera.{option}")
+    load(path, f"devices.camera.{option}", "scan.mode=step")
+
+
+def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
+    path, level = config.config_folder() / "instrument.yaml", "devices.camera.trigger_active=level"
+    with pytest.raises(ConfigError, match=r"set devices\.stage\.pulse_width_s \(None\) to scan\.exposure_s \(0\.05\)"):
+        load(path, level)
+    with pytest.raises(ConfigError, match=r"pulse_width_s \(0\.001\)"):
+        load(path, level, "devices.stage.pulse_width_s=0.001")
+    load(path, level, "devices.stage.pulse_width_s=0.05")
+
+
+def test_what_a_controller_cannot_is_refused_at_once(tmp_path: Path) -> None:
+    for stage, message in (
+        ("{kind: pm16c, port: 'sim://pm16c', active_high: false", "the PM16C's trigger output has one polarity"),
+        ("{kind: pi_gcs, port: 'sim://pi_gcs', pulse_width_s: 1.0e-3", "the firmware of a pi_gcs controller fixes it"),
+        ("{kind: zaber, port: 'sim://zaber', pulse_width_s: 1.5e-3", "it is whole milliseconds"),
+        (
+            "{kind: zaber, port: 'sim://zaber', pulse_width_s: 1.0e-3, toggle: true",
+            "a toggled output has no pulse width",
+        ),
+        ("{kind: zaber, port: 'sim://zaber', starter: 2", "two different triggers"),
+    ):
+        assert message in faults(tmp_path, GOOD.replace('{kind: pm16c, port: "sim://pm16c"', stage))

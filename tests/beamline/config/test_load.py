@@ -1,0 +1,135 @@
+"""Configuration: precedence, defaults, round trip, its plan, and its scenes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from beamline.config import load as config
+from beamline.core.errors import ConfigError
+from beamline.plan.plan import Mode, Place
+from tests.beamline.config_file import CONFIGS, GOOD, load, write
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_shipped_configurations_are_valid(name: str) -> None:
+    loaded = config.load(config.config_folder() / f"{name}.yaml", environment={})
+    assert config.plan_of(loaded).angles.size == loaded.scan.angles.views  # type: ignore[union-attr]
+    assert loaded.simulated == (name != "instrument")
+
+
+def test_defaults_and_numbers_as_people_write_them(tmp_path: Path) -> None:
+    loaded = load(write(tmp_path))
+    assert loaded.scan.period_s == 0.05  # YAML 1.1 reads 5e-2 as text
+    assert loaded.scan.mode is Mode.FLY
+    assert (loaded.scan.flats.count, loaded.scan.flats.at) == (10, Place.START)
+    assert loaded.devices.camera.roi == (0, 0, 8, 8)
+    with pytest.raises(ValidationError):
+        loaded.scan.period_s = 1.0  # type: ignore[misc]
+
+
+def test_precedence_flags_environment_file_defaults(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    assert load(path).scan.settle_s == 0.1
+    assert load(path, BEAMLINE_SCAN__SETTLE_S="0.5").scan.settle_s == 0.5
+    both = load(path, "scan.settle_s=0.7", "recon.axis=4.5", BEAMLINE_SCAN__SETTLE_S="0.5", BEAMLINE_SCAN__PERIOD_S="1")
+    assert (both.scan.settle_s, both.scan.period_s, both.recon.axis) == (0.7, 1.0, 4.5)
+    whole = load(path, "scan.angles={scheme: interlaced, views: 12, passes: 3}", "scan.darks.at=none")
+    assert whole.scan.angles.scheme == "interlaced"
+    assert whole.scan.darks.at is Place.NONE
+    # A site's own variables are left alone.
+    assert load(path, BEAMLINE_NAME="bl1", HOME="/x").sample.name == "test"
+
+
+def test_the_process_environment_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BEAMLINE_SAMPLE__NAME", "from-outside")
+    assert config.load(write(tmp_path)).sample.name == "from-outside"
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_resolved_reads_back_as_itself(name: str, tmp_path: Path) -> None:
+    loaded = config.load(config.config_folder() / f"{name}.yaml", environment={})
+    text = config.resolved_yaml(loaded)
+    assert text.splitlines()[0].startswith("# splatline ")
+    assert str(config.config_folder().parent) not in text  # nothing of this machine
+    assert load(write(tmp_path, text)) == loaded
+
+
+def test_schema_describes_a_configuration() -> None:
+    schema = config.schema()
+    json.dumps(schema)
+    assert schema["additionalProperties"] is False
+    assert {"sample", "scan", "devices", "optics"} <= set(schema["required"])
+    period = schema["$defs"]["Scan"]["properties"]["period_s"]
+    assert period["exclusiveMinimum"] == 0
+    assert "fly scan" in period["description"]
+
+
+def test_plan_of_every_scheme(tmp_path: Path) -> None:
+    (tmp_path / "angles.txt").write_text("0\n45\n# no more\n", encoding="utf-8")
+    path = write(tmp_path)
+    for angles, first, last, n in (
+        ("{scheme: fixed, views: 4, start_deg: 10, span_deg: -360}", 10, -260, 4),
+        ("{scheme: sector, views: 3, first_deg: 30, last_deg: 150}", 30, 150, 3),
+        ("{scheme: interlaced, views: 8, passes: 2}", 0, 157.5, 8),
+        ("{scheme: golden, views: 2}", 0, 180 * (math.sqrt(5) - 1) / 2, 2),
+    ):
+        plan = config.plan_of(load(path, f"scan.angles={angles}"))
+        assert plan.angles.size == n
+        np.testing.assert_allclose(np.rad2deg(plan.angles[[0, -1]]), [first, last])
+    seeded = [
+        config.plan_of(load(path, f"scan.angles={{scheme: random, views: 9, seed: {s}}}")).angles for s in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(seeded[0], seeded[1])
+    assert not np.array_equal(seeded[0], seeded[2])
+    # An angle file is found beside the configuration file, wherever the command runs.
+    beside = write(tmp_path, GOOD.replace("{scheme: fixed, views: 12}", "{scheme: file, path: angles.txt}"), "b.yaml")
+    np.testing.assert_allclose(config.plan_of(load(beside)).angles, [0, math.pi / 4])
+
+
+def test_plan_of_carries_exposures_and_places(tmp_path: Path) -> None:
+    plan = config.plan_of(load(write(tmp_path), "scan.flats={count: 3, at: both, exposure_s: 0.2}", "scan.mode=step"))
+    assert (plan.flats.count, plan.flats.at, plan.flats.exposure) == (3, Place.BOTH, 0.2)
+    assert plan.darks.exposure == plan.exposure == 0.01
+    assert (plan.mode, plan.scheme) == (Mode.STEP, "fixed")
+
+
+def test_angles_that_cannot_be_had(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    with pytest.raises(ConfigError, match=r"scan\.angles: 12 views cannot be taken in 5 equal passes"):
+        config.plan_of(load(path, "scan.angles={scheme: interlaced, views: 12, passes: 5}"))
+    with pytest.raises(ConfigError, match=r"absent\.txt"):
+        config.plan_of(load(path, "scan.angles={scheme: file, path: absent.txt}"))
+    (tmp_path / "bad.txt").write_text("0\nx\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"bad\.txt: line 2 holds 'x'"):
+        config.plan_of(load(path, f"scan.angles={{scheme: file, path: '{tmp_path.as_posix()}/bad.txt'}}"))
+
+
+def test_scenes_inline_beside_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = tmp_path / "installed"
+    (installed / "scenes").mkdir(parents=True)
+    write(installed / "scenes", "from: installed\n", "a.yaml")
+    monkeypatch.setattr(config, "config_folder", lambda: installed)
+    home = tmp_path / "home"
+    home.mkdir()
+    path = write(home, GOOD.replace("simulation: {}", "simulation: {scene: scenes/a.yaml}"))
+    assert config.scene_mapping(load(path)) == {"from": "installed"}
+    assert "scene: scenes/a.yaml" in config.resolved_yaml(load(path))  # portable: no machine's folder in it
+    (home / "scenes").mkdir()
+    write(home / "scenes", "from: home\n", "a.yaml")
+    assert config.scene_mapping(load(path)) == {"from": "home"}
+    assert config.scene_mapping(load(path, "simulation.scene={phantom: none}")) == {"phantom": "none"}
+    monkeypatch.chdir(tmp_path)
+    named = load(path, "simulation.scene=installed/scenes/a.yaml")  # a shipped scene, named from where one stands
+    assert config.scene_mapping(named) == {"from": "installed"}
+    assert named.simulation is not None
+    assert named.simulation.scene == "scenes/a.yaml"
+    with pytest.raises(
+        ConfigError, match=r"--set .*: simulation\.scene: there is no file absent\.yaml; .*scenes/a\.yaml"
+    ):
+        load(path, "simulation.scene=absent.yaml")

@@ -1,0 +1,90 @@
+"""Every sink hears everything in order, and one that breaks or dawdles is nobody else's trouble."""
+
+from __future__ import annotations
+
+import threading
+
+from beamline.core.events import Announcer, Event
+from simulators.devices.clock import VirtualClock
+
+
+def test_all_sinks_hear_all_events_in_order_with_their_time() -> None:
+    clock = VirtualClock(start=100.0)
+    first: list[Event] = []
+    second: list[Event] = []
+    with Announcer([first.append, second.append], clock) as emit:
+        for i in range(50):
+            emit("frame", {"n": i})
+            clock.sleep(1.0)
+    assert [(e.event, e.time, e.data["n"]) for e in first] == [("frame", 100.0 + i, i) for i in range(50)]
+    assert first == second
+
+
+def test_a_sink_that_breaks_is_given_up_and_the_others_are_told() -> None:
+    heard: list[Event] = []
+    calls = 0
+
+    def broken(event: Event) -> None:
+        nonlocal calls
+        calls += 1
+        raise BrokenPipeError("reader is gone")
+
+    with Announcer([broken, heard.append], VirtualClock()) as emit:
+        emit("state", {"message": "a"})
+        emit("state", {"message": "b"})
+    assert calls == 1
+    assert [e.event for e in heard] == ["warning", "state", "state"]
+    assert "reader is gone" in heard[0].data["message"]
+
+
+def test_a_sink_that_hangs_does_not_hold_up_who_speaks() -> None:
+    go_on = threading.Event()
+    heard: list[int] = []
+
+    def slow(event: Event) -> None:
+        go_on.wait(30)
+        heard.append(event.data["n"])
+
+    with Announcer([slow], VirtualClock()) as emit:
+        for i in range(1000):
+            emit("frame", {"n": i})
+        assert heard == []  # everything was said before the sink did anything
+        go_on.set()
+    assert heard == list(range(1000))
+
+
+def test_threads_may_speak_at_once() -> None:
+    heard: list[Event] = []
+    with Announcer([heard.append], VirtualClock()) as emit:
+        threads = [
+            threading.Thread(target=lambda t=t: [emit("frame", {"thread": t, "n": n}) for n in range(100)])
+            for t in range(4)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(heard) == 400
+    for t in range(4):
+        assert [e.data["n"] for e in heard if e.data["thread"] == t] == list(range(100))
+
+
+def test_two_sinks_that_break_at_once_are_each_given_up_once() -> None:
+    """As both logs of a run do on a full disk: the word that one is given up is what breaks the other."""
+    heard: list[Event] = []
+
+    class Full:
+        def __init__(self) -> None:
+            self.calls = 0
+
+        def __call__(self, event: Event) -> None:
+            self.calls += 1
+            raise OSError(28, "No space left on device")
+
+    logs = [Full(), Full()]
+    with Announcer([*logs, heard.append], VirtualClock()) as emit:
+        emit("state", {"message": "a"})
+        emit("state", {"message": "b"})
+    assert [log.calls for log in logs] == [1, 1]
+    assert [e.data["message"] for e in heard if e.event == "state"] == ["a", "b"]
+    assert sum("given up" in e.data["message"] for e in heard) == 2

@@ -1,0 +1,30 @@
+"""Ask: a request is put to stderr and waits for Enter; where nobody sits, it says so."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from beamline.instrument.operator import ask_operator
+from drivers.errors import DeviceError
+
+
+def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    with pytest.raises(DeviceError, match="no terminal to ask at"):
+        ask_operator("Open the beam shutter.")
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stdin", Terminal(""))
+    with pytest.raises(DeviceError, match="was not confirmed"):
+        ask_operator("Open the beam shutter.")
+    monkeypatch.setattr(sys, "stdin", Terminal("\n"))
+    ask_operator("Open the beam shutter.")
+    captured = capsys.readouterr()
+    assert captured.out.strip() == ""  # stdout is for results
+    assert "Open the beam shutter. Then press Enter (to stop the scan: Ctrl-C, then Enter)" in captured.err

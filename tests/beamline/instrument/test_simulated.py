@@ -1,0 +1,195 @@
+"""Simulated devices scan as real ones do: from the trigger to the right angle, with beam, on the clock asked for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from beamline.config.models import Config
+from beamline.core.errors import ConfigError
+from beamline.instrument import connect as devices
+from beamline.plan.timeline import block_seconds
+from beamline.scan.dry_run import dry_run
+from drivers.clock import SystemClock
+from drivers.protocols import TriggerSource
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from simulators.devices.clock import ScaledClock, VirtualClock
+from simulators.frame.detector import Detector
+from simulators.scenes.scene import load_scene
+from tests.beamline.ball_scan import BALL, COMMON, STAGES, fly, shipped, small
+
+
+@pytest.mark.parametrize("stage", STAGES.values(), ids=STAGES)
+@pytest.mark.parametrize("angles", ["{scheme: fixed, views: 24}", "{scheme: interlaced, views: 24, passes: 3}"])
+def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
+    """The stand-in of each controller behind the same configuration: as many frames as pulses, each at its count."""
+    settings = small(
+        f"devices.stage={stage}",
+        f"devices.camera.trigger_polarity={'negative' if 'active_high: false' in stage else 'positive'}",
+        *("devices.stage.low_deg=-60", f"scan.angles={angles}", "scan.period_s=2"),
+    )
+    worked = dry_run(settings)
+    assert worked.timeline.violations == ()
+    block = worked.timeline.views
+    with devices.connect(settings) as bench:
+        assert bench.devices.stage.limits == worked.stage
+        bench.devices.shutter.open()
+        stamps, images = fly(bench, block, settings)
+        assert bench.devices.stage.remaining_pulses() in (0, None)
+    assert stamps == list(range(block.n))
+    scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
+    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.sample.line_integrals(a, detector)) for a in block.angles])
+    assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
+
+
+@pytest.mark.parametrize("output", ["kind: pi_gcs, trigger_line", "kind: zaber, output"])
+def test_an_output_that_a_simulated_controller_lacks_is_refused_in_words(output: str) -> None:
+    kind, key = output.removeprefix("kind: ").split(", ")
+    settings = small(f"devices.stage={{{output}: 9, port: 'sim://{kind}', {COMMON}}}")
+    with pytest.raises(ConfigError, match=rf"{key}: the simulated {kind} controller has no such digital output"):
+        devices.connect(settings)
+
+
+@pytest.mark.parametrize("stage", ["pi_gcs", "zaber, falling"])
+def test_a_simulated_camera_that_takes_the_other_edge_is_refused_with_the_one_it_needs(stage: str) -> None:
+    """It would expose at every pulse's end; a real cable may have an inverter, so a real camera may."""
+    falling = "falling" in stage
+    other, needed = ("positive", "negative") if falling else ("negative", "positive")
+    with pytest.raises(ConfigError, match=f"active_high {str(not falling).lower()} .* set trigger_polarity {needed}"):
+        small(f"devices.stage={STAGES[stage]}", f"devices.camera.trigger_polarity={other}")
+    real = shipped("instrument", "devices.camera.trigger_polarity=negative")
+    assert real.devices.stage.active_high
+
+
+@pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
+@pytest.mark.parametrize("open_high", [True, False])
+def test_a_shutter_on_the_stage_s_output_lets_the_beam_through(kind: str, open_high: bool) -> None:
+    """The driver sets the controller's output; the simulated blade follows the cable, and the camera sees it."""
+    settings = small(
+        f"devices.stage={STAGES[kind]}",
+        f"devices.shutter={{kind: stage_output, output: 4, open_high: {str(open_high).lower()}, settle_s: 0.25}}",
+    )
+    with devices.connect(settings) as bench:
+        camera, shutter = bench.devices.camera, bench.devices.shutter
+        camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
+        camera.arm(4)
+
+        def brightest() -> int:
+            bench.clock.sleep(camera.timing.min_period)
+            camera.software_trigger()
+            return int(camera.next_frame(1.0).counts.max())
+
+        shutter.close()
+        assert (shutter.is_open(), brightest()) == (False, 0)
+        before = bench.clock.now()
+        shutter.open()
+        assert bench.clock.now() - before == pytest.approx(0.25, abs=0.05)
+        assert (shutter.is_open(), brightest()) == (True, round(1e5 * 0.05 / 0.107))
+        shutter.close()
+        assert (shutter.is_open(), brightest()) == (False, 0)
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        "{scheme: fixed, views: 24}",
+        "{scheme: fixed, views: 12, start_deg: 180, span_deg: -180}",
+        "{scheme: interlaced, views: 24, passes: 4}",
+        "{scheme: sector, views: 13, first_deg: 30, last_deg: 150}",
+    ],
+)
+def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
+    settings = small(f"scan.angles={angles}", "scan.period_s=2", "devices.stage.low_deg=-20")
+    worked = dry_run(settings)
+    assert worked.timeline.violations == ()
+    block = worked.timeline.views
+    with devices.connect(settings) as bench:
+        assert isinstance(bench.clock, VirtualClock)
+        bench.devices.shutter.open()
+        began = bench.clock.now()
+        stamps, images = fly(bench, block, settings)
+        seconds = bench.clock.now() - began
+    # Nothing but the polls of a standing stage separates the plan from the clock.
+    assert seconds == pytest.approx(
+        block_seconds(block, worked.stage, worked.camera, settle=0), abs=0.05 * len(block.trains)
+    )
+    assert stamps == list(range(block.n))
+    # The ball's shadow stands at u = x cos(angle) on a detector of 4.6 um pixels whose middle is the axis.
+    u = (np.arange(40) - 19.5) * 4.6e-3
+    depth = -np.log(np.maximum(images, 1) / (1e5 * 0.05 / 0.107))
+    centre = (depth.clip(0.05) - 0.05).sum(axis=1) @ u / (depth.clip(0.05) - 0.05).sum(axis=(1, 2))
+    np.testing.assert_allclose(centre, 0.06 * np.cos(block.angles), atol=2e-4)
+    # And each picture is the scene's at that angle, to the rounding of a count; a tenth of a step would show.
+    scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
+    exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.sample.line_integrals(a, detector)) for a in block.angles])
+    assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
+
+
+def test_step_darks_and_flats() -> None:
+    settings = small()
+    with devices.connect(settings) as bench:
+        stage, camera, shutter, sample = (
+            getattr(bench.devices, name) for name in ("stage", "camera", "shutter", "sample")
+        )
+        camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
+        camera.arm(3)
+
+        def shot() -> np.ndarray:
+            bench.clock.sleep(camera.timing.min_period)
+            camera.software_trigger()
+            return camera.next_frame(1.0).counts
+
+        stage.start_move(math.pi / 2, stage.limits.max_speed)
+        assert stage.wait(60.0) == pytest.approx(math.pi / 2, abs=1e-5)
+        dark = shot()
+        shutter.open()
+        view = shot()
+        sample.out()
+        flat = shot()
+    assert dark.max() == 0
+    assert flat.min() == flat.max() == round(1e5 * 0.05 / 0.107)
+    assert view.min() < 0.5 * flat.min()
+
+
+def settings_clock(settings: Config) -> type:
+    with devices.connect(settings) as bench:
+        return type(bench.clock)
+
+
+def test_clocks() -> None:
+    assert settings_clock(shipped("demo")) is SystemClock
+    assert settings_clock(shipped("demo", "simulation.clock=virtual")) is VirtualClock
+    assert settings_clock(shipped("demo", "simulation.clock={speed: 4}")) is ScaledClock
+    given = VirtualClock(5.0)
+    with devices.connect(shipped("demo"), given) as bench:
+        assert bench.clock is given
+
+
+def test_benches_do_not_share_a_controller() -> None:
+    settings = small()
+    with devices.connect(settings) as one, devices.connect(settings) as two:
+        one.devices.stage.start_move(1.0, one.devices.stage.limits.max_speed)
+        one.devices.stage.wait(60.0)
+        assert one.devices.stage.position() == pytest.approx(1.0, abs=1e-4)
+        assert two.devices.stage.position() == 0.0
+
+
+def test_truth_lies_where_a_reconstruction_puts_it() -> None:
+    """A region off the sensor's middle: z counts from the middle of the rows that were read."""
+    settings = small("devices.camera.roi=[1136, 2020, 40, 56]")  # its rows' middle is 4 rows above the sensor's
+    with devices.connect(settings) as bench:
+        bench.devices.camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
+        assert bench.truth is not None
+        volume = bench.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), 4.6e-3)))
+    z, y, x = (
+        float((volume.data.sum(axis=axes) * at).sum() / volume.data.sum())
+        for axes, at in zip(((1, 2), (0, 2), (0, 1)), volume.grid.coordinates(), strict=True)
+    )
+    assert (x, y) == (pytest.approx(0.06, abs=1e-4), pytest.approx(0, abs=1e-4))
+    # Rows 1136 ... 1175 have their middle at 1155.5, the sensor at 1151.5: z of the ball falls by 4 pixels.
+    assert z == pytest.approx(0.01 - 4 * 4.6e-3, abs=1e-4)
+    # A ball of 0.02 mm radius and 30 / mm.
+    assert volume.data.sum() * 4.6e-3**3 == pytest.approx(30 * 4 / 3 * math.pi * 0.02**3, rel=0.01)

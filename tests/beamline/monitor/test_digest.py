@@ -1,0 +1,151 @@
+"""Digest against numpy and scipy, which know nothing of it."""
+
+from __future__ import annotations
+
+import time
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.stats import entropy as scipy_entropy
+
+from beamline.monitor.digest import ENTROPY_BINS, _count_greys, digest, preview_shape
+
+shapes = st.tuples(st.integers(1, 17), st.integers(1, 17))
+counts = hnp.arrays(np.uint16, shapes)
+
+
+def naive_preview(image: np.ndarray, valid: np.ndarray, bin_: int) -> np.ndarray:
+    out = np.full(preview_shape(image.shape, bin_), np.nan)
+    for r in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            part = np.s_[r * bin_ : (r + 1) * bin_, c * bin_ : (c + 1) * bin_]
+            if valid[part].any():
+                out[r, c] = image[part][valid[part]].mean(dtype=np.float64)
+    return out
+
+
+def naive_entropy(values: np.ndarray) -> float:
+    low, high = values.min(), values.max()
+    if low == high:
+        return 0.0
+    bins = np.minimum(((values - low) * (ENTROPY_BINS / (high - low))).astype(int), ENTROPY_BINS - 1)
+    return float(scipy_entropy(np.bincount(bins), base=2))
+
+
+@settings(max_examples=60, deadline=None)
+@given(image=counts, bin_=st.integers(1, 5), saturation=st.integers(0, 65535))
+def test_counts_agree_with_numpy(image: np.ndarray, bin_: int, saturation: int) -> None:
+    found = digest(image, saturation=saturation, preview_bin=bin_)
+    exact = image.astype(np.float64)
+    assert (found.minimum, found.maximum, found.sum_abs) == (exact.min(), exact.max(), exact.sum())
+    assert found.mean == pytest.approx(exact.mean(), rel=1e-12)
+    assert found.variance == pytest.approx(exact.var(), rel=1e-9, abs=1e-9)
+    assert found.saturated_fraction == (image >= saturation).mean()
+    assert found.invalid_fraction == 0
+    assert found.checksum == zlib.crc32(image.tobytes())
+    np.testing.assert_allclose(found.preview, naive_preview(image, np.ones(image.shape, bool), bin_), rtol=1e-6)
+
+
+def test_entropy_is_numpys_histogram_and_scipys_sum(rng: np.random.Generator) -> None:
+    image = rng.poisson(1400, (64, 96)).astype(np.uint16)
+    histogram, _ = np.histogram(image, bins=ENTROPY_BINS)
+    assert digest(image).entropy == pytest.approx(scipy_entropy(histogram, base=2), abs=1e-9)
+    reals = rng.normal(size=(64, 96))
+    histogram, _ = np.histogram(reals, bins=ENTROPY_BINS)
+    assert digest(reals).entropy == pytest.approx(scipy_entropy(histogram, base=2), abs=1e-9)
+
+
+def test_entropy_of_what_can_be_counted_by_hand() -> None:
+    assert digest(np.full((4, 4), 7, np.uint16)).entropy == 0
+    assert digest(np.array([[0, 1], [2, 3]], np.uint16)).entropy == 2  # four equally likely greys
+    assert digest(np.arange(256, dtype=np.uint16).reshape(16, 16)).entropy == 8
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16, np.int32, np.uint8])
+def test_other_types_say_the_same_as_counts(dtype: type, rng: np.random.Generator) -> None:
+    image = rng.integers(0, 200, (33, 18))
+    expected, found = digest(image.astype(np.uint16)), digest(image.astype(dtype))
+    for name in ("minimum", "maximum", "mean", "variance", "sum_abs", "entropy"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9), name
+    np.testing.assert_allclose(found.preview, expected.preview, rtol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    image=hnp.arrays(
+        np.float32,
+        shapes,
+        elements=st.floats(-1e4, 1e4, width=32) | st.sampled_from([np.nan, np.inf, -np.inf, -1.0]),
+    ),
+    bin_=st.integers(1, 5),
+)
+def test_invalid_pixels_are_counted_and_never_spread(image: np.ndarray, bin_: int) -> None:
+    found = digest(image, preview_bin=bin_, no_data=-1.0)
+    valid = np.isfinite(image) & (image != -1)
+    assert found.invalid_fraction == pytest.approx((~valid).mean(), abs=1e-12)
+    np.testing.assert_allclose(found.preview, naive_preview(image, valid, bin_), rtol=1e-5, atol=1e-3)
+    values = image[valid].astype(np.float64)
+    if values.size == 0:
+        assert np.isnan([found.minimum, found.maximum, found.mean, found.variance, found.entropy]).all()
+        return
+    assert (found.minimum, found.maximum) == (values.min(), values.max())
+    assert found.mean == pytest.approx(values.mean(), rel=1e-9, abs=1e-9)
+    assert found.variance == pytest.approx(values.var(), rel=1e-7, abs=1e-6)
+    assert found.sum_abs == pytest.approx(np.abs(values).sum(), rel=1e-9)
+    assert found.entropy == pytest.approx(naive_entropy(values), abs=1e-9)
+
+
+def test_variance_keeps_its_digits_far_from_zero(rng: np.random.Generator) -> None:
+    small = rng.normal(size=(50, 40))
+    assert digest(small + 1e7).variance == pytest.approx(small.var(), rel=1e-6)
+
+
+def test_a_view_into_a_larger_array_is_digested_like_its_copy(rng: np.random.Generator) -> None:
+    large = rng.integers(0, 65536, (40, 60)).astype(np.uint16)
+    view = large[3:30, 5:50:2]
+    a, b = digest(view), digest(view.copy())
+    assert (a.checksum, a.mean, a.variance) == (b.checksum, b.mean, b.variance)
+    np.testing.assert_array_equal(a.preview, b.preview)
+
+
+def test_one_frame_compiles_the_kernel_for_all(rng: np.random.Generator) -> None:
+    digest(np.zeros((3, 3), np.uint16))
+    before = len(_count_greys.signatures)
+    image = rng.poisson(100, (20, 20)).astype(np.uint16)
+    for writeable in (True, False):
+        image.flags.writeable = writeable
+        digest(image)
+    digest(image[:, ::2])
+    assert len(_count_greys.signatures) == before
+    assert not image.flags.writeable  # the caller's array is as it was
+
+
+def test_one_changed_pixel_changes_the_checksum(rng: np.random.Generator) -> None:
+    image = rng.poisson(100, (20, 20)).astype(np.uint16)
+    other = image.copy()
+    other[7, 3] += 1
+    assert digest(image).checksum == digest(image.copy()).checksum != digest(other).checksum
+
+
+@pytest.mark.parametrize("bad", [np.zeros((2, 2, 2)), np.zeros((0, 4)), np.zeros((2, 2), complex), np.zeros(4)])
+def test_what_is_no_frame_is_refused(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"non-empty real \[row, col\]"):
+        digest(bad)
+    with pytest.raises(ValueError, match="at least 1"):
+        digest(np.zeros((2, 2)), preview_bin=0)
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize(("shape", "limit"), [((2304, 4096), 0.05), ((200, 200), 0.002)])
+def test_a_frame_takes_a_few_milliseconds(shape: tuple[int, int], limit: float, rng: np.random.Generator) -> None:
+    image = rng.poisson(1400, shape).astype(np.uint16)
+    digest(image)
+    start = time.perf_counter()
+    digest(image, saturation=65535)
+    seconds = time.perf_counter() - start
+    print(f"{shape}: {seconds * 1e3:.2f} ms")
+    assert seconds < limit

@@ -1,0 +1,87 @@
+"""The checks together: silent on clean scans, legal thresholds named, flags packed into bits that can be unpacked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.core.errors import ConfigError
+from beamline.monitor import watch as scan
+from beamline.monitor.digest import digest
+from beamline.monitor.flag import Context, Flag, Level
+from drivers.frame import Frame, FrameKind
+
+CONTEXT = Context(saturation=65535, pixels=100)
+
+
+def test_a_clean_scan_raises_no_flag(bench: Any) -> None:
+    frames = bench.references() + bench.views(720) + bench.flats() + bench.darks()
+    assert bench.watch(frames) == []
+
+
+def test_a_clean_scan_in_jumping_order_raises_no_flag(bench: Any) -> None:
+    frames = bench.references()
+    for i in range(300):
+        frames += [replace(frame, trigger=i) for frame in bench.views(1, first=i * 77 % 360)]
+    assert bench.watch(frames, period=None) == []
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(bench: Any, factor: float) -> None:
+    def flats() -> list[Frame]:
+        return [replace(f, exposure=factor * f.exposure) for f in bench.flats(light=factor)]
+
+    clean = bench.darks() + flats() + bench.views(60) + flats() + bench.darks()
+    assert bench.watch(clean) == []
+    dimmed = bench.darks() + flats() + bench.views(20) + bench.views(2, first=20, light=0.9) + flats()
+    found = bench.watch(dimmed)
+    assert {flag.check for flag in found} == {"beam"}
+    assert [flag.score for flag in found] == pytest.approx([0.1, 0.1], abs=0.01)
+
+
+def test_checks_compare_with_the_mean_of_the_latest_group_of_references(bench: Any) -> None:
+    groups = [bench.darks(3), bench.flats(4), bench.views(5), bench.flats(3, light=0.9), bench.darks(2)]
+    state = scan.start(CONTEXT)
+    for frames in groups:
+        for frame in frames:
+            state, _ = scan.watch(state, frame, digest(frame.counts, 65535, 4))
+        kind = frames[0].kind
+        if kind is not FrameKind.PROJECTION:
+            mean = np.mean([digest(frame.counts, 65535, 4).preview for frame in frames], axis=0)
+            found = state.context.dark if kind is FrameKind.DARK else state.context.flat
+            np.testing.assert_allclose(found, mean, rtol=1e-5)
+
+
+def test_a_frame_may_have_several_flags(bench: Any) -> None:
+    frames = bench.references() + bench.views(12)
+    frames[-1].counts[:] = 200
+    frames[-1].counts[30:32] = 65535
+    checks = {flag.check for flag in bench.watch(frames)}
+    assert {"beam", "saturation"} <= checks
+
+
+@given(st.lists(st.tuples(st.sampled_from(scan.NAMES), st.sampled_from(Level)), unique_by=lambda pair: pair[0]))
+def test_every_set_of_flags_has_its_own_bits(found: list[tuple[str, Level]]) -> None:
+    bits = scan.bitmask([Flag(check, level, 0, 1.0, 0.0, "") for check, level in found])
+    assert 0 <= bits < 2**32
+    unpacked = {
+        name: Level.ALARM if bits >> (scan.ALARM_SHIFT + i) & 1 else Level.WARN
+        for i, name in enumerate(scan.NAMES)
+        if bits >> i & 1
+    }
+    assert unpacked == dict(found)
+
+
+def test_an_unknown_check_is_refused_with_the_legal_names() -> None:
+    with pytest.raises(ConfigError, match=r"'bean'; legal: beam, saturation"):
+        scan.start(CONTEXT, {"bean": {"warn": 0.1}})
+
+
+def test_an_unknown_limit_is_refused_with_the_legal_names() -> None:
+    with pytest.raises(ConfigError, match=r"beam has no limit 'wran'; legal: warn, alarm, lost"):
+        scan.start(CONTEXT, {"beam": {"wran": 0.1}})

@@ -1,0 +1,142 @@
+"""Angle plans: laws that hold for every number of views, passes and span."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.plan import angles
+
+VIEWS = st.integers(1, 400)
+START = st.floats(-10, 10)
+SPAN = st.floats(0.01, 2 * math.pi) | st.floats(-2 * math.pi, -0.01)
+
+
+def _inside(theta: np.ndarray, start: float, span: float) -> bool:
+    position = (theta - start) / span
+    return bool(np.all((position >= -1e-12) & (position < 1)))
+
+
+@given(views=VIEWS, start=START, span=SPAN)
+def test_fixed_steps_are_equal_and_leave_out_the_end(views: int, start: float, span: float) -> None:
+    theta = angles.fixed(views, start, span)
+    assert theta.shape == (views,)
+    assert theta[0] == start
+    assert _inside(theta, start, span)
+    np.testing.assert_allclose(np.diff(theta), span / views, rtol=0, atol=1e-12)
+    # One more step would be the end: the circle (or half circle) closes without a view taken twice.
+    assert theta[-1] + span / views == pytest.approx(start + span, abs=1e-12)
+
+
+@given(views=VIEWS, first=START, last=START)
+def test_sector_includes_both_ends(views: int, first: float, last: float) -> None:
+    theta = angles.sector(views, first, last)
+    assert theta.shape == (views,)
+    assert theta[0] == first
+    if views > 1:
+        assert theta[-1] == last
+        np.testing.assert_allclose(np.diff(theta), (last - first) / (views - 1), rtol=0, atol=1e-12)
+
+
+@given(views=VIEWS, start=START, span=SPAN, seed=st.integers(0, 2**31))
+def test_random_is_sorted_without_repeats_and_repeatable(views: int, start: float, span: float, seed: int) -> None:
+    theta = angles.random(views, start, span, rng=np.random.default_rng(seed))
+    assert theta.shape == (views,)
+    assert _inside(theta, start, span)
+    assert np.all(np.diff(theta) * np.sign(span) > 0)
+    np.testing.assert_array_equal(theta, angles.random(views, start, span, rng=np.random.default_rng(seed)))
+
+
+def test_random_is_uniform() -> None:
+    theta = angles.random(20_000, 0.0, 1.0, rng=np.random.default_rng(3))
+    # Kolmogorov-Smirnov distance of 20 000 uniform draws stays under 1.63 / sqrt(n) in 99 of 100 cases.
+    assert np.abs(theta - np.arange(20_000) / 20_000).max() < 1.63 / math.sqrt(20_000)
+
+
+@given(passes=st.integers(1, 300))
+def test_pass_order_is_a_permutation(passes: int) -> None:
+    np.testing.assert_array_equal(np.sort(angles.pass_order(passes)), np.arange(passes))
+
+
+def test_pass_order_is_the_published_bit_reversal() -> None:
+    # Mohan et al. 2015 (TIMBIR): K = 4 and K = 8 sub-frames.
+    assert angles.pass_order(4).tolist() == [0, 2, 1, 3]
+    assert angles.pass_order(8).tolist() == [0, 4, 2, 6, 1, 5, 3, 7]
+
+
+@given(per_pass=st.integers(2, 40), passes=st.integers(1, 16), start=START, span=SPAN)
+def test_interlaced_is_the_fixed_plan_in_another_order(per_pass: int, passes: int, start: float, span: float) -> None:
+    views = per_pass * passes
+    theta = angles.interlaced(views, passes, start, span)
+    direction = math.copysign(1, span)
+    np.testing.assert_array_equal(np.sort(theta * direction), angles.fixed(views, start, span) * direction)
+    sweeps = theta.reshape(passes, per_pass)
+    np.testing.assert_allclose(np.diff(sweeps, axis=1), passes * span / views, rtol=0, atol=1e-9)
+
+
+@given(power=st.integers(1, 5), done=st.integers(1, 32))
+def test_interlaced_gaps_halve(power: int, done: int) -> None:
+    """After any number of passes no gap is more than twice the smallest (the point of bit reversal)."""
+    passes = 1 << power
+    done = min(done, passes)
+    theta = np.sort(angles.interlaced(4 * passes, passes)[: 4 * done])
+    gaps = np.diff(np.append(theta, theta[0] + math.pi))
+    assert gaps.max() <= 2 * gaps.min() + 1e-9
+
+
+@pytest.mark.parametrize(("views", "passes"), [(10, 3), (10, 10), (10, 0), (3, 2)])
+def test_interlaced_names_the_legal_passes(views: int, passes: int) -> None:
+    with pytest.raises(ValueError, match=f"{views} views cannot be taken in {passes} equal passes.*legal passes: 1"):
+        angles.interlaced(views, passes)
+
+
+@given(views=st.integers(2, 400), start=START, span=SPAN)
+def test_golden_spreads_by_the_three_gap_theorem(views: int, start: float, span: float) -> None:
+    """Any n multiples of an irrational cut the circle in at most three gap lengths, the largest the sum of the others.
+
+    For the golden section the largest is at most phi**2 = 2.618 times the smallest.
+    """
+    theta = angles.golden(views, start, span)
+    assert _inside(theta, start, span)
+    position = np.sort((theta - start) / span)
+    gaps = np.diff(np.append(position, position[0] + 1.0))
+    lengths = np.unique(gaps.round(9))
+    assert len(lengths) <= 3
+    if len(lengths) == 3:
+        assert lengths[2] == pytest.approx(lengths[0] + lengths[1], abs=3e-9)
+    assert gaps.max() / gaps.min() < ((1 + math.sqrt(5)) / 2) ** 2 + 1e-6
+
+
+def test_file_keeps_the_order() -> None:
+    theta = angles.from_text("# from the last scan\n0\n 90.0  # quarter\n\n-45\r\n1e1\n")
+    np.testing.assert_allclose(theta, [0, math.pi / 2, -math.pi / 4, math.pi / 18])
+
+
+@given(st.lists(st.floats(-720, 720), min_size=1, max_size=50))
+def test_file_round_trip(degrees: list[float]) -> None:
+    text = "\n".join(repr(value) for value in degrees)
+    np.testing.assert_array_equal(angles.from_text(text), np.deg2rad(degrees))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("0\nten\n", "line 2 holds 'ten'"),
+        ("0\n1 2\n", "line 2 holds '1 2'"),
+        ("0\n\nnan\n", "line 3 holds 'nan'"),
+        ("# nothing\n\n", "no angle"),
+    ],
+)
+def test_file_names_the_line(text: str, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        angles.from_text(text)
+
+
+@pytest.mark.parametrize("plan", [angles.fixed, angles.golden])
+def test_no_views_is_refused(plan: object) -> None:
+    with pytest.raises(ValueError, match="at least 1 view"):
+        plan(0)  # type: ignore[operator]

@@ -1,0 +1,378 @@
+"""Timeline: rows, pulses, times and limits against hand-worked figures and brute force."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from beamline.plan import angles
+from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
+from beamline.plan.timeline import block_seconds, describe, move_seconds, pass_ends, taxi_angle, work_out
+from drivers.errors import DeviceRefused
+from drivers.frame import FrameKind
+from drivers.protocols import CameraTiming, StageLimits
+from drivers.stages.travel import Travel
+
+DEG = math.pi / 180
+STAGE = StageLimits(360_000, 30 * DEG, 60 * DEG, -5 * DEG, 365 * DEG, True)
+CAMERA = CameraTiming(shape=(144, 252), min_period=0.051, readout=0.0006, row_period=3.6e-6, bits=16)
+PLAN = ScanPlan(
+    angles=angles.fixed(360),
+    mode=Mode.FLY,
+    exposure=0.05,
+    period=0.1,
+    settle=0.1,
+    darks=FieldPlan(10, Place.START, 0.05),
+    flats=FieldPlan(20, Place.BOTH, 0.05),
+    scheme="fixed",
+)
+
+
+def to_counts(angle: float) -> int:
+    return round(angle / (2 * math.pi) * 360_000)
+
+
+def worked(
+    plan: ScanPlan = PLAN, stage: StageLimits = STAGE, camera: CameraTiming = CAMERA, **more: object
+) -> Timeline:
+    return work_out(plan, stage, to_counts, camera, **more)  # type: ignore[arg-type]
+
+
+def test_a_fly_scan_worked_by_hand() -> None:
+    timeline = worked(axis_col=125.5)
+    assert [(b.kind.name, b.mode, b.first_row, b.n) for b in timeline.blocks] == [
+        ("DARK", Mode.STATIC, 0, 10),
+        ("FLAT", Mode.STATIC, 10, 20),
+        ("PROJECTION", Mode.FLY, 30, 360),
+        ("FLAT", Mode.STATIC, 390, 20),
+    ]
+    views = timeline.blocks[2]
+    # 180 deg / 360 = 0.5 deg = 500 counts; 0.5 deg in 0.1 s = 5 deg/s; 5**2 / (2 * 60) = 0.208 deg to accelerate,
+    # that is 0.417 steps, and ceil(0.417 + 0.5) = 1 step of taxi.
+    assert timeline.step_counts == 500
+    assert timeline.step == pytest.approx(0.5 * DEG)
+    assert views.speed == pytest.approx(5 * DEG)
+    assert views.taxi == pytest.approx(0.5 * DEG)
+    np.testing.assert_allclose(views.angles, np.arange(360) * 0.5 * DEG, atol=1e-12)
+    ((start, stop),) = pass_ends(views)
+    assert (start, stop) == (pytest.approx(-0.5 * DEG), pytest.approx(180.0 * DEG))
+    # Half the detector is 126 px: 5 deg/s * 0.05 s = 0.00436 rad.
+    assert timeline.blur_px == pytest.approx(126 * 0.25 * DEG)
+    assert timeline.skew_px == pytest.approx(126 * 5 * DEG * 3.6e-6 * 143)
+    assert (timeline.frame_bytes, timeline.total_bytes) == (72_576, (72_576 + 36 * 63 * 4) * 410)
+    assert timeline.n_frames == 410
+    # To -0.5 deg: 2 sqrt(0.5/60); the pass: 180.5 deg at 5 deg/s and one ramp's 1/12 s; back to zero: 180/30 + 1/2 s.
+    pass_and_moves = 2 * math.sqrt(0.5 / 60) + 180.5 / 5 + 5 / 60 + (180 / 30 + 0.5)
+    references = (10 + 20 + 20 - 3) * 0.051  # one period less than frames in each block, and ...
+    tails = 4 * 0.0506  # ... the last exposure and readout of every block
+    assert timeline.duration == pytest.approx(pass_and_moves + references + tails)
+    assert timeline.violations == ()
+
+
+def test_a_step_scan_worked_by_hand() -> None:
+    plan = replace(PLAN, angles=angles.from_text("0\n10\n10.0004\n-1"), mode=Mode.STEP, scheme="file")
+    timeline = worked(plan)
+    views = timeline.blocks[2]
+    assert (views.mode, views.trains, views.speed, views.taxi) == (Mode.STEP, (), 0.0, 0.0)
+    # Each view at its nearest whole count, in the order asked for.
+    np.testing.assert_allclose(views.angles / DEG, [0, 10, 10, -1], atol=1e-12)
+    assert (timeline.step_counts, timeline.blur_px, timeline.skew_px) == (0, 0.0, 0.0)
+    # Moves of 0, 10, 0 and 11 deg (triangles: below 30**2 / 60 = 15 deg), 0.1 s to settle, 0.0506 s to expose and read.
+    times = [0.1506, 2 * math.sqrt(10 / 60) + 0.1506, 0.1506, 2 * math.sqrt(11 / 60) + 0.1506]
+    assert block_seconds(views, STAGE, CAMERA, plan.settle) == pytest.approx(sum(times))
+    slow = replace(plan, period=5.0)
+    assert block_seconds(worked(slow).blocks[2], STAGE, CAMERA, plan.settle) == pytest.approx(0.1 + 3 * 5.0 + 0.0506)
+    assert timeline.violations == ()
+
+
+@given(
+    views=st.integers(2, 200),
+    passes=st.sampled_from([1, 2, 3, 4, 8]),
+    start=st.floats(0, 180),
+    backwards=st.booleans(),
+    darks=st.integers(0, 5),
+    flats=st.integers(0, 5),
+    at=st.tuples(st.sampled_from(Place), st.sampled_from(Place)),
+    period=st.floats(0.06, 10),
+)
+def test_rows_are_contiguous_and_every_view_has_its_pulse(
+    views: int,
+    passes: int,
+    start: float,
+    backwards: bool,
+    darks: int,
+    flats: int,
+    at: tuple[Place, Place],
+    period: float,
+) -> None:
+    views = max(2, views // passes) * passes
+    theta = angles.interlaced(views, passes, start * DEG, -math.pi if backwards else math.pi)
+    plan = replace(
+        PLAN, angles=theta, period=period, darks=FieldPlan(darks, at[0], 0.05), flats=FieldPlan(flats, at[1], 0.1)
+    )
+    timeline = worked(plan)
+    row = 0
+    for block in timeline.blocks:
+        assert block.first_row == row
+        assert block.n > 0
+        row += block.n
+    assert row == timeline.n_frames
+    taken = {kind: sum(b.n for b in timeline.blocks if b.kind is kind) for kind in FrameKind}
+    times = {Place.NONE: 0, Place.START: 1, Place.END: 1, Place.BOTH: 2}
+    assert taken[FrameKind.DARK] == darks * times[at[0]]
+    assert taken[FrameKind.FLAT] == flats * times[at[1]]
+    (block,) = (b for b in timeline.blocks if b.kind is FrameKind.PROJECTION)
+    pulses = [train.start + i * train.interval for train in block.trains for i in range(train.n)]
+    assert len(pulses) == views == block.n
+    np.testing.assert_allclose(block.angles, np.array(pulses) * math.pi / 180_000, atol=1e-9)
+    assert np.abs(block.angles - theta).max() <= (views + 1) * math.pi / 360_000 + 1e-9
+    assert [train.end for train in block.trains][-1] == pulses[-1]
+    # Between pulses of a pass exactly one period goes by, and the speed is a whole number of counts a second, the
+    # nearest one; the run-up suffices to reach that speed before the first pulse.
+    assert block.speed * block.period == pytest.approx(timeline.step)
+    rate = block.speed / (math.pi / 180_000)
+    assert rate == pytest.approx(round(rate))
+    assert abs(rate - timeline.step_counts / period) <= 0.5 + 1e-6
+    lattice = timeline.step / len(block.trains)
+    assert block.taxi >= block.speed**2 / (2 * STAGE.acceleration) + lattice / 2 - 1e-12
+    assert timeline.step == pytest.approx(timeline.step_counts * math.pi / 180_000)
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+def test_a_stage_that_needs_room_before_a_train_gets_it(passes: int) -> None:
+    plan = replace(PLAN, angles=angles.interlaced(180, passes), period=2.0)
+    slow = worked(plan).views
+    roomy = worked(plan, replace(STAGE, run_up=1)).views
+    (train, *_), lattice = roomy.trains, math.pi / 180
+    interval = train.interval * math.pi / 180_000
+    assert slow.taxi == pytest.approx(lattice)  # the run-up of a slow scan
+    assert roomy.taxi == pytest.approx(interval + lattice)  # more than an interval, and still whole steps
+
+
+@given(distance=st.floats(0, 400), speed=st.floats(0.5, 60), acceleration=st.floats(1, 200))
+def test_move_time_against_integration(distance: float, speed: float, acceleration: float) -> None:
+    """Distance run in the computed time, by integrating the trapezoid, is the distance."""
+    total = move_seconds(-distance, speed, acceleration)
+    t = np.linspace(0, total, 4001)
+    v = np.minimum(np.minimum(acceleration * t, acceleration * (total - t)), speed)
+    assert np.trapezoid(v, t) == pytest.approx(distance, rel=1e-3, abs=1e-9)
+
+
+@given(speed=st.floats(1e-4, 2), acceleration=st.floats(1e-3, 5), interval=st.floats(1e-5, 0.2))
+def test_taxi_is_the_fewest_whole_intervals(speed: float, acceleration: float, interval: float) -> None:
+    taxi = taxi_angle(speed, acceleration, interval)
+    ramp = speed**2 / (2 * acceleration)
+    assert taxi / interval == pytest.approx(round(taxi / interval))
+    assert taxi >= (ramp + interval / 2) * (1 - 1e-9)
+    assert taxi - interval < (ramp + interval / 2) * (1 + 1e-9)
+
+
+@given(
+    period=st.floats(0.001, 2),
+    exposure=st.floats(0.0005, 0.5),
+    views=st.integers(2, 720),
+    start=st.floats(-20, 200),
+    free=st.integers(0, 10**8),
+)
+def test_no_violation_means_that_nothing_is_broken(
+    period: float, exposure: float, views: int, start: float, free: int
+) -> None:
+    """Each limit checked again from the blocks; a violation is there exactly where one of them is broken."""
+    camera = replace(CAMERA, min_period=exposure + 0.001)
+    plan = replace(PLAN, angles=angles.fixed(views, start * DEG), period=period, exposure=exposure)
+    timeline = worked(plan, camera=camera, free_bytes=free)
+    block = timeline.blocks[2]
+    first, last = block.angles[0], block.angles[-1]
+    half_count = math.pi / 360_000
+    broken = [
+        exposure > block.period,
+        block.period < camera.min_period,
+        timeline.step_counts / period < 0.5,
+        block.speed > STAGE.max_speed,
+        first - block.taxi < STAGE.low - half_count or last + block.taxi > STAGE.high + half_count,
+        timeline.total_bytes * 1.1 > free,
+    ]
+    assert len(timeline.violations) == sum(broken)
+
+
+VIOLATIONS = {
+    "period below the camera's": ({"period": 0.0505}, "period_s 0.0505 is below the camera's least 0.051 s"),
+    "exposure over period": ({"exposure": 0.2}, "exposure_s 0.2 is longer than period_s 0.1"),
+    "speed": (
+        {"angles": angles.fixed(40, 90 * DEG)},
+        "needs 45°/s, the stage turns at most 30°/s; set scan.period_s >= 0.15",
+    ),
+    "start": ({"angles": angles.fixed(360, -5 * DEG)}, "go from -5.5° to 175° (with 0.5° of taxi at each end)"),
+    "end": ({"angles": angles.fixed(360, 186 * DEG)}, "limits are -5° ... 365°"),
+    "slow": ({"period": 2000.0}, "less than a count a second of the stage; set scan.period_s <= 500"),
+    "step beyond": ({"angles": np.array([0.0, 7.0]), "mode": Mode.STEP}, "go from 0° to 401.07°, its limits"),
+    "unequal": ({"angles": angles.golden(100)}, "not equally spaced"),
+    "one view": ({"angles": np.zeros(1)}, "at least 2 views"),
+    "no flats": ({"flats": FieldPlan(0, Place.START, 0.05)}, "no flats: scan.flats.count is 0"),
+    "no darks": ({"darks": FieldPlan(0, Place.BOTH, 0.05)}, "no darks: scan.darks.count is 0"),
+}
+
+
+@pytest.mark.parametrize(("changes", "sentence"), VIOLATIONS.values(), ids=VIOLATIONS.keys())
+def test_violations_have_values_and_advice(changes: dict[str, object], sentence: str) -> None:
+    timeline = worked(replace(PLAN, **changes))
+    (violation,) = timeline.violations
+    assert sentence in violation
+    assert ";" in violation  # what to do follows
+    # Broken plans are still worked out, so that the operator sees all of it at once.
+    assert timeline.n_frames > 0
+    assert timeline.duration > 0
+
+
+def test_advice_works_when_followed() -> None:
+    for changes in ({"period": 0.0505}, {"angles": angles.fixed(40, 90 * DEG)}):
+        (violation,) = worked(replace(PLAN, **changes)).violations
+        period = float(re.search(r"scan\.period_s >= ([\d.]+)", violation)[1])  # type: ignore[index]
+        assert worked(replace(PLAN, **changes | {"period": period})).violations == ()
+
+
+@given(
+    views=st.integers(2, 5000),
+    passes=st.sampled_from([1, 2, 3]),
+    spacing=st.floats(1e-6, 0.1),
+    unit=st.sampled_from([1, 2]),
+)
+def test_a_plan_is_refused_where_its_pulses_would_run_together(
+    views: int, passes: int, spacing: float, unit: int
+) -> None:
+    """A turn has 360 000 counts and takes 12 s at full speed: from the time between two pulses then. A least interval
+    that is all but whole is left out."""
+    assume(abs(spacing * 30_000 - round(spacing * 30_000)) > 1e-3)
+    views = max(2, views // passes) * passes
+    plan = replace(PLAN, angles=angles.interlaced(views, passes, 0.0, math.pi), period=40.0)
+    stage = replace(STAGE, pulse_spacing=spacing, interval_unit=unit)
+    timeline = worked(plan, stage)
+    close, uneven = timeline.step_counts / 30_000 < spacing, timeline.step_counts % unit > 0
+    assert any("trigger output" in sentence for sentence in timeline.violations) == (close or uneven)
+    taken = replace(timeline.views.trains[0], start=0)
+    try:  # a stage with room for the train takes it where the plan breaks nothing, and only there
+        Travel("stage", replace(stage, high=9.0)).refuse_train(taken)
+    except DeviceRefused:
+        assert close or uneven
+    else:
+        assert not (close or uneven)
+
+
+def test_advice_for_pulses_that_would_run_together_works_when_followed() -> None:
+    """500 counts at 30 000 counts/s are 16.7 ms; at 25 deg/s they are 20."""
+    stage = replace(STAGE, pulse_spacing=0.02)
+    (violation,) = worked(stage=stage).violations
+    assert "500 counts of the stage apart, its trigger output needs 600: 0.02 s at its full speed of 30°/s" in violation
+    most = float(re.search(r"max_speed_deg_s <= ([\d.]+)", violation)[1])  # type: ignore[index]
+    assert most == 25
+    assert worked(stage=replace(stage, max_speed=most * DEG)).violations == ()
+    assert worked(stage=replace(stage, max_speed=(most + 0.1) * DEG)).violations != ()
+
+
+def test_no_trigger_output_and_no_room() -> None:
+    (violation,) = worked(stage=replace(STAGE, trigger_output=False)).violations
+    assert "no trigger output" in violation
+    # 410 frames of 144 x 252 px, 2 bytes a pixel and 4 a block of 4 x 4 pixels, or for each pixel.
+    (violation,) = worked(free_bytes=36_000_000).violations
+    assert "needs 33.5 MB and a tenth more, the disk has 36 MB free" in violation
+    assert worked(free_bytes=37_000_000).violations == ()
+    (violation,) = worked(free_bytes=90_000_000, preview_bin=1).violations
+    assert "needs 89.3 MB and a tenth more" in violation
+
+
+@pytest.mark.parametrize(("axis_col", "legal"), [(-0.5, True), (-0.6, False), (251.5, True), (251.6, False)])
+def test_an_axis_outside_the_frame_is_refused(axis_col: float, legal: bool) -> None:
+    violations = worked(axis_col=axis_col).violations
+    assert (violations == ()) is legal
+    assert legal or "lies outside the frame's columns 0 ... 251" in violations[0]
+
+
+REMARKS = {
+    "rounding": (
+        {"angles": angles.fixed(181), "period": 0.2},
+        "the step of 0.994475° is 994.475 counts; triggers fall on whole counts, so it becomes 994 counts = 0.994°, "
+        "which moves views by up to 0.0855",
+    ),
+    "whole counts a second": (
+        {"angles": angles.fixed(36_000), "period": 0.6},
+        "period_s 0.6 would be 8.33333 counts/s of the stage; it turns at 8, so that views come every 0.625 s",
+    ),
+    "margin": ({"period": 0.0512}, "less than 1 % over the camera's least 0.051 s"),
+    "few views": ({"angles": angles.fixed(180)}, "180 views are fewer than pi/2 x 252 columns = 396"),
+    "no flats": ({"flats": FieldPlan(0, Place.NONE, 0.05)}, "no flats will be taken"),
+    "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),
+    "exposure": (
+        {"flats": FieldPlan(5, Place.END, 0.1)},
+        "flats are exposed for 0.1 s and views for 0.05 s; their light",
+    ),
+    "darks' exposure": (
+        {"darks": FieldPlan(5, Place.END, 0.1)},
+        "darks are exposed for 0.1 s and views for 0.05 s; th",
+    ),
+    "blur": ({"exposure": 0.09, "angles": angles.fixed(360, 0, 2 * math.pi)}, "motion blur is 1.98 px"),
+}
+
+
+@pytest.mark.parametrize(("changes", "sentence"), REMARKS.values(), ids=REMARKS.keys())
+def test_remarks_break_nothing(changes: dict[str, object], sentence: str) -> None:
+    timeline = worked(replace(PLAN, **changes), camera=replace(CAMERA, min_period=0.051))
+    assert timeline.violations == ()
+    assert any(sentence in remark for remark in timeline.remarks), timeline.remarks
+
+
+def test_skew_is_remarked_and_a_quiet_plan_has_no_remark() -> None:
+    slow = replace(CAMERA, row_period=86.4e-6, shape=(2304, 252))
+    assert any("rolling shutter skews" in remark for remark in worked(camera=slow).remarks)
+    assert worked(replace(PLAN, angles=angles.fixed(400))).remarks == ()
+
+
+def test_blur_is_how_far_an_edge_point_moves() -> None:
+    """Against the geometry: a point at the farther edge of the detector, turned by speed x exposure."""
+    timeline = worked(axis_col=100.0)
+    block = timeline.blocks[2]
+    turned = block.speed * PLAN.exposure
+    edge = 252 - 0.5 - 100.0
+    assert timeline.blur_px == pytest.approx(edge * math.sin(turned), rel=1e-4)
+
+
+def test_interlaced_passes_return_at_full_speed() -> None:
+    one, two = (worked(replace(PLAN, angles=angles.interlaced(360, n))) for n in (1, 2))
+    views = two.blocks[2]
+    assert len(views.trains) == 2
+    assert views.speed == pytest.approx(10 * DEG)
+    (a, b), (c, d) = pass_ends(views)
+    back = move_seconds(c - b, STAGE.max_speed, STAGE.acceleration)
+    pure = sum(move_seconds(x - y, views.speed, STAGE.acceleration) for x, y in ((a, b), (c, d)))
+    assert back > 6
+    to_start = move_seconds(a, STAGE.max_speed, STAGE.acceleration)
+    assert block_seconds(views, STAGE, CAMERA, 0.1) == pytest.approx(pure + back + to_start + 0.0506)
+    assert two.duration > one.duration
+
+
+def test_describe_says_everything() -> None:
+    timeline = worked(free_bytes=5 * 10**9)
+    text = "\n".join(describe(PLAN, timeline, STAGE, CAMERA, free_bytes=5 * 10**9))
+    for part in (
+        "30-389",
+        "0.5° = 500 counts of 0.001°",
+        "5°/s",
+        "0.5° before the first and after the last trigger",
+        "0.55 px",
+        "144 x 252 px",
+        "410 frames of 72.6 kB and previews = 33.5 MB; 5 GB free",
+        "0:00:4",
+        "remark",
+    ):
+        assert part in text, part
+    assert "VIOLATION" not in text
+    broken = replace(PLAN, angles=angles.golden(100), scheme="golden")
+    text = "\n".join(describe(broken, worked(broken), STAGE, CAMERA))
+    assert "VIOLATION the views are not equally spaced" in text
+    step = replace(PLAN, mode=Mode.STEP)
+    assert "0.1 s to settle" in "\n".join(describe(step, worked(step), STAGE, CAMERA))

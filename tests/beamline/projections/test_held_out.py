@@ -1,0 +1,67 @@
+"""Views held out: of the scan, not of the fit; one set for the reconstructor, told apart by number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.projections.held_out import keep_back, with_held_out
+from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.selection import Selection
+from beamline.reconstruct.options import SourceOptions
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+ANGLES = np.radians(np.arange(0, 180, 6.0))
+
+
+def _prepared(tmp_path: Path, views: str, angles: np.ndarray = ANGLES) -> Prepared:
+    scan = TwoCylinders(angles=angles, shape=(2, 40))
+    write_exchange(tmp_path / "scan.h5", scan)
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        return prepare(source, Selection(views=views, axis_col=scan.axis_col), lambda said: None)
+
+
+def test_every_tenth_view_is_kept_back_where_all_were_chosen(tmp_path: Path) -> None:
+    everything = _prepared(tmp_path, "all")
+    kept = keep_back(everything)
+    assert kept.held_out is not None
+    np.testing.assert_allclose(np.degrees(kept.held_out[1].angles), [30, 90, 150])
+    np.testing.assert_array_equal(kept.held_out[0], everything.projections.data[[5, 15, 25]])
+    rest = np.setdiff1d(np.arange(30), [5, 15, 25])
+    np.testing.assert_array_equal(kept.projections.data, everything.projections.data[rest])
+    np.testing.assert_array_equal(kept.projections.view_ids, everything.projections.view_ids[rest])
+    np.testing.assert_array_equal(kept.geometry.angles, everything.geometry.angles[rest])
+    assert kept.projections.air.shape == (27,)
+
+
+def test_a_selection_that_left_some_out_is_not_cut_further(tmp_path: Path) -> None:
+    prepared = _prepared(tmp_path, "fixed:20")
+    assert keep_back(prepared) is prepared
+
+
+@pytest.mark.parametrize("n", [3, 4, 9])
+def test_few_views_still_leave_one(tmp_path: Path, n: int) -> None:
+    kept = keep_back(_prepared(tmp_path, "all", np.linspace(0, 3, n)))
+    assert kept.held_out is not None
+    assert (kept.geometry.n_views, kept.held_out[1].n_views) == (n - 1, 1)
+
+
+def test_two_views_leave_none(tmp_path: Path) -> None:
+    prepared = _prepared(tmp_path, "all", np.array([0.0, 1.5]))
+    with pytest.raises(ConfigError, match="--early-stop"):
+        keep_back(prepared)
+
+
+def test_one_set_for_the_reconstructor(tmp_path: Path) -> None:
+    prepared = _prepared(tmp_path, "fixed:20")
+    assert prepared.held_out is not None
+    data, geometry, unseen = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
+    assert unseen == list(range(20, geometry.n_views)) and len(unseen) == prepared.held_out[1].n_views
+    np.testing.assert_array_equal(data[unseen], prepared.held_out[0])
+    np.testing.assert_array_equal(geometry.select(unseen).angles, prepared.held_out[1].angles)
+    assert (geometry.axis_col, geometry.pixel_pitch) == (prepared.geometry.axis_col, prepared.geometry.pixel_pitch)
+    same = with_held_out(prepared.projections.data, prepared.geometry, None)
+    assert same[1] is prepared.geometry and same[2] == []

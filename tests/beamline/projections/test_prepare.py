@@ -1,0 +1,249 @@
+"""From a file's frames to line integrals: the right numbers, the right geometry, only what was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.projections import prepare as pipeline
+from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import open_scan
+from recon.base.geometry import Geometry
+from recon.prep.align import AxisError, AxisEstimate
+from recon.prep.correct import CorrectionSettings
+from tests.beamline.array_source import ArraySource
+from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
+
+SCAN = TwoCylinders()
+PLAIN = CorrectionSettings(air="none")
+
+
+def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[Prepared, list[str]]:
+    warnings: list[str] = []
+    with open_scan(path, **said) as source:
+        return prepare(source, selection, warnings.append), warnings
+
+
+def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    # A count of 20000 is rounded to a half: 2.5e-5 of transmission near 1, less than 1e-4 of a line integral below 1.
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+    assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
+    assert prepared.geometry.axis_col == prepared.axis_col
+    np.testing.assert_allclose(prepared.geometry.angles, SCAN.angles)
+    assert prepared.held_out is None
+    assert (prepared.length_unit, prepared.quantity, prepared.n_projections) == ("mm", "counts", 45)
+    assert warnings == []
+
+
+@pytest.mark.parametrize(("rows", "binning", "shape"), [((1, 4), 1, (3, 40)), (None, 2, (2, 20)), ((0, 4), 3, (1, 13))])
+def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: int, shape: tuple[int, int]) -> None:
+    path = write_exchange(tmp_path / "scan.h5", replace(SCAN, pixel_size_mm=0.5))
+    selection = Selection(rows=rows, binning=binning, axis_col=20.7, correction=PLAIN)
+    prepared, _ = _prepare(path, selection)
+    first, end = rows or (0, 4)
+    expected = Geometry.parallel(SCAN.angles, (end - first, 40), 0.5, 20.7).binned(binning)
+    assert prepared.geometry.detector_shape == shape == expected.detector_shape
+    assert prepared.geometry.axis_col == expected.axis_col
+    assert prepared.geometry.pixel_pitch == 0.5 * binning
+    assert prepared.axis_col == 20.7
+    # Counts are averaged, then the logarithm taken.
+    transmission = np.exp(-SCAN.line_integrals())[:, : shape[0] * binning, : shape[1] * binning]
+    mean = transmission.reshape(45, shape[0], binning, shape[1], binning).mean(axis=(2, 4))
+    np.testing.assert_allclose(prepared.projections.data, -np.log(mean), atol=1e-4)
+
+
+def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(2, 80), axis_col=40.7))
+    prepared, _ = _prepare(path, Selection(binning=2, correction=PLAIN))
+    assert prepared.axis_col == pytest.approx(40.7, abs=0.5)
+    assert prepared.geometry.axis_col == pytest.approx((prepared.axis_col - 0.5) / 2)
+
+
+def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    prepared, _ = _prepare(path, Selection(views="first:10", axis_col=20.7, correction=PLAIN))
+    assert prepared.geometry.n_views == 10
+    assert prepared.n_projections == 45
+    np.testing.assert_array_equal(prepared.projections.view_ids, np.arange(4, 14))  # 2 darks and 2 flats come first
+    assert prepared.held_out is not None
+    data, geometry = prepared.held_out
+    assert data.shape == (16, 4, 40)
+    assert geometry.angles.min() >= SCAN.angles[10]
+    np.testing.assert_allclose(data, replace(SCAN, angles=geometry.angles).line_integrals(), atol=1e-4)
+
+
+@pytest.mark.parametrize(("axis_col", "turned"), [(20.7, 1 / 2), (8.0, 1)])
+def test_selected_views_of_a_whole_turn_spread_over_it_where_the_axis_is_off_the_middle(
+    tmp_path: Path, axis_col: float, turned: float
+) -> None:
+    whole = replace(SCAN, angles=np.linspace(0, 2 * np.pi, 48, endpoint=False))
+    path = write_exchange(tmp_path / "scan.h5", whole)
+    prepared, _ = _prepare(path, Selection(views="fixed:12", axis_col=axis_col, correction=PLAIN))
+    expected = np.linspace(0, 2 * np.pi * turned, 12, endpoint=False)
+    np.testing.assert_allclose(prepared.geometry.angles, expected, atol=1e-5)
+
+
+def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
+    """The beam loses 20 % from the first flat to the last: interpolation makes the views right."""
+    n = SCAN.angles.size
+    beam = np.linspace(1.0, 0.8, n + 2)
+    views = DARK + BEAM * beam[1:-1, None, None] * np.exp(-SCAN.line_integrals())
+    flats = [np.full((1, 4, 40), DARK + BEAM * b) for b in (beam[0], beam[-1])]
+    data = np.concatenate([np.full((1, 4, 40), DARK), flats[0], views, flats[1]]).astype(np.float32)
+    angles = np.concatenate([[np.nan] * 2, SCAN.angles, [np.nan]])
+    source = ArraySource(data, [2, 1] + [0] * n + [1], angles)
+    prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+
+
+def exposed(flats: list[float], dark: float = 0.1, views: float = 0.1) -> ArraySource:
+    """A dark, the flats, the views and the flats again, each with as much light as its exposure in s gives."""
+    n = SCAN.angles.size
+    light = [np.full((1, 4, 40), BEAM * seconds / 0.1) for seconds in flats]
+    images = [np.zeros((1, 4, 40)), *light, BEAM * views / 0.1 * np.exp(-SCAN.line_integrals()), *light]
+    keys = [2] + [1] * len(flats) + [0] * n + [1] * len(flats)
+    angles = np.full(len(keys), np.nan)
+    angles[np.array(keys) == 0] = SCAN.angles
+    exposures = np.array([dark, *flats, *[views] * n, *flats])
+    return ArraySource(DARK + np.concatenate(images), keys, angles, exposures)
+
+
+@pytest.mark.parametrize("flats", [[0.025], [0.3], [0.1, 0.02, 0.05]])
+@pytest.mark.parametrize("binning", [1, 2])
+def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(flats: list[float], binning: int) -> None:
+    """Without it every line integral would be off by log(flat exposure / view exposure)."""
+    selection = Selection(axis_col=20.7, correction=PLAIN, binning=binning)
+    prepared = prepare(exposed(flats), selection, pytest.fail)  # type: ignore[arg-type]
+    shape = (45, 4 // binning, binning, 40 // binning, binning)
+    expected = -np.log(np.exp(-SCAN.line_integrals()).reshape(shape).mean(axis=(2, 4)))
+    np.testing.assert_allclose(prepared.projections.data, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("unknown", ["flats", "views"])
+def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
+    source = exposed([0.1])
+    source.exposures[source.image_key == (1 if unknown == "flats" else 0)] = np.nan
+    source.exposures[source.image_key == (0 if unknown == "flats" else 1)] = 7.0
+    source.exposures[source.image_key == 2] = np.nan
+    prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
+
+
+def test_darks_of_another_exposure_are_told() -> None:
+    warnings: list[str] = []
+    selection = Selection(axis_col=20.7, correction=PLAIN)
+    prepare(exposed([0.1], dark=0.025), selection, warnings.append)  # type: ignore[arg-type]
+    assert len(warnings) == 1
+    assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warnings[0]
+
+
+def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None:
+    counts = SCAN.counts().astype(np.float32)
+    counts[[3, 30]] = np.nan
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": counts})
+    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    assert prepared.geometry.n_views == 43
+    np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
+    np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
+    assert any("2 of 45 views hold no finite pixel (first: frame 7)" in text for text in warnings)
+
+
+def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
+    data = SCAN.line_integrals().astype(np.float32)
+    data[3, 1, 20] = np.nan
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": data, "data_white": None, "data_dark": None})
+    prepared, _ = _prepare(path, Selection(), quantity="line_integrals")
+    assert prepared.quantity == "line_integrals"
+    left, right = data[3, 1, 19], data[3, 1, 21]
+    assert prepared.projections.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
+    data[3, 1, 20] = prepared.projections.data[3, 1, 20]
+    np.testing.assert_array_equal(prepared.projections.data, data)
+
+
+_SHAPE = (45, 4, 40)
+BAD_SCANS = {
+    "no flats": ({"data_white": None}, "flats"),
+    "no darks": ({"data_dark": None}, "darks"),
+    "no beam": ({"data_white": np.full((2, 4, 40), DARK, np.uint16)}, "beam"),
+    "one view": ({"data": np.full((1, 4, 40), 9000, np.uint16), "theta": np.zeros(1)}, "at least 2"),
+    "one angle": ({"theta": np.zeros(45)}, "0 degrees"),
+    "angles not known": ({"theta": np.full(45, np.nan)}, "--angles"),
+    "all NaN": ({"data": np.full(_SHAPE, np.nan, np.float32)}, "finite"),
+    "flat of another shape": ({"data_white": np.full((2, 4, 30), 9000, np.uint16)}, "shape"),
+    "too few angles": ({"theta": np.zeros(3)}, "3 angles"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SCANS)
+def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
+    changes, said = BAD_SCANS[case]
+    path = write_exchange(tmp_path / "scan.h5", SCAN, changes)
+    quantity = "counts" if case in ("no flats", "no darks") else None
+    with pytest.raises(DataError, match=said):
+        _prepare(path, Selection(), quantity=quantity)
+
+
+def test_unknown_quantity_names_the_option(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data_white": None, "data_dark": None})
+    with pytest.raises(DataError, match=r"--quantity counts or --quantity line-integrals"):
+        _prepare(path, Selection())
+
+
+def test_empty_field_is_refused(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": np.full(_SHAPE, DARK + BEAM, np.uint16)})
+    with pytest.raises(DataError):
+        _prepare(path, Selection(axis_col=20.0))
+
+
+def _estimate(value: float, confident: bool) -> AxisEstimate:
+    return AxisEstimate(value, np.arange(3.0), np.arange(3.0), confident, "pair")
+
+
+def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "find_axis", lambda data, angles: _estimate(18.0, False))
+    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()]).astype(
+        np.uint16
+    )
+    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
+    warnings: list[str] = []
+    prepared = prepare(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    assert prepared.axis_col == 18.0
+    assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
+    source.axis_col = 20.5
+    warnings.clear()
+    prepared = prepare(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    assert prepared.axis_col == 20.5
+    assert any("the file's 20.50 is used" in text for text in warnings)
+
+
+def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def find_axis(data: object, angles: object) -> AxisEstimate:
+        raise AxisError("the best axis, column 0, is at the edge")
+
+    monkeypatch.setattr(pipeline, "find_axis", find_axis)
+    path = write_exchange(tmp_path / "scan.h5", SCAN)
+    with pytest.raises(DataError, match=r"at the edge.*--axis COLUMN"):
+        _prepare(path, Selection())
+
+
+@pytest.mark.parametrize(
+    ("name", "expected", "tolerance"),
+    [
+        ("diamond_24737_parallel_91x135x160.h5", 85.75, 0.5),
+        ("aps2bm_tooth_181x2x640.h5", 295.6, 0.5),
+    ],
+)
+def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:
+    prepared, _ = _prepare(shared_data / name, Selection())
+    assert prepared.axis_col == pytest.approx(expected, abs=tolerance)
+    assert prepared.axis is not None
+    assert prepared.axis.confident
+    assert np.isfinite(prepared.projections.data).all()

@@ -1,0 +1,55 @@
+"""Pixels as they are read: in batches, in bins of what is finite, and reference frames by the views between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.projections.read import read_binned, read_references
+from tests.beamline.array_source import ArraySource
+
+
+def test_reading_is_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = np.arange(7 * 2 * 3, dtype=np.uint16).reshape(7, 2, 3)
+    source = ArraySource(data, [0] * 7, np.zeros(7))
+    monkeypatch.setattr("beamline.projections.read._BATCH_BYTES", 3 * 2 * 3 * 2)
+    got = read_binned(source, np.array([6, 0, 5, 1, 2]), slice(0, 2), 1)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(got, data[[6, 0, 5, 1, 2]])
+    assert [len(frames) for frames, _ in source.was_read] == [3, 2]
+
+
+@given(
+    rows=st.integers(1, 9),
+    cols=st.integers(1, 9),
+    binning=st.integers(1, 4),
+    holes=st.floats(0, 0.9),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_bins_are_means_of_what_is_finite(rows: int, cols: int, binning: int, holes: float, seed: int) -> None:
+    """Against a loop over the bins."""
+    rng = np.random.default_rng(seed)
+    data = rng.random((2, rows, cols)).astype(np.float32)
+    data[rng.random(data.shape) < holes] = np.nan
+    got = read_binned(ArraySource(data, [0, 0], np.zeros(2)), np.arange(2), slice(0, rows), binning)  # type: ignore[arg-type]
+    assert got.shape == (2, rows // binning, cols // binning)
+    for v, r, c in np.ndindex(got.shape):
+        block = data[v, r * binning : (r + 1) * binning, c * binning : (c + 1) * binning]
+        if np.isfinite(block).any():
+            assert got[v, r, c] == pytest.approx(float(np.nanmean(block)), rel=1e-5)
+        else:
+            assert np.isnan(got[v, r, c])
+
+
+def test_flats_are_grouped_by_the_views_between_them() -> None:
+    keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
+    data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
+    references = read_references(ArraySource(data, keys, np.zeros(12)), slice(0, 2), 1)  # type: ignore[arg-type]
+    assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
+        (1.5, 1.5),
+        (7.0, 7.0),
+        (11.0, 11.0),
+    ]
+    assert references.dark[0, 0] == 5.0

@@ -1,0 +1,38 @@
+"""A selection: columns there and back through bins, and words, rows, bins and axes that do not fit a scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.core.errors import ConfigError
+from beamline.projections.prepare import prepare
+from beamline.projections.selection import Selection, unbinned
+from beamline.storage.readers.open import open_scan
+from recon.base.geometry import Geometry
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+
+@given(column=st.floats(-10, 5000), binning=st.integers(1, 16))
+def test_unbinned_inverts_the_geometrys_binning(column: float, binning: int) -> None:
+    binned = Geometry.parallel([0.0], (16, 6000), 1.0, column).binned(binning).axis_col
+    assert unbinned(binned, binning) == pytest.approx(column, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("selection", "said"),
+    [
+        (Selection(views="nonsense"), "--views: .*'nonsense'.*fixed:N"),
+        (Selection(views="first:1"), "at least 2"),
+        (Selection(rows=(2, 9), axis_col=20.0), "--rows 2:9"),
+        (Selection(binning=5, axis_col=20.0), "--bin 5"),
+        (Selection(axis_col=40.0), "outside the detector"),
+    ],
+)
+def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: str) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders())
+    with open_scan(path) as source, pytest.raises(ConfigError, match=said):
+        prepare(source, selection, pytest.fail)

@@ -1,0 +1,225 @@
+"""A budget is kept, on a clock that ticks at each look and on a real one; and what was chosen is told."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import recon
+from beamline.core.events import Event
+from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.selection import Selection
+from beamline.reconstruct import budget as module
+from beamline.reconstruct.budget import Budgeted, joined, within
+from beamline.reconstruct.finished import run
+from beamline.reconstruct.options import ReconOptions, SourceOptions
+from beamline.reconstruct.result import Target
+from beamline.storage.writers.recon_file import read_reconstruction
+from drivers.clock import SystemClock
+from recon.assess.metrics import psnr
+from recon.assess.time_model import PRESETS, Choice, Speeds
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.projector import Projector
+from recon.warm_up import warm_up
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
+
+
+class Ticking:
+    """A clock by which every look takes as long."""
+
+    def __init__(self, tick: float) -> None:
+        self.time, self.tick = 100.0, tick
+
+    def __call__(self) -> float:
+        self.time += self.tick
+        return self.time
+
+
+@pytest.fixture
+def prepared(tmp_path: Path) -> Prepared:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        return prepare(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
+
+
+def _spend(prepared: Prepared, budget: float, now: Ticking, warned: list[str] | None = None) -> Budgeted:
+    said = [] if warned is None else warned
+    return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False, said.append)
+
+
+@pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
+def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+    """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    done = _spend(prepared, budget, Ticking(0.01))
+    assert done.choice.method == "r2"
+    assert 0.9 * budget < done.seconds <= budget
+    assert done.result.volume.grid == Grid.matching(prepared.geometry)
+    assert f"of {budget:.3g} s" in done.said(budget)
+    assert done.settings(budget)["measured_step_s"] == 0.01
+    assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
+
+
+def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    done = _spend(prepared, 5.0, Ticking(0.01))
+    assert (done.choice.method, done.choice.binning) == ("fbp", 2)
+    assert done.result.volume.grid.shape == (3, 20, 20)
+    assert "pixels joined 2 x 2" in done.said(5.0) and done.said(5.0).startswith("fbp")
+
+
+def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said_to_be_late(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Ticking(0.01)
+
+    def slow(*_: object) -> Speeds:
+        clock.time += 7.0
+        return Speeds(432.0, 50.0, 3.0, 10.0)
+
+    monkeypatch.setattr(module, "calibrate", slow)
+    warned: list[str] = []
+    done = _spend(prepared, 5.0, clock, warned)
+    joined_pixels = done.choice.binning
+    assert done.choice.method == "fbp" and joined_pixels >= 4  # about as many as six rows allow
+    assert done.seconds > 7 and f"of {5.0:.3g} s" in done.said(5.0)
+    assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
+    late = 7.01 + 432 / joined_pixels**3 - 5
+    assert warned[0].endswith(f"fbp, pixels joined {joined_pixels} x {joined_pixels}, will be about {late:.3g} s late.")
+    _spend(prepared, 20.0, clock, warned)
+    assert len(warned) == 1
+
+
+def test_the_shortest_fit_is_said_to_be_late_too(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    warned: list[str] = []
+    _spend(_cone(prepared, 3.6), 0.001, Ticking(0.01), warned)
+    assert len(warned) == 1 and "the cheapest choice, r2, pixels joined" in warned[0]
+
+
+def _cone(prepared: Prepared, turn: float, magnification: float = 10.0, tilt: float = 0.0) -> Prepared:
+    """A cone's views of the same cylinders by the voxel projector, on pixels as large at the axis as before."""
+    pitch = prepared.geometry.pixel_pitch
+    angles = np.linspace(0, turn, 36, endpoint=False)
+    cone = Geometry.cone(
+        angles, SCAN.shape, magnification * pitch, 400.0, 400.0 * magnification, SCAN.axis_col, tilt=tilt
+    )
+    grid = Grid.matching(cone)
+    assert grid == Grid.matching(prepared.geometry)
+    data = Projector(cone.straightened(), grid).forward(SCAN.truth(grid))
+    return replace(
+        prepared, projections=replace(prepared.projections, data=data), geometry=cone, held_out=None, n_projections=36
+    )
+
+
+def test_a_cones_budget_counts_pixels_at_the_axis(prepared: Prepared) -> None:
+    """Magnified ten times, a pixel is ten voxels wide on the detector, and one at the axis."""
+    cone = _cone(prepared, 2 * np.pi)
+    done = _spend(cone, 8.0, Ticking(0.01))
+    grid = Grid.matching(cone.geometry)
+    assert done.choice.method == "r2" and done.result.volume.grid == grid
+    truth = SCAN.truth(grid)
+    direct = psnr(truth, recon.reconstruct(cone.projections.data, cone.geometry, grid, "fbp").volume.data)
+    assert psnr(truth, done.result.volume.data) > direct + 1
+    assert done.result.history[-1].residual < 0.05
+
+
+def test_a_cone_is_placed_as_its_parallel_likeness_is(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    counts = [_spend(views, 3.0, Ticking(0.01)).placed for views in (prepared, _cone(prepared, 2 * np.pi))]
+    assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) > 500
+
+
+def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    done = _spend(_cone(prepared, 2 * np.pi), 5.0, Ticking(0.01))
+    assert done.said(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
+
+
+@pytest.mark.parametrize(("turn", "tilt"), [(3.6, 0.0), (2 * np.pi, 0.02)])
+def test_views_without_a_direct_method_get_the_shortest_fit(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, turn: float, tilt: float
+) -> None:
+    """A cone's short scan, and views that lean, are for neither FBP nor FDK."""
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    done = _spend(_cone(prepared, turn, tilt=tilt), 5.0, Ticking(0.01))
+    assert done.choice.method == done.result.method == "r2" and done.choice.binning == 2
+    assert done.result.history[-1].step > 0 and 0 < done.placed < 100
+    assert done.result.volume.data.max() > 0
+
+
+def test_joined_views_keep_their_scale_and_place(prepared: Prepared) -> None:
+    assert joined(prepared, 1) is prepared
+    half = joined(prepared, 2)
+    assert half.geometry.pixel_pitch == 2 * prepared.geometry.pixel_pitch
+    assert half.projections.data.shape == (24, 3, 20)
+    assert half.projections.data.mean() == pytest.approx(prepared.projections.data.mean(), rel=1e-5)
+    assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
+
+
+def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    monkeypatch.setattr(module, "choose", lambda *_: Choice("r2", 2, 1.0, 100, 1.0))
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        grid = Grid.matching(prepare(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
+    np.save(tmp_path / "truth.npy", SCAN.truth(grid))
+    options = ReconOptions(
+        SourceOptions(tmp_path / "scan.h5"), Target(tmp_path / "out.h5", tmp_path / "out.html"),
+        Selection(axis_col=SCAN.axis_col), budget=1.0, truth=str(tmp_path / "truth.npy"),
+    )  # fmt: skip
+    events: list[Event] = []
+    metrics = run(options, events.append, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.volume.grid.shape == (3, 20, 20)
+    assert (record.parameters["binning"], record.parameters["budget"]) == (2, 1.0)
+    assert metrics["psnr"] > 15
+    done = events[-1].data
+    assert "pixels joined 2 x 2" in done["chosen"]
+    assert {"seconds", "low", "high", "of"} == set(done["next_db"])
+    page = (tmp_path / "out.html").read_text(encoding="utf-8")
+    assert done["chosen"] in page and "The next dB" in page
+
+
+def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    options = ReconOptions(
+        SourceOptions(tmp_path / "scan.h5"), Target(tmp_path / "out.h5", None), Selection(axis_col=SCAN.axis_col),
+        quality="preview",
+    )  # fmt: skip
+    events: list[Event] = []
+    run(options, events.append, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    preview = PRESETS["preview"]
+    assert record.parameters["steps"] == preview.steps
+    count = round(preview.share * 2000)  # a small volume: the least that a fit starts from by itself
+    assert events[-1].data["chosen"].startswith(f"preview: {preview.steps} steps from {count} Gaussians")
+    assert "chosen" not in run_plain(options, tmp_path)
+
+
+def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
+    events: list[Event] = []
+    plain = replace(options, quality=None, steps=5, target=Target(tmp_path / "plain.h5", None))
+    run(plain, events.append, SystemClock())
+    return dict(events[-1].data)
+
+
+def test_a_real_budget_on_a_real_clock(prepared: Prepared) -> None:
+    """Four seconds, and a tenth of grace; a machine busy with other work may stop this process for a while."""
+    warm_up()
+    begin = time.perf_counter()
+    done = within(4.0, prepared, 0, "hann", time.perf_counter, lambda p: None, lambda: False, lambda w: None)
+    took = time.perf_counter() - begin
+    assert done.choice.method == "r2"
+    assert 3.0 < took < 4.4
+    assert done.seconds == pytest.approx(took, abs=0.2)
+    assert done.result.history[-1].residual < 0.2

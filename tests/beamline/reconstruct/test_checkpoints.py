@@ -1,0 +1,171 @@
+"""Whether a checkpoint is of this fit: every change of data or settings is found, and told by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.selection import Selection
+from beamline.reconstruct.checkpoints import Keeper, differences, made_from
+from beamline.reconstruct.options import SourceOptions
+from beamline.storage.writers.checkpoint import Checkpoint, write_checkpoint
+from recon.splatting import optimise as fit
+from recon.splatting.checkpoint import arrays_of
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import FitSettings
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
+OTHERS = {"seed": 1, "start": "fbp"}
+SETTINGS = FitSettings()
+
+
+@pytest.fixture
+def prepared(tmp_path: Path) -> Prepared:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        return prepare(source, Selection(axis_col=SCAN.axis_col), lambda said: None)
+
+
+def _flipped(prepared: Prepared) -> Prepared:
+    """One bit of one pixel is another."""
+    data = prepared.projections.data.copy()
+    data.view(np.uint32)[3, 1, 7] ^= 1
+    return replace(prepared, projections=replace(prepared.projections, data=data))
+
+
+def _turned(prepared: Prepared) -> Prepared:
+    angles = prepared.geometry.angles.copy()
+    angles[4] += 1e-9
+    return replace(prepared, geometry=prepared.geometry.at(angles))
+
+
+CHANGES: dict[str, tuple[Callable[[Prepared], Prepared], FitSettings, dict[str, Any]]] = {
+    "projections": (_flipped, SETTINGS, OTHERS),
+    "angles": (_turned, SETTINGS, OTHERS),
+    "axis_col": (lambda p: replace(p, geometry=replace(p.geometry, axis_col=20.0)), SETTINGS, OTHERS),
+    "pixel_pitch": (lambda p: replace(p, geometry=replace(p.geometry, pixel_pitch=2.0)), SETTINGS, OTHERS),
+    "length_unit": (lambda p: replace(p, length_unit="px"), SETTINGS, OTHERS),
+    "loss": (lambda p: p, replace(SETTINGS, loss="l2"), OTHERS),
+    "policy": (lambda p: p, replace(SETTINGS, policy=None), OTHERS),
+    "seed": (lambda p: p, SETTINGS, {**OTHERS, "seed": 2}),
+    "start": (lambda p: p, SETTINGS, {**OTHERS, "start": "tv"}),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_change_is_told_by_its_name(prepared: Prepared, name: str) -> None:
+    before = made_from(prepared, SETTINGS, OTHERS)
+    change, settings, others = CHANGES[name]
+    found = differences(made_from(change(prepared), settings, others), before)
+    assert [said.split(" ")[0] for said in found] == [name]
+
+
+def test_fewer_views_are_told_by_number(prepared: Prepared) -> None:
+    few = replace(
+        prepared,
+        projections=replace(prepared.projections, data=prepared.projections.data[:20]),
+        geometry=prepared.geometry.select(slice(20)),
+    )
+    found = differences(made_from(few, SETTINGS, OTHERS), made_from(prepared, SETTINGS, OTHERS))
+    assert "n_views (20, 30 in the checkpoint)" in found
+
+
+def test_views_held_out_do_not_matter(prepared: Prepared) -> None:
+    spoilt = replace(prepared, held_out=(np.zeros((1, 2, 40), np.float32), prepared.geometry.select([0])))
+    assert not differences(made_from(spoilt, SETTINGS, OTHERS), made_from(prepared, SETTINGS, OTHERS))
+
+
+def _state(**changes: Any) -> dict[str, Any]:
+    """Of a fit of five Gaussians that has begun."""
+    model = Gaussians.from_physical(np.zeros((5, 3)), np.ones((5, 3)), np.ones(5), density_unit=1.0)
+    return {**arrays_of(fit.init(model, 0)), **changes}
+
+
+def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: Prepared) -> None:
+    path, said = tmp_path / "fit.h5", list[str]()
+    origin = made_from(prepared, SETTINGS, OTHERS)
+    Keeper(path).write(origin, 100, said.append, _state())
+    again = Keeper(path, path)
+    again.refuse_existing()  # the one that it begins from may be replaced
+    state = again.begin(origin, 100, said.append)
+    assert state is not None and not said
+    assert state.keys() == _state().keys()
+    np.testing.assert_array_equal(state["statistic"], np.zeros(5))
+    again.begin(origin, 200, said.append)
+    assert "100 steps, this one is over 200 steps" in said[0]
+    with pytest.raises(DataError, match=r"loss \(l1, l2 in the checkpoint|loss \(l2, l1 in the checkpoint"):
+        again.begin(made_from(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
+
+
+@pytest.mark.parametrize(
+    ("kept", "wanted", "words"),
+    [
+        (0, 0, "of a fit over a time, as this one is:"),
+        (100, 0, "of a fit over 100 steps, this one is over a time:"),
+        (0, 200, "of a fit over a time, this one is over 200 steps:"),
+    ],
+)
+def test_a_plan_without_steps_is_told(tmp_path: Path, prepared: Prepared, kept: int, wanted: int, words: str) -> None:
+    path, said = tmp_path / "fit.h5", list[str]()
+    origin = made_from(prepared, SETTINGS, OTHERS)
+    Keeper(path).write(origin, kept, said.append, _state())
+    assert Keeper(path, path).begin(origin, wanted, said.append) is not None
+    assert len(said) == 1 and words in said[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"statistic": np.full(5, np.nan, np.float32)}, "statistic"),
+        ({"best.raw": np.full(5, np.inf)}, "best.raw"),
+        ({"scalars": np.array([np.nan, 0.1, 0.1])}, "density unit"),
+        ({"first.means": np.full((5, 3), np.nan, np.float32)}, "first.means"),
+        ({"generator": np.zeros(3, np.uint64)}, "generator"),
+    ],
+)
+def test_a_damaged_checkpoint_is_to_blame_before_any_work(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(**changes), {}, 100))
+    with pytest.raises(DataError, match=rf"checkpoint .*fit\.h5 is damaged: .*{said}"):
+        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+
+
+def test_a_checkpoint_that_lacks_arrays_is_to_blame(tmp_path: Path) -> None:
+    state = _state()
+    del state["second.raw"]
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, {}, 100))
+    with pytest.raises(DataError, match=r"fit\.h5 is damaged: .*second\.raw"):
+        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+
+
+def test_a_plan_shorter_than_what_is_done_is_refused(tmp_path: Path) -> None:
+    counts = np.array([100, 120, 0], np.int64)  # limit, step, seen
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(counts=counts), {}, 200))
+    again, said = Keeper(None, tmp_path / "fit.h5"), list[str]()
+    with pytest.raises(ConfigError, match=r"120 steps behind it, more than the 20 wanted: .* 120 with --steps"):
+        again.begin({}, 20, said.append)
+    assert again.begin({}, 120, said.append) is not None and again.begin({}, 0, said.append) is not None
+
+
+def test_a_file_in_the_way_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "fit.h5").write_text("precious")
+    with pytest.raises(DataError, match="never overwritten"):
+        Keeper(tmp_path / "fit.h5").refuse_existing()
+    with pytest.raises(DataError, match="does not exist"):
+        Keeper(tmp_path / "no" / "fit.h5").refuse_existing()
+    with pytest.raises(DataError, match="no checkpoint"):
+        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+    assert Keeper().begin({}, 0, lambda said: None) is None and not Keeper().wanted
+
+
+def test_a_disk_that_refuses_does_not_end_the_fit(tmp_path: Path) -> None:
+    said: list[str] = []
+    Keeper(tmp_path / "no" / "fit.h5").write({}, 0, said.append, {})
+    assert "left out" in said[0]

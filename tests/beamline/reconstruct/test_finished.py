@@ -1,0 +1,357 @@
+"""Offline reconstruction: the right volume, everything it was made with, and nothing at all where it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import get_args
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event
+from beamline.monitor.digest import digest
+from beamline.projections.selection import Selection
+from beamline.reconstruct import checkpoints
+from beamline.reconstruct import finished as offline
+from beamline.reconstruct import result as deliver
+from beamline.reconstruct.checkpoints import Keeper
+from beamline.reconstruct.finished import run
+from beamline.reconstruct.options import ReconOptions, SourceOptions
+from beamline.reconstruct.recon_report import METHOD_NAMES
+from beamline.reconstruct.result import Target
+from beamline.storage.writers.checkpoint import read_checkpoint
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.writers.recon_file import read_reconstruction
+from drivers.clock import SystemClock
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.reconstruction import Method
+from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(shape=(2, 40), pixel_size_mm=0.5)
+
+
+def _options(tmp_path: Path, **changes: object) -> ReconOptions:
+    if not (tmp_path / "scan.h5").exists():
+        write_exchange(tmp_path / "scan.h5", SCAN)
+    options = ReconOptions(
+        source=SourceOptions(tmp_path / "scan.h5"),
+        target=Target(tmp_path / "out.h5", None),
+        selection=Selection(),
+        method="fbp",
+        command="beamline recon scan.h5 -m fbp",
+    )
+    return replace(options, **changes)  # type: ignore[arg-type]
+
+
+def _names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_fbp_is_the_object_in_inverse_millimetres(tmp_path: Path) -> None:
+    events: list[Event] = []
+    metrics = run(_options(tmp_path), events.append, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    truth = SCAN.truth(record.volume.grid)
+    inside = truth == truth.max()
+    assert record.volume.grid.voxel_size == pytest.approx(0.5)
+    assert record.volume.data[inside].mean() == pytest.approx(truth.max(), rel=0.1)  # 0.14 / mm
+    assert psnr(truth, record.volume.data) > 22
+    assert metrics["residual"] < 0.1
+    assert record.metrics == pytest.approx(metrics)
+    done = events[-1]
+    assert done.event == "done"
+    assert done.data["output"] == tmp_path / "out.h5"
+    assert done.data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.25)
+    assert done.data["seconds"] == metrics["seconds"]
+    assert [e.event for e in events if e.event != "progress"] == ["recon_started", "done"]
+
+
+def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -> None:
+    events: list[Event] = []
+    np.savez(tmp_path / "truth.npz", volume=SCAN.truth(Grid.matching(Geometry.parallel([0.0], (2, 40), 0.5))))
+    target = Target(tmp_path / "out.h5", tmp_path / "out.html")
+    options = _options(
+        tmp_path, method="r2", steps=150, gaussians=400, target=target, truth=str(tmp_path / "truth.npz")
+    )
+    options = replace(options, selection=Selection(views="fixed:12", axis_col=SCAN.axis_col))
+    metrics = run(options, events.append, SystemClock())
+    assert metrics["psnr"] > events[-1].data["fbp"]["psnr"]  # 12 views: FBP has streaks
+    assert metrics["residual_held_out"] < events[-1].data["fbp"]["residual_held_out"]
+    assert {"ssim3d", "nrmse", "residual", "seconds"} <= set(metrics)
+    progress = [event.data for event in events if event.event == "progress"]
+    assert progress[-1]["step"] == 150
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.history["step"][-1] == 150
+    assert len(record.history["loss"]) == len(progress)
+    page = (tmp_path / "out.html").read_text(encoding="utf-8")
+    for said in ("R²-Gaussian", "FBP", "beamline recon scan.h5", "12 of 45 views"):
+        assert said in page
+    assert page.count("data:image/png;base64,") == 4  # slices, quality, projection, sinogram; the axis was given
+
+
+@pytest.mark.parametrize("changes", [{"steps": 3, "start": "tv", "loss": "l2"}, {"budget": 1.0}])
+def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
+) -> None:
+    asked: list[dict[str, object]] = []
+
+    def compiled(device: str = "cpu", loss: str = "l1", geometry: object = None, **more: object) -> None:
+        asked.append({"device": device, "loss": loss, "geometry": geometry, **more})
+
+    monkeypatch.setattr(offline, "warm_up", compiled)
+    selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
+    run(_options(tmp_path, method="r2", selection=selection, **changes), lambda event: None, SystemClock())
+    assert len(asked) == 1
+    geometry = asked[0].pop("geometry")
+    assert isinstance(geometry, Geometry) and geometry.n_views == 20 and geometry.detector_shape == (2, 40)
+    assert asked[0].get("start", "fbp") == changes.get("start", "fbp")
+    assert asked[0]["loss"] == changes.get("loss", "l1")
+
+
+def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
+    selection = Selection(views="first:20", rows=(0, 2), binning=2, axis_col=20.7, seed=3)
+    run(_options(tmp_path, selection=selection, seed=3, filter="hann"), lambda e: None, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    said = {
+        "method": "fbp",
+        "axis_col": 20.7,
+        "axis_source": "given, or stated in the file",
+        "views": "first:20",
+        "n_views": 20,
+        "n_projections": 45,
+        "rows": "0:2",
+        "binning": 2,
+        "pixel_pitch": 1.0,
+        "pixel_pitch_unit": "mm",
+        "quantity": "counts",
+        "correction_floor": 1e-4,
+        "correction_air": "auto",
+        "filter": "hann",
+        "seed": 3,
+        "command": "beamline recon scan.h5 -m fbp",
+    }
+    assert {name: record.parameters[name] for name in said} == said
+    np.testing.assert_array_equal(record.parameters["view_frames"], np.arange(4, 24))
+    np.testing.assert_allclose(record.parameters["view_angles_deg"], np.degrees(SCAN.angles[:20]))
+    assert Path(record.raw_file) == (tmp_path / "scan.h5").resolve()
+
+
+def test_scale_unknown_means_pixels(tmp_path: Path) -> None:
+    with h5py.File(write_exchange(tmp_path / "scan.h5", SCAN), "r+") as file:
+        del file.attrs["pixel_size_mm"]
+    run(_options(tmp_path), lambda e: None, SystemClock())
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.length_unit == "px"
+    assert record.volume.grid.voxel_size == 1.0
+    assert record.volume.data[:, 20:24, 23:27].max() == pytest.approx(0.07, rel=0.25)  # 1 / px
+
+
+def test_a_given_pixel_size_wins(tmp_path: Path) -> None:
+    run(_options(tmp_path, selection=Selection(pixel_size_mm=0.25)), lambda e: None, SystemClock())
+    assert read_reconstruction(tmp_path / "out.h5").volume.grid.voxel_size == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"source": SourceOptions(Path("missing.h5"))}, DataError, "missing.h5"),
+        ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
+        ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
+        ({"target": Target(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
+    ],
+)
+def test_failures_leave_nothing(tmp_path: Path, changes: dict[str, object], error: type[Exception], said: str) -> None:
+    options = _options(tmp_path, **changes)
+    with pytest.raises(error, match=said):
+        run(options, lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5"}
+
+
+@pytest.mark.parametrize("existing", ["out.h5", "out.html"])
+def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> None:
+    (tmp_path / existing).write_text("precious")
+    options = _options(tmp_path, target=Target(tmp_path / "out.h5", tmp_path / "out.html"))
+    with pytest.raises(DataError, match="never overwritten"):
+        run(options, lambda e: None, SystemClock())
+    assert (tmp_path / existing).read_text() == "precious"
+    assert _names(tmp_path) == {"scan.h5", existing}
+
+
+def test_a_report_that_fails_takes_the_volume_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise DataError("no space left")
+
+    monkeypatch.setattr(deliver, "write_report", full)
+    options = _options(tmp_path, target=Target(tmp_path / "out.h5", tmp_path / "out.html"))
+    with pytest.raises(DataError, match="no space"):
+        run(options, lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5"}
+
+
+def test_a_scan_still_being_written_is_not_taken_for_a_finished_one(tmp_path: Path) -> None:
+    writer = NXtomoWriter(tmp_path / "scan.h5", ScanInfo(sample="s"), (4, 8), clock=SystemClock())
+    with pytest.raises(DataError):
+        run(_options(tmp_path), lambda e: None, SystemClock())
+    writer.close()
+    assert _names(tmp_path) == {"scan.h5"}
+
+
+def test_what_a_dead_scan_left_is_reconstructed_when_asked_for(tmp_path: Path) -> None:
+    """The writer never closes its file, as when its process was killed."""
+    warnings: list[str] = []
+
+    def listen(event: Event) -> None:
+        if event.event == "warning":
+            warnings.append(event.data["message"])
+
+    writer = NXtomoWriter(tmp_path / "scan.h5", ScanInfo(sample="s"), SCAN.shape, clock=SystemClock())
+    for frame in frames_of(SCAN)[:-5]:
+        writer.append(frame, digest(frame.counts))
+    options = _options(tmp_path, unfinished=True)
+    run(options, listen, SystemClock())
+    writer.close("failed")
+    record = read_reconstruction(options.target.output)
+    assert record.parameters["n_views"] == SCAN.angles.size - 5
+    assert "unfinished" in warnings[0]
+
+
+def test_the_same_seed_gives_the_same_volume(tmp_path: Path) -> None:
+    volumes = []
+    for name in ("a.h5", "b.h5"):
+        options = _options(tmp_path, method="r2", steps=20, gaussians=200, seed=5, target=Target(tmp_path / name, None))
+        run(options, lambda e: None, SystemClock())
+        volumes.append(read_reconstruction(tmp_path / name).volume.data)
+    np.testing.assert_allclose(volumes[0], volumes[1], atol=1e-4 * np.abs(volumes[0]).max())
+
+
+FIT = {"method": "r2", "steps": 80, "gaussians": 300, "selection": Selection(axis_col=SCAN.axis_col)}
+
+
+def _volume(path: Path) -> np.ndarray:
+    return read_reconstruction(path).volume.data
+
+
+def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None:
+    """Ended after some steps, begun again from its file: the same volume to the bit, with views held out as well."""
+    selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
+    whole = _options(tmp_path, **{**FIT, "selection": selection})
+    run(whole, lambda e: None, SystemClock())
+    asked: list[int] = []
+
+    @contextmanager
+    def after_30_steps() -> Iterator[Callable[[], bool]]:
+        yield lambda: len(asked) >= 30 or asked.append(0) is not None
+
+    kept = tmp_path / "fit.checkpoint.h5"
+    part = replace(whole, target=Target(tmp_path / "part.h5", None), keeper=Keeper(kept))
+    run(part, lambda e: None, SystemClock(), after_30_steps)
+    assert read_reconstruction(tmp_path / "part.h5").parameters["ended_early"]
+    assert read_checkpoint(kept).state["counts"][1] == len(asked) + 1 < 80
+    rest = replace(whole, target=Target(tmp_path / "rest.h5", tmp_path / "rest.html"), keeper=Keeper(None, kept))
+    run(rest, lambda e: None, SystemClock())
+    np.testing.assert_array_equal(_volume(tmp_path / "rest.h5"), _volume(tmp_path / "out.h5"))
+    assert np.abs(_volume(tmp_path / "part.h5") - _volume(tmp_path / "out.h5")).max() > 0
+    parameters = read_reconstruction(tmp_path / "rest.h5").parameters
+    assert parameters["resumed_from"] == str(kept) and parameters["steps"] == 80
+    page = (tmp_path / "rest.html").read_text(encoding="utf-8")
+    assert "since the fit was resumed" in page and "The next dB" not in page
+
+
+def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that is a second on at each look."""
+    looks = count()
+    clock = SystemClock()
+    monkeypatch.setattr(clock, "now", lambda: float(next(looks)))
+    steps: list[int] = []
+    monkeypatch.setattr(checkpoints, "write_checkpoint", lambda _, kept: steps.append(int(kept.state["counts"][1])))
+    run(_options(tmp_path, **FIT, keeper=Keeper(tmp_path / "fit.h5")), lambda e: None, clock)
+    assert len(steps) > 2 and steps == sorted(steps) and steps[-1] == 80
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
+    kept = tmp_path / "fit.checkpoint.h5"
+    run(_options(tmp_path, **FIT, keeper=Keeper(kept)), lambda e: None, SystemClock())
+    other = _options(
+        tmp_path, **FIT, loss="l2", seed=4, keeper=Keeper(None, kept), target=Target(tmp_path / "b.h5", None)
+    )
+    with pytest.raises(DataError, match=r"loss \(l2, l1 in the checkpoint\); seed \(4, 0 in the checkpoint\)"):
+        run(other, lambda e: None, SystemClock())
+    with pytest.raises(DataError, match="axis_col"):
+        run(replace(other, loss="l1", seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5", "out.h5", "fit.checkpoint.h5"}
+
+
+def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> None:
+    events: list[Event] = []
+    options = _options(tmp_path, **{**FIT, "steps": 120}, early_stop=True)
+    metrics = run(options, events.append, SystemClock())
+    said = [event.data["message"] for event in events if event.event == "state"]
+    assert said == ["4 of 45 views are held out to say when to stop"]
+    assert "residual_held_out" in metrics
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert record.parameters["n_views"] == 41
+    assert np.isfinite(record.history["held_out"][-1])
+
+
+@pytest.mark.parametrize("loss", ["l2", "poisson"])
+def test_every_loss_is_fitted_and_kept(tmp_path: Path, loss: str) -> None:
+    metrics = run(_options(tmp_path, **FIT, loss=loss, start="tv"), lambda e: None, SystemClock())
+    parameters = read_reconstruction(tmp_path / "out.h5").parameters
+    assert (parameters["loss"], parameters["start"], parameters["device"]) == (loss, "tv", "cpu")
+    assert metrics["residual"] < 0.2
+
+
+@pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
+def test_iterations_become_volume_history_and_report(tmp_path: Path, method: Method) -> None:
+    events: list[Event] = []
+    options = _options(
+        tmp_path, method=method, iterations=8, selection=Selection(axis_col=SCAN.axis_col),
+        target=Target(tmp_path / "out.h5", tmp_path / "out.html"),
+    )  # fmt: skip
+    metrics = run(options, events.append, SystemClock())
+    assert metrics["residual"] < 0.2
+    progress = [event.data for event in events if event.event == "progress"]
+    assert [p["step"] for p in progress] == list(range(1, 9))
+    assert progress[-1]["per_s"] > 0 and progress[-1]["eta_s"] == 0
+    record = read_reconstruction(tmp_path / "out.h5")
+    assert (record.parameters["method"], record.parameters["iterations"]) == (method, 8)
+    np.testing.assert_array_equal(record.history["step"], np.arange(1, 9))
+    assert METHOD_NAMES[method] in (tmp_path / "out.html").read_text(encoding="utf-8")
+
+
+def test_every_method_has_a_name() -> None:
+    assert set(METHOD_NAMES) == set(get_args(Method))
+
+
+def test_a_device_that_is_not_there_is_told_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--device abacus"):
+        run(_options(tmp_path, **FIT, device="abacus"), lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5"}
+
+
+@pytest.mark.slow
+def test_walnut_from_60_views_is_better_than_fbp(tmp_path: Path, shared_data: Path) -> None:
+    """Measured data (Meaney 2022): R² from 60 of 240 views beats FBP of the same views by more than 1 dB."""
+    events: list[Event] = []
+    options = _options(
+        tmp_path,
+        source=SourceOptions(shared_data / "walnut_parallel_rebinned_240x96x256.h5", quantity="line_integrals"),
+        method="r2",
+        seconds=40.0,
+        selection=Selection(views="fixed:60"),
+        truth=f"{shared_data / 'walnut_fdk_256.npz'}:70:166",
+        target=Target(tmp_path / "out.h5", tmp_path / "out.html"),
+    )
+    metrics = run(options, events.append, SystemClock())
+    assert metrics["psnr"] > events[-1].data["fbp"]["psnr"] + 1.0
+    assert events[-1].data["axis_col"] == pytest.approx(127.5, abs=0.5)

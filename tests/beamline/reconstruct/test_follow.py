@@ -1,0 +1,333 @@
+"""Following a growing file: the scan and the fit share one clock of the test's, so that nothing waits for real."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import BeamlineError, ConfigError, DataError
+from beamline.core.events import Event
+from beamline.monitor.digest import digest
+from beamline.projections.selection import Selection
+from beamline.reconstruct import growing as module
+from beamline.reconstruct.follow import Rhythm, follow
+from beamline.reconstruct.options import ReconOptions, SourceOptions
+from beamline.reconstruct.result import Target
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.writers.recon_file import read_reconstruction
+from drivers.frame import Frame, FrameKind
+from recon.assess.metrics import psnr
+from recon.base.volume import Volume
+from recon.prep.align import AxisEstimate
+from tests.beamline.scans import TwoCylinders, frames_of
+
+EPOCH = 1.8e9
+TICK = 0.02  # s that pass with each look at the clock
+
+
+class ScanClock:
+    """Time passes when it is looked at; what is due by then happens."""
+
+    def __init__(self) -> None:
+        self.time = EPOCH
+        self.due: list[tuple[float, Callable[[], None]]] = []
+
+    def now(self) -> float:
+        self._pass(TICK)
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self._pass(seconds)
+
+    def _pass(self, seconds: float) -> None:
+        self.time += seconds
+        while self.due and self.due[0][0] <= self.time:
+            self.due.pop(0)[1]()
+
+
+class StandingClock:
+    def now(self) -> float:
+        return EPOCH
+
+    def sleep(self, seconds: float) -> None:
+        pytest.fail("nobody should wait for this clock")
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
+INTERLACED = replace(SCAN, angles=np.concatenate([SCAN.angles[i::3] for i in (0, 2, 1)]))
+RHYTHM = Rhythm(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)
+
+
+def _schedule(
+    clock: ScanClock,
+    path: Path,
+    frames: list[Frame],
+    *,
+    begin: float = 0.5,
+    period: float = 0.1,
+    status: str | None = "complete",
+    axis_col: float | None = None,
+) -> None:
+    """The scan: its file appears after `begin` s and takes a frame every `period` s; status None never finishes it."""
+    writers: list[NXtomoWriter] = []
+    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col)
+
+    def create() -> None:
+        writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
+
+    def append(frame: Frame) -> Callable[[], None]:
+        return lambda: writers[0].append(frame, digest(frame.counts))
+
+    start = clock.time + begin
+    clock.due.append((start, create))
+    clock.due += [(start + period * (i + 1), append(frame)) for i, frame in enumerate(frames)]
+    end = start + period * (len(frames) + 1)
+    if status is not None:
+        clock.due.append((end, lambda: writers[0].close(status)))
+    else:
+        # Hours later, so that the file is closed when the test is over.
+        clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
+
+
+def _options(tmp_path: Path, **changes: object) -> ReconOptions:
+    output = tmp_path / "recon.h5"
+    options = ReconOptions(
+        source=SourceOptions(tmp_path / "scan.h5"),
+        target=Target(output, None),
+        selection=Selection(axis_col=SCAN.axis_col),
+        seconds=2.0,
+        gaussians=200,
+        command="beamline recon scan.h5 --follow",
+    )
+    return replace(options, **changes)  # type: ignore[arg-type]
+
+
+def _close(clock: ScanClock) -> None:
+    """Let the rest of the schedule happen."""
+    clock.sleep(1e6)
+
+
+def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    target = Target(tmp_path / "recon.h5", tmp_path / "report.html")
+    metrics = follow(_options(tmp_path, target=target, seconds=4.0), events.append, clock, RHYTHM)
+
+    names = [event.event for event in events]
+    assert names[0] == "state"
+    assert [event.data["state"] for event in events[:2]] == ["warming_up", "waiting"]
+    assert names.count("recon_started") == 1
+    assert "snapshot" in names
+    assert names[-1] == "done"
+    views = [event.data["n_views"] for event in events if event.event == "progress"]
+    assert views == sorted(views)
+    assert views[0] < 30  # it began before the scan had ended
+    assert views[-1] == 30
+
+    record = read_reconstruction(tmp_path / "recon.h5")
+    assert record.parameters["n_views"] == 30
+    assert {"ssim_weight", "tv_weight", "rates", "policy_every", "seconds_after_scan"} <= set(record.parameters)
+    assert record.metrics == pytest.approx(metrics)
+    truth = SCAN.truth(record.volume.grid)
+    assert psnr(truth, record.volume.data) > 20
+    assert metrics["residual"] < 0.1
+    np.testing.assert_array_equal(record.history["n_views"], views)
+    assert "<html" in (tmp_path / "report.html").read_text()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "report.html", "scan.h5"]
+
+
+@pytest.mark.parametrize("late", [FrameKind.FLAT, FrameKind.DARK])
+def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, late: FrameKind) -> None:
+    clock, events = ScanClock(), list[Event]()
+    frames = frames_of(INTERLACED)
+    order = [frame for frame in frames if frame.kind is not late] + [frame for frame in frames if frame.kind is late]
+    _schedule(clock, tmp_path / "scan.h5", [replace(frame, index=i) for i, frame in enumerate(order)])
+    metrics = follow(_options(tmp_path), events.append, clock, RHYTHM)
+    waiting = [event.data["message"] for event in events if event.event == "state"]
+    assert sum("when the scan has ended" in message for message in waiting) == 1
+    assert metrics["residual"] < 0.1
+    record = read_reconstruction(tmp_path / "recon.h5")
+    assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20
+
+
+def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+
+    @contextmanager
+    def at_once() -> Iterator[Callable[[], bool]]:
+        yield lambda: True
+
+    follow(_options(tmp_path, seconds=1e5), events.append, clock, RHYTHM, at_once)
+    assert events[-1].event == "done"
+    parameters = read_reconstruction(tmp_path / "recon.h5").parameters
+    assert parameters["ended_early"] and parameters["n_views"] == 30
+
+
+def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:
+    clock = ScanClock()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    seen: list[tuple[int, float]] = []
+
+    def look(event: Event) -> None:
+        if event.event == "snapshot":
+            record = read_reconstruction(Path(event.data["path"]))
+            assert record.parameters["n_views"] == event.data["n_views"]
+            seen.append((event.data["n_views"], psnr(SCAN.truth(record.volume.grid), record.volume.data)))
+
+    follow(_options(tmp_path), look, clock, RHYTHM)
+    assert len(seen) >= 3
+    assert seen[-1][0] > seen[0][0]
+    assert max(quality for _, quality in seen) > 18
+
+
+def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -> None:
+    clock = ScanClock()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), begin=0.0, period=0.0, axis_col=20.25)
+    clock.sleep(1.0)
+    events: list[Event] = []
+    follow(_options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    assert events[-1].data["axis_col"] == 20.25
+
+
+def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    follow(_options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    started = [event.data for event in events if event.event == "recon_started"]
+    assert started[0]["n_views"] < 30
+    assert events[-1].data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.3)
+
+
+def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def locate(source: object, corrector: object, frames: np.ndarray, warn: object) -> tuple[float, AxisEstimate]:
+        value = 18.0 if frames.size < 20 else 20.7
+        return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
+
+    monkeypatch.setattr(module, "locate_axis", locate)
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    metrics = follow(_options(tmp_path, selection=Selection(), seconds=4.0), events.append, clock, RHYTHM)
+    assert [e.data["axis_col"] for e in events if e.event == "recon_started"] == [18.0, 20.7]
+    assert events[-1].data["axis_col"] == 20.7
+    assert [e.data["again"] for e in events if e.event == "recon_started"] == [False, True]
+    history = read_reconstruction(tmp_path / "recon.h5").history
+    assert history["n_views"][-1] == 30
+    assert np.all(np.diff(history["seconds"]) > 0)  # one time, though the second fit began later
+    assert metrics["residual"] < 0.1
+
+
+def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "beamline.projections.prepare.find_axis",
+        lambda data, angles: AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), False, "pair"),
+    )
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    follow(_options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    (started,) = [event.data for event in events if event.event == "recon_started"]
+    assert started["n_views"] == 30
+    assert any(e.event == "warning" and "not a clear optimum" in e.data["message"] for e in events)
+
+
+def _no_scan(clock: ScanClock, path: Path) -> None:
+    pass
+
+
+def _dies(clock: ScanClock, path: Path) -> None:
+    _schedule(clock, path, frames_of(INTERLACED)[:16], status=None)
+
+
+def _ends_without_views(clock: ScanClock, path: Path) -> None:
+    _schedule(clock, path, frames_of(INTERLACED)[:4], status="stopped")
+
+
+def _ends_with_one_view(clock: ScanClock, path: Path) -> None:
+    _schedule(clock, path, frames_of(INTERLACED)[:5], status="stopped")
+
+
+def _has_no_flats(clock: ScanClock, path: Path) -> None:
+    frames = [f for f in frames_of(INTERLACED) if f.kind != 1]
+    _schedule(clock, path, [replace(f, index=i) for i, f in enumerate(frames)])
+
+
+@pytest.mark.parametrize(
+    ("scan", "said", "left"),
+    [
+        (_no_scan, "No scan began in .* within 3 s", set()),
+        (_dies, "has not grown for 3 s and is not finished.*12 views", {"scan.h5", "recon.snapshot.h5"}),
+        (_ends_without_views, "0 projections", {"scan.h5"}),
+        (_ends_with_one_view, "1 projections", {"scan.h5"}),
+        (_has_no_flats, "without flats", {"scan.h5"}),
+    ],
+)
+def test_scans_that_make_no_volume(
+    tmp_path: Path, scan: Callable[[ScanClock, Path], None], said: str, left: set[str]
+) -> None:
+    clock = ScanClock()
+    scan(clock, tmp_path / "scan.h5")
+    with pytest.raises(DataError, match=said):
+        follow(_options(tmp_path), lambda event: None, clock, RHYTHM)
+    assert {p.name for p in tmp_path.iterdir()} == left
+    _close(clock)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"method": "fbp"}, ConfigError),
+        ({"selection": Selection(views="fixed:5")}, ConfigError),
+        ({"steps": 10}, ConfigError),
+        ({"truth": "missing.npz"}, ConfigError),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_at_once(
+    tmp_path: Path, changes: dict[str, object], error: type[BeamlineError]
+) -> None:
+    with pytest.raises(error):
+        follow(_options(tmp_path, **changes), lambda event: None, ScanClock(), RHYTHM)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_result_stays(tmp_path: Path) -> None:
+    (tmp_path / "recon.h5").write_text("precious")
+    with pytest.raises(DataError, match="never overwritten"):
+        follow(_options(tmp_path), lambda event: None, ScanClock(), RHYTHM)
+    assert (tmp_path / "recon.h5").read_text() == "precious"
+
+
+def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = module.write_reconstruction
+
+    def write(path: Path, record: object, *, replace: bool = False) -> None:
+        if "snapshot" in path.name:
+            raise DataError("the file is in use")
+        real(path, record, replace=replace)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "write_reconstruction", write)
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    follow(_options(tmp_path), events.append, clock, RHYTHM)
+    assert any("snapshot was left out" in str(e.data.get("message")) for e in events)
+    assert "snapshot" not in [e.event for e in events]
+    assert h5py.is_hdf5(tmp_path / "recon.h5")
+
+
+def test_volume_is_of_the_whole_selection(tmp_path: Path) -> None:
+    clock = ScanClock()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(replace(INTERLACED, shape=(4, 40))))
+    selection = Selection(rows=(1, 3), binning=2, axis_col=SCAN.axis_col)
+    follow(_options(tmp_path, selection=selection), lambda event: None, clock, RHYTHM)
+    volume: Volume = read_reconstruction(tmp_path / "recon.h5").volume
+    assert volume.grid.shape == (1, 20, 20)
+    assert volume.grid.voxel_size == pytest.approx(1.0)

@@ -1,0 +1,116 @@
+"""Truths and figures of merit: what is read, what fits, and what the numbers mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.projections.prepare import Prepared
+from beamline.reconstruct.measure import fit_truth, measure, read_truth, regions
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.prep.correct import Projections
+from recon.voxels.projector import project
+
+DATA = np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8)
+
+
+@pytest.mark.parametrize("name", ["truth.npz", "truth.npy", "recon.h5", "plain.h5"])
+@pytest.mark.parametrize(("slices", "expected"), [("", slice(0, 4)), (":1:3", slice(1, 3)), (":2:", slice(2, 4))])
+def test_truths_in_every_form(tmp_path: Path, name: str, slices: str, expected: slice) -> None:
+    path = tmp_path / name
+    if path.suffix == ".npz":
+        np.savez(path, volume=DATA.astype(np.float16), voxel_mm=np.float32(0.1))
+    elif path.suffix == ".npy":
+        np.save(path, DATA)
+    else:
+        with h5py.File(path, "w") as file:
+            file["entry/data/data" if name == "recon.h5" else "volume"] = DATA
+    read = read_truth(f"{path}{slices}")
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, DATA[expected])
+
+
+def test_truths_that_are_none(tmp_path: Path) -> None:
+    np.savez(tmp_path / "two.npz", a=DATA, b=DATA)
+    np.savez(tmp_path / "flat.npz", a=DATA[0])
+    (tmp_path / "text.npz").write_text("no archive")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["something"] = DATA
+    np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
+    for name in ("two.npz", "flat.npz", "text.npz", "other.h5", "objects.npy"):
+        with pytest.raises(DataError, match="holds no volume"):
+            read_truth(str(tmp_path / name))
+    with pytest.raises(DataError, match="neither"):
+        read_truth(str(tmp_path / "text.npz"))
+    np.save(tmp_path / "good.npy", DATA)
+    with pytest.raises(ConfigError, match=r"slices 2:9 do not lie in 0:4"):
+        read_truth(f"{tmp_path / 'good.npy'}:2:9")
+    with pytest.raises(ConfigError, match="no such file"):
+        read_truth(str(tmp_path / "missing.npy"))
+
+
+def test_a_finer_truth_is_averaged_onto_the_grid() -> None:
+    grid = Grid((2, 3, 4), 1.0)
+    fitted = fit_truth(DATA, grid, 2)
+    assert fitted.grid is grid
+    for z, y, x in np.ndindex(2, 3, 4):
+        block = DATA[2 * z : 2 * z + 2, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2]
+        assert fitted.data[z, y, x] == pytest.approx(block.mean())
+    np.testing.assert_array_equal(fit_truth(DATA, Grid(DATA.shape), 1).data, DATA)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"shape \(4, 6, 8\), the volume \(4, 6, 9\)"):
+        fit_truth(DATA, Grid((4, 6, 9)), 1)
+
+
+def _prepared(volume: Volume, held_out: bool = False) -> Prepared:
+    rows, _, cols = volume.grid.shape
+    geometry = Geometry.parallel(np.linspace(0, 3, 20), (rows, cols))
+    data = project(volume, geometry)
+    mask = np.zeros((rows, cols), bool)
+    projections = Projections(data, np.arange(20), 0.0, np.ones(20, np.float32), mask)
+    return Prepared(projections, geometry, 0.0, None, (data, geometry) if held_out else None, 20, "mm", "counts")
+
+
+def _ball() -> Volume:
+    return _ball_in((12, 24, 24))
+
+
+def _ball_in(shape: tuple[int, int, int]) -> Volume:
+    grid = Grid(shape, 1.0)
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    return Volume((z**2 + y**2 + x**2 < 25).astype(np.float32), grid)
+
+
+def test_a_perfect_volume(rng: np.random.Generator) -> None:
+    truth = _ball()
+    noisy = Volume(truth.data + rng.normal(0, 0.01, truth.data.shape).astype(np.float32), truth.grid)
+    values = measure(noisy, _prepared(truth, held_out=True), truth, None)
+    assert set(values) == {"psnr", "ssim3d", "nrmse", "residual", "residual_held_out"}
+    assert values["psnr"] == pytest.approx(40, abs=0.2)  # noise of 1 % of the peak
+    assert values["residual"] < 0.05
+    assert measure(truth, _prepared(truth), truth, None)["residual"] == 0.0
+
+
+def test_without_a_truth_the_background_tells(rng: np.random.Generator) -> None:
+    ball = _ball()
+    noisy = Volume(ball.data + rng.normal(0, 0.01, ball.data.shape).astype(np.float32), ball.grid)
+    values = measure(noisy, _prepared(ball), None, regions(noisy, 0))
+    assert set(values) == {"snr", "cnr", "residual"}
+    assert values["snr"] == pytest.approx(40, abs=1.5)  # 20 log10(1 / 0.01)
+    assert values["cnr"] == pytest.approx(40, abs=1.5)
+
+
+def test_a_volume_without_two_regions_has_no_snr() -> None:
+    flat = Volume(np.ones((4, 8, 8), np.float32), Grid((4, 8, 8)))
+    assert regions(flat, 0) is None
+    assert "snr" not in measure(flat, _prepared(_ball_in((4, 8, 8))), None, None)
+
+
+def test_a_constant_truth_is_refused() -> None:
+    for value in (1.0, np.nan):
+        with pytest.raises(ConfigError, match="nothing to compare"):
+            fit_truth(np.full((4, 8, 8), value, np.float32), Grid((4, 8, 8)), 1)

@@ -1,0 +1,72 @@
+"""What is delivered beside a volume: the direct reconstruction of the same views, by the method that takes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import recon
+from beamline.core.events import Event
+from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.selection import Selection
+from beamline.reconstruct.options import SourceOptions
+from beamline.reconstruct.recon_report import Context, Made, facts_of
+from beamline.reconstruct.result import Target, deliver
+from beamline.report import figures
+from drivers.clock import SystemClock
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.projector import Projector
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
+
+
+def _scan(folder: Path, turn: float) -> tuple[Prepared, Context]:
+    """A file's context, with a cone's views of the same sample (magnified five times) in place of its own."""
+    write_exchange(folder / "scan.h5", SCAN)
+    with SourceOptions(folder / "scan.h5").open() as source:
+        facts = facts_of(source)
+        selection = Selection(axis_col=SCAN.axis_col)
+        prepared = prepare(source, selection, lambda said: None)
+    angles = np.linspace(0, turn, 30, endpoint=False)
+    cone = Geometry.cone(angles, SCAN.shape, 5.0, 400.0, 2000.0, SCAN.axis_col)
+    grid = Grid.matching(cone)
+    data = Projector(cone, grid).forward(SCAN.truth(grid))
+    views = replace(prepared, projections=replace(prepared.projections, data=data), geometry=cone, held_out=None)
+    return views, Context(facts, selection, "beamline recon scan.h5", 0)
+
+
+@pytest.mark.parametrize(("turn", "compared"), [(2 * np.pi, True), (3.6, False)])
+def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, turn: float, compared: bool) -> None:
+    prepared, context = _scan(tmp_path, turn)
+    result = recon.reconstruct(prepared.projections.data, prepared.geometry, method="os-sirt-tv", iterations=3)
+    made = Made(result.volume, "os-sirt-tv", result.seconds, result.history, result.settings)
+    events: list[Event] = []
+    deliver(
+        made, prepared, None, Target(tmp_path / "out.h5", tmp_path / "out.html"), context, events.append, SystemClock()
+    )
+    done = events[-1].data
+    assert ("fbp" in done) is compared
+    if compared:
+        assert done["fbp"]["residual"] < 0.3
+    assert (tmp_path / "out.html").exists()
+
+
+def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
+    for geometry in (
+        Geometry.parallel([0.0, 1.0], (6, 40), 0.5, 18.0),
+        Geometry.cone([0.0, 1.0], (6, 40), 5.0, 100.0, 1000.0, 18.0),
+    ):
+        figures.projection(np.random.default_rng(0).random((2, 6, 40), np.float32), geometry, 0, "mm")
+    flat, cone = (figure.axes[0].get_images()[0].get_extent() for figure in drawn)
+    np.testing.assert_allclose(cone, flat)
+    np.testing.assert_allclose(flat, [-18.5 * 0.5, 21.5 * 0.5, -1.5, 1.5])

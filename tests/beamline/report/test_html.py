@@ -1,0 +1,183 @@
+"""The report: valid, self-contained, escaped; its pictures show what their labels say."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.report import figures
+from beamline.report.html import METRICS, Picture, Report, formatted, to_html, write_report
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+class _Checker(HTMLParser):
+    """Collects tags and attributes, and fails where tags do not nest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def _pixels(png: bytes) -> np.ndarray:
+    return matplotlib.image.imread(io.BytesIO(png), format="png")
+
+
+def _report(**changes: object) -> Report:
+    values: dict[str, object] = {
+        "title": "battery <1>",
+        "summary": "R² reached 31 dB & more.",
+        "scan": {"sample": "battery"},
+        "settings": {"views": "90 of 180"},
+        "metrics": {"FBP": {"psnr": 25.123, "seconds": 1.0}, "R²-Gaussian": {"psnr": 31.456, "ssim3d": 0.9}},
+        "frames": "110/110",
+        "flags": [],
+        "pictures": [Picture("Sinogram", 'A "sinogram" isn\'t <much>', b"\x89PNG fake")],
+        "command": "beamline recon 'my scan.h5' --axis 85.75",
+    }
+    return Report(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def _parsed(page: str) -> _Checker:
+    checker = _Checker()
+    checker.feed(page)
+    checker.close()
+    assert checker.open == []
+    return checker
+
+
+def test_page_nests_is_self_contained_and_escapes() -> None:
+    page = to_html(_report())
+    parsed = _parsed(page)
+    assert page.startswith("<!DOCTYPE html>")
+    text = "".join(parsed.text)
+    for said in ("battery <1>", "31 dB & more", "beamline recon 'my scan.h5' --axis 85.75", "90 of 180", "110/110"):
+        assert said in text
+    tags = [tag for tag, _ in parsed.seen]
+    assert not {"script", "link", "iframe", "object"} & set(tags)
+    sources = [v for _, attrs in parsed.seen for k, v in attrs.items() if k in ("src", "href", "srcset")]
+    assert all(v is not None and v.startswith("data:image/png;base64,") for v in sources)
+    assert "http" not in page
+    assert "url(" not in page
+    (image,) = [attrs for tag, attrs in parsed.seen if tag == "img"]
+    assert image["alt"] == 'A "sinogram" isn\'t <much>'
+    assert base64.b64decode((image["src"] or "").split(",")[1]) == b"\x89PNG fake"
+
+
+def test_metrics_stand_in_their_method_column() -> None:
+    page = to_html(_report())
+    row = re.search(r"<tr><th scope='row'>PSNR.*?</tr>", page)
+    assert row is not None
+    assert re.findall(r"<td>(.*?)</td>", row[0]) == ["25.12 dB", "31.46 dB"]
+    row = re.search(r"<tr><th scope='row'>SSIM 3D.*?</tr>", page)
+    assert row is not None
+    assert re.findall(r"<td>(.*?)</td>", row[0]) == ["–", "0.9000"]
+    assert "NRMSE" not in page
+
+
+def test_flags_are_counted_and_listed() -> None:
+    text = "".join(_parsed(to_html(_report(flags=["axis <not> confident", "beam low"]))).text)
+    assert "2 flags" in text
+    assert "axis <not> confident" in text
+    assert "No flags" in "".join(_parsed(to_html(_report())).text)
+
+
+def test_every_metric_formats() -> None:
+    for name, metric in METRICS.items():
+        assert formatted(name, 1.0).endswith(metric.unit)
+    assert formatted("snr", -np.inf) == "undefined"
+
+
+def test_report_is_whole_and_never_overwrites(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    write_report(path, _report())
+    assert path.read_text(encoding="utf-8") == to_html(_report())
+    with pytest.raises(DataError, match="never overwritten"):
+        write_report(path, _report(title="other"))
+    write_report(path, _report(title="other"), replace=True)
+    assert "other" in path.read_text(encoding="utf-8")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_grey_window_ignores_nan_and_outliers() -> None:
+    values = np.linspace(0.0, 1.0, 10_001)
+    values[7] = np.nan
+    values[-1] = 1e9
+    low, high = figures.grey_window([values[:5000], values[5000:]])
+    assert (low, high) == (pytest.approx(0.01, abs=1e-3), pytest.approx(0.995, abs=1e-3))
+    assert figures.grey_window([np.full(5, 3.0)]) == (3.0, 4.0)
+    assert figures.grey_window([np.full(5, np.nan)]) == (0.0, 1.0)
+
+
+def _levels(png: bytes) -> set[float]:
+    """Grey levels of large areas of a picture."""
+    pixels = _pixels(png)[..., :3]
+    grey = pixels[(np.ptp(pixels, axis=-1) == 0)][:, 0]
+    values, counts = np.unique(np.round(grey, 2), return_counts=True)
+    return set(values[counts > 2000].tolist())
+
+
+def test_slices_share_one_window(rng: np.random.Generator) -> None:
+    """Two flat volumes of 0 and 1 beside one of 0.5: with one window they are black, white and mid-grey."""
+    grid = Grid((20, 24, 28), 0.5)
+    volumes = {f"{v}": Volume(np.full(grid.shape, v, np.float32), grid) for v in (0.0, 0.5, 1.0)}
+    levels = _levels(figures.orthogonal_slices(volumes, "mm"))
+    assert {0.0, 1.0} <= levels
+    assert any(abs(level - 0.5) < 0.02 for level in levels)
+
+
+def test_slices_meet_where_the_volume_is_bright() -> None:
+    """One bright ball off the middle: all three slices show it."""
+    grid = Grid((40, 50, 60), 1.0)
+    z, y, x = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
+    ball = ((z - 10) ** 2 + (y - 38) ** 2 + (x - 15) ** 2 < 16).astype(np.float32)
+    assert figures._bright_centre(ball) == (10, 38, 15)
+    assert figures._bright_centre(np.zeros((4, 6, 8), np.float32)) == (2, 3, 4)
+
+
+@pytest.mark.parametrize("shape", [(1, 64, 64), (2, 8, 300), (40, 20, 20)])
+@pytest.mark.parametrize("n", [1, 3])
+def test_slices_of_any_shape(shape: tuple[int, int, int], n: int, rng: np.random.Generator) -> None:
+    volume = Volume(rng.random(shape, dtype=np.float32), Grid(shape, 0.1))
+    pixels = _pixels(figures.orthogonal_slices({f"v{i}": volume for i in range(n)}, "mm"))
+    assert pixels.shape[1] < 1100
+
+
+def test_projection_and_sinogram(rng: np.random.Generator) -> None:
+    geometry = Geometry.parallel([2.0, 0.0, 1.0], (2, 30), 0.1, axis_col=20.0)
+    data = rng.random((3, 2, 30), dtype=np.float32)
+    assert _pixels(figures.projection(data, geometry, 0, "mm")).ndim == 3
+    assert _pixels(figures.sinogram(data, geometry, 1)).ndim == 3
+
+
+def test_curves() -> None:
+    columns = np.linspace(10, 20, 11)
+    assert _pixels(figures.axis_curve(columns, (columns - 14) ** 2, 14.0, False)).ndim == 3
+    seconds = np.arange(5.0)
+    history = {"seconds": seconds, "loss": 1 / (1 + seconds), "residual": np.full(5, np.nan), "n_views": seconds}
+    narrow = _pixels(figures.quality_against_time(history))
+    wide = _pixels(figures.quality_against_time(history, [(0.0, 20.0), (2.0, 25.0)]))
+    assert narrow.shape == wide.shape

@@ -1,0 +1,103 @@
+"""A fit's record goes into a file and comes back; the residual that judges it is that of views held out, if any."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beamline.reconstruct.recon_report import Made
+from beamline.report.figures import quality_against_time
+from beamline.report.record import history_arrays, history_of, judged_by
+from recon.assess.time_model import next_decibel, next_decibel_of_fit
+from recon.base.volume import Grid, Volume
+from recon.splatting.optimise import Progress
+from recon.splatting.settings import FitSettings
+from recon.splatting.stream import WHILE_VIEWS_COME
+
+GRID = Grid((1, 1, 1))
+
+
+def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
+    """Falls by `slope` dB for each factor of e in time."""
+    times = np.linspace(0.5, 30, n)
+    residuals = 10 ** (-(20 + slope * np.log(times)) / 20)
+    pairs = zip(times.tolist(), residuals.tolist(), strict=True)
+    return tuple(Progress(k + 1, n, t, r / 2, r, 100, views) for k, (t, r) in enumerate(pairs))
+
+
+def _made(history: tuple[Progress, ...], method: str = "sirt") -> Made:
+    settings = {"pace": FitSettings().pace} if method == "r2" else {}
+    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, settings)
+
+
+def test_there_and_back() -> None:
+    history = _record(3.0)
+    arrays = history_arrays(history)
+    assert {len(values) for values in arrays.values()} == {len(history)}
+    assert [p.step for p in history_of(arrays)] == [p.step for p in history]
+    np.testing.assert_array_equal(history_arrays(history_of(arrays))["residual"], arrays["residual"])
+    assert history_arrays(()) == {} and history_of({}) == ()
+
+
+def test_what_was_not_recorded_is_not_a_number() -> None:
+    arrays = history_arrays(_record(3.0))
+    del arrays["loss"]
+    assert all(math.isnan(p.loss) for p in history_of(arrays))
+
+
+def test_views_held_out_judge_before_views_used() -> None:
+    seconds = np.arange(3.0)
+
+    def words(**arrays: np.ndarray) -> str | None:
+        judged = judged_by({"seconds": seconds, **arrays})
+        return None if judged is None else judged.views
+
+    assert words(residual=seconds, held_out=seconds) == "views held out"
+    assert words(residual=seconds, held_out=np.full(3, np.nan)) == "views used"
+    assert words() is None
+
+
+def test_each_look_at_views_held_out_counts_once() -> None:
+    """Between two looks the record says the last one again, which is no evidence."""
+    looks = np.array([np.nan, np.nan, 0.5, 0.5, 0.5, 0.4, 0.4, 0.3])
+    judged = judged_by({"seconds": np.arange(8.0), "residual": looks, "held_out": looks})
+    assert judged is not None
+    np.testing.assert_array_equal(judged.seconds, [2, 5, 7])
+    np.testing.assert_array_equal(judged.residuals, [0.5, 0.4, 0.3])
+
+
+def test_a_fit_says_what_longer_fits_gained() -> None:
+    made = _made(_record(3.0), "r2")
+    assert made.next_decibel == next_decibel_of_fit(30.0, 60)
+    assert "as longer fits gained on two other scans" in made.next_decibel_said
+    late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
+    followed = replace(_made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace})
+    assert followed.next_decibel is None and followed.next_decibel_said == ""
+    assert _made(late, "r2").next_decibel_said == "none in reach of what was measured"
+
+
+def test_iterations_say_what_another_decibel_would_cost() -> None:
+    made = _made(_record(3.0))
+    assert made.next_decibel is not None
+    assert made.next_decibel.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
+    assert made.next_decibel_said.startswith("about 11.9 s more (")
+    assert "none measurable" in _made(_record(0.0)).next_decibel_said
+    assert _made(()).next_decibel is None and _made(()).next_decibel_said == ""
+
+
+def test_while_views_still_come_nothing_is_extrapolated() -> None:
+    grown = (*_record(3.0), *_record(3.0, views=20))
+    assert _made(grown).next_decibel is None
+
+
+@pytest.mark.parametrize("slope", [3.0, 0.0])
+@pytest.mark.parametrize("psnr", [(), ((5.0, 25.0), (30.0, 31.0))])
+def test_the_picture_has_room_for_all_of_it(slope: float, psnr: tuple[tuple[float, float], ...]) -> None:
+    arrays = history_arrays(_record(slope))
+    arrays["held_out"] = 1.3 * arrays["residual"]
+    arrays["n_gaussians"][30:] *= 2
+    further = next_decibel(arrays["seconds"], arrays["held_out"])
+    assert quality_against_time(arrays, psnr, further).startswith(b"\x89PNG")

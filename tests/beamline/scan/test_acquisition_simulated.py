@@ -1,0 +1,114 @@
+"""Acquisition over the real stage driver and the simulated camera: what they lose is what is found missing."""
+
+from __future__ import annotations
+
+import math
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.core.stop import ScanStopped, StopRequest
+from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan
+from beamline.plan.timeline import work_out
+from beamline.scan.acquisition import Acquisition
+from beamline.scan.ledger import LedgerError
+from drivers.frame import Frame, FrameKind
+from drivers.protocols import CameraSettings, Devices, TriggerSource
+from drivers.stages.pm16c.stage import PM16CStage
+from simulators.devices.camera import SimulatedOrcaQuest
+from simulators.devices.clock import VirtualClock
+from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.trigger_line import TriggerLine
+from simulators.scenes.scene import load_scene
+from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.serial_url import register
+
+N = 24
+SETTINGS = CameraSettings(0.02, TriggerSource.EXTERNAL, roi=(1148, 2044, 8, 8))
+SCENE = {
+    "phantom": {"kind": "solids", "solids": [{"kind": "cylinder", "radius": 0.01, "height": 0.1, "attenuation": 5.0}]},
+    "beam": {"photons_per_s": 1e5},
+}
+PULSES = st.sets(st.integers(0, N - 1), max_size=4)
+
+
+class Bench:
+    """The simulated instrument with faults; what happens when frames are taken can be scheduled."""
+
+    def __init__(self, pulses_lost: set[int], ignored: set[int], lost: set[int]) -> None:
+        self.clock = VirtualClock()
+        self.line = TriggerLine(self.clock)
+        box = PM16CController(self.clock, self.line, counts_per_turn=36000, lost=pulses_lost)
+        self.stage = PM16CStage(
+            register(f"acquire-{uuid4().hex}", box),
+            counts_per_turn=36000,
+            clock=self.clock,
+            max_speed=math.radians(60),
+            acceleration=math.radians(60),
+            low=math.radians(-90),
+            high=math.radians(270),
+        )
+        self.shutter, self.sample = SimulatedShutter(), SimulatedSampleMover()
+        self.camera = SimulatedOrcaQuest(
+            load_scene(SCENE), self.line, self.clock, 0, self.shutter, self.sample, lost=lost, ignored=ignored
+        )
+
+    def scan(self, stop: StopRequest, stop_after: int = 10**9) -> tuple[Acquisition, list[Frame], BaseException | None]:
+        none = FieldPlan(0, Place.NONE, 0.02)
+        angles = np.linspace(0, math.pi, N, endpoint=False)
+        plan = ScanPlan(angles, Mode.FLY, 0.02, 0.15, 0.0, none, none, "fixed")
+        self.camera.configure(SETTINGS)
+        timeline = work_out(plan, self.stage.limits, self.stage.to_counts, self.camera.timing)
+        assert timeline.violations == ()
+        devices = Devices(self.stage, self.camera, self.shutter, self.sample)
+        acquisition = Acquisition(devices, timeline, SETTINGS, 0.0, self.clock, stop)
+        frames: list[Frame] = []
+        try:
+            for frame in acquisition.frames():
+                frames.append(frame)
+                if len(frames) == stop_after:
+                    stop.stop()
+        except Exception as error:
+            return acquisition, frames, error
+        return acquisition, frames, None
+
+    def assert_true_angles(self, frames: list[Frame]) -> None:
+        """Against where the simulated axis really was when the trigger rose."""
+        for frame in frames:
+            assert frame.angle == pytest.approx(self.line.angle_at(frame.time), abs=2 * math.pi / 36000)
+
+
+@settings(max_examples=20, deadline=None)
+@given(PULSES, PULSES, PULSES)
+def test_lost_pulses_ignored_triggers_and_lost_frames_are_all_named(
+    pulses_lost: set[int], ignored: set[int], lost: set[int]
+) -> None:
+    bench = Bench(pulses_lost, ignored, lost)
+    arrive = [i for i in range(N) if i not in pulses_lost]
+    accepted = [i for number, i in enumerate(arrive) if number not in ignored]
+    kept = [i for number, i in enumerate(accepted) if number not in lost]
+    acquisition, frames, error = bench.scan(StopRequest())
+    assert [frame.trigger for frame in frames] == kept
+    bench.assert_true_angles(frames)
+    assert acquisition.missing == [i for i in range(N) if i not in kept]
+    assert isinstance(error, LedgerError) if acquisition.missing else error is None
+    assert bench.stage.position() == 0.0
+    assert not bench.shutter.is_open()
+    bench.stage.close()
+
+
+@pytest.mark.parametrize("after", [1, 5, 12])
+def test_a_stop_while_turning_keeps_the_angles_of_the_frames_on_their_way(after: int) -> None:
+    bench = Bench(set(), set(), set())
+    acquisition, frames, error = bench.scan(StopRequest(), stop_after=after)
+    assert isinstance(error, ScanStopped)
+    assert after < len(frames) < N
+    assert [frame.trigger for frame in frames] == list(range(len(frames)))
+    assert all(frame.kind is FrameKind.PROJECTION for frame in frames)
+    bench.assert_true_angles(frames)
+    assert acquisition.missing == []
+    assert bench.stage.position() == 0.0
+    bench.stage.close()

@@ -1,0 +1,162 @@
+"""The live reconstruction beside a scan: its story is told among ours; neither its life nor its death costs a frame."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beamline.core.events import Event
+from beamline.core.stop import ScanAborted, StopRequest
+from beamline.scan import run as module
+from beamline.scan.live_process import LiveReconstruction
+from beamline.scan.run import run_scan
+from tests.beamline.fakes import Instrument
+from tests.beamline.ran import Ran, small
+
+
+def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
+    return lambda scan, output: [sys.executable, "-c", code, str(scan), str(output)]
+
+
+def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
+    code = """
+import json, pathlib, sys
+print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "n_views": 5}))
+print("a library's chatter")
+pathlib.Path(sys.argv[2]).write_text("volume")
+print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
+"""
+    ran = Ran(tmp_path, Instrument(), live=script(code))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    recon = [(e.event, e.data["source"]) for e in ran.events if "source" in e.data]
+    assert recon == [("snapshot", "recon"), ("recon_done", "recon")]
+    assert ran.result.recon is not None
+    assert ran.result.recon["axis_col"] == 80.5
+    assert Path(ran.result.recon["output"]) == ran.folder / "recon.h5"
+    assert ran.events[-1].event == "done"
+    ran.assert_good_file(19, "complete")
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        ("import sys; sys.exit('out of memory')", "ended with code 1"),
+        ("pass", "ended with code 0"),
+        ('print(\'{"event": "failed", "message": "no axis", "exit_code": 5}\'); raise SystemExit(5)', "no axis"),
+    ],
+)
+def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: str, says: str) -> None:
+    ran = Ran(tmp_path, Instrument(), live=script(code))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    assert ran.result.recon is None
+    assert any(says in event.data["message"] for event in ran.of("warning"))
+    ran.assert_good_file(19, "complete")
+    if "memory" in code:
+        assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
+
+
+def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
+    assert ran.error is None
+    assert any("cannot be started" in event.data["message"] for event in ran.of("warning"))
+    ran.assert_good_file(19, "complete")
+
+
+def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
+    stop = StopRequest()
+    ran = Ran(
+        tmp_path,
+        Instrument(on_frame=lambda number: stop.abort() if number == 10 else None),
+        stop=stop,
+        live=script("import time; time.sleep(100)"),
+    )
+    assert type(ran.error) is ScanAborted
+    assert any("it was ended" in event.data["message"] for event in ran.of("warning"))
+
+
+def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[str]] = []
+
+    class Kept(LiveReconstruction):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            assert self._process is not None
+            started.append(self._process)
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(module, "LiveReconstruction", Kept)
+    monkeypatch.setattr(module, "Recorder", broken)
+    ran = Ran(tmp_path, Instrument(), live=script("import time; time.sleep(100)"))
+    assert isinstance(ran.error, ZeroDivisionError)
+    assert [process.poll() is None for process in started] == [False]
+
+
+def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path) -> None:
+    stop = StopRequest()
+    instrument = Instrument()
+    events: list[Event] = []
+
+    def sink(event: Event) -> None:
+        events.append(event)
+        if event.event == "scan_done":
+            stop.stop()
+
+    result = run_scan(
+        small(),
+        tmp_path,
+        [sink],
+        stop,
+        live=script("import time; time.sleep(100)"),
+        bench=instrument.bench(),
+    )
+    assert result.n_frames == 19
+    assert result.recon is None
+
+
+DELIVERS = """
+import json, signal, sys, time
+def deliver(*_):
+    print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=True)
+    sys.exit(4)
+signal.signal(signal.SIGTERM, deliver)
+print(json.dumps({"event": "progress", "time": 1.0}), flush=True)
+time.sleep(100)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
+def test_a_live_reconstruction_that_is_ended_may_deliver_what_it_has(tmp_path: Path) -> None:
+    live = _Live(tmp_path, DELIVERS)
+    done = live.process.finish(give_up=lambda: "progress" in live.said, hurry=lambda: False)
+    assert done is not None
+    assert done["output"] == str(tmp_path / "recon.h5")
+    assert "warning" not in live.said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
+def test_in_a_hurry_it_is_not_waited_for(tmp_path: Path) -> None:
+    live = _Live(tmp_path, DELIVERS.replace("sys.exit(4)", "time.sleep(100)").replace('"done"', '"progress"'))
+    assert live.process.finish(give_up=lambda: "progress" in live.said, hurry=lambda: True) is None
+    assert live.said[-1] == "warning"
+
+
+class _Live:
+    """A live reconstruction without a scan, and the events that it passed on."""
+
+    def __init__(self, folder: Path, code: str) -> None:
+        self.said: list[str] = []
+        command = script(code)(folder / "scan.h5", folder / "recon.h5")
+        self.process = LiveReconstruction(command, folder / "recon.log", lambda event, data: self.said.append(event))

@@ -1,0 +1,108 @@
+"""The recorder writes every frame in order, or says why it cannot, and never lets the camera wait for a dead disk."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.core.errors import DataError
+from beamline.core.stop import StopRequest
+from beamline.monitor import watch as monitor
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.flag import Context
+from beamline.scan import recorder as module
+from beamline.scan.recorder import Recorder
+from drivers.frame import Frame, FrameKind
+from tests.beamline.fakes import Instrument
+
+TIMELINE = Instrument().timeline()
+
+
+class Writer:
+    """Keeps the rows it was given; `before` is called with each row first, and may wait or raise."""
+
+    def __init__(self, before: Callable[[int], object] = lambda row: None) -> None:
+        self.path = Path("runs/scan.h5")
+        self.rows: list[int] = []
+        self._before = before
+
+    @property
+    def committed(self) -> int:
+        return len(self.rows)
+
+    def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+        self._before(frame.index)
+        assert digest.mean == frame.index
+        self.rows.append(frame.index)
+
+
+def record(writer: Writer) -> Recorder:
+    watch = monitor.start(Context(65535, 4))
+    stop = StopRequest()
+    return Recorder(
+        writer, watch, TIMELINE, preview_bin=2, emit=lambda event, data: None, stop=stop, stop_on_alarm=False
+    )
+
+
+def frame(row: int) -> Frame:
+    counts = np.full((2, 2), row, np.uint16)
+    return Frame(counts, FrameKind.PROJECTION, row, row, row, 0.0, 1.8e9 + row, 0.1)
+
+
+@settings(max_examples=15, deadline=None)
+@given(n=st.integers(0, 60), room=st.integers(1, 4))
+def test_every_frame_is_written_in_order_however_little_room_there_is(n: int, room: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "WAITING_FRAMES", (room, room))
+        recorder = record(writer := Writer())
+        for row in range(n):
+            recorder.put(frame(row))
+        recorder.finish()
+    assert writer.rows == list(range(n))
+    assert recorder.n_frames == n
+    assert not recorder.hangs
+
+
+@pytest.mark.parametrize("at", [0, 3])
+def test_a_failure_reaches_whoever_waits_for_room_and_nothing_is_written_after_it(
+    monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    monkeypatch.setattr(module, "WAITING_FRAMES", (1, 1))
+    go = threading.Event()
+
+    def fail(row: int) -> None:
+        if row == at:
+            go.wait(30)
+            raise OSError(28, "No space left on device")
+
+    recorder = record(writer := Writer(fail))
+    with pytest.raises(DataError, match=f"No space left.*first {at} frames are safe in .*scan.h5") as caught:
+        for row in range(99):
+            if row == at + 2:  # one frame fails, one waits: this one finds no room
+                go.set()
+            recorder.put(frame(row))
+    assert isinstance(caught.value.__cause__, OSError)
+    with pytest.raises(DataError, match="No space left"):
+        recorder.finish()
+    assert writer.rows == list(range(at))
+
+
+def test_a_disk_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "WAITING_FRAMES", (1, 1))
+    monkeypatch.setattr(module, "STALL", 0.02)
+    free = threading.Event()
+    recorder = record(writer := Writer(lambda row: free.wait(30) if row == 2 else None))
+    with pytest.raises(DataError, match=r"took no frame for 0\.02 s.* first 2 frames are safe in .*scan\.h5"):
+        for row in range(9):
+            recorder.put(frame(row))
+    with pytest.raises(DataError, match="took no frame"):
+        recorder.finish()
+    assert recorder.hangs
+    free.set()
+    assert writer.rows[:2] == [0, 1]

@@ -1,0 +1,400 @@
+"""A run leaves one folder with a readable file and the whole story, however it ends, and says what it must in time."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.config.load import config_folder, load
+from beamline.core.errors import ConfigError, DataError, InstrumentError, ScanStopped
+from beamline.core.events import Event
+from beamline.core.stop import ScanAborted, StopRequest
+from beamline.instrument.connect import connect
+from beamline.monitor.digest import FrameDigest
+from beamline.projections.prepare import prepare
+from beamline.projections.selection import Selection
+from beamline.scan import recorder as recorder_module
+from beamline.scan import run as module
+from beamline.scan.ledger import LedgerError
+from beamline.scan.run import State, run_scan
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.errors import DeviceError
+from drivers.frame import Frame, FrameKind
+from recon.prep.correct import CorrectionSettings
+from tests.beamline.fakes import COUNT, Faults, Instrument
+from tests.beamline.ran import SMALL, Ran, small
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_run_from_trigger_to_file(tmp_path: Path, mode: str) -> None:
+    ran = Ran(tmp_path, Instrument(), f"scan.mode={mode}")
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    ran.assert_good_file(3 + 2 + 12 + 2, "complete")
+    ran.assert_safe()
+    assert ran.result.path == ran.folder / "scan.h5"
+    assert (ran.result.n_frames, ran.result.missing, ran.result.flags) == (19, (), {})
+    assert ran.result.bytes == ran.result.path.stat().st_size
+    assert {p.name for p in ran.folder.iterdir()} == {"config.resolved.yaml", "events.jsonl", "scan.h5", "user.log"}
+    assert ran.folder.name.endswith("_battery")
+    assert load(ran.folder / "config.resolved.yaml", environment={}) == small(f"scan.mode={mode}")
+    assert "close" not in ran.instrument.log  # whoever brings the devices closes them
+
+
+def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument())
+    assert ran.folder is not None
+    names = [event.event for event in ran.events if event.event != "frame"]
+    block = ["block_started", "block_done"]
+    assert names == ["state", "run_started", "state", *block * 4, "state", "scan_done", "state", "done"]
+    assert ran.states == [State.PREPARING, State.ACQUIRING, State.STOPPING, State.DONE]
+    frames = ran.of("frame")
+    assert frames[-1].data["n"] == frames[-1].data["of"] == 19
+    assert frames[-1].data["eta_s"] == 0
+    lines = (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["event"] for line in lines] == [event.event for event in ran.events]
+    log = (ran.folder / "user.log").read_text(encoding="utf-8")
+    assert "12 projection frames (fly, 0.02 s each)" in log
+    assert "Scan complete: 19 frames" in log
+
+
+def test_what_the_file_says_of_the_scan(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument())
+    assert ran.folder is not None
+    with h5py.File(ran.folder / "scan.h5") as file:
+        plan = json.loads(file["entry/record/plan"][()])
+        assert plan["scheme"] == "fixed"
+        np.testing.assert_allclose(plan["angles_deg"], np.arange(0, 180, 15))
+        assert file["entry/instrument/devices/camera/model"][()] == b"fake camera"
+        log = file["entry/frame_log"]
+        assert list(log["trigger"]) == [0, 1, 2, 0, 1, *range(12), 0, 1]
+        assert np.all(np.diff(log["time"][()]) > 0)
+        assert not np.any(log["flags"])
+
+
+def test_missing_frames_are_named_after_everything_else_was_taken(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(Faults(lost={8}, ignored={11, 12})))
+    assert isinstance(ran.error, LedgerError)
+    assert ran.error.missing == (8, 11, 12)
+    assert "3 of 12 projections are missing: 3, 6-7" in str(ran.error)
+    ran.assert_good_file(16, "failed", missing=(8, 11, 12))
+    ran.assert_safe()
+    assert ran.of("scan_done")[0].data["missing"] == (8, 11, 12)
+    assert ran.of("failed")[0].data["exit_code"] == 5
+    assert ran.states[-1] == State.FAILED
+    assert [event.data["check"] for event in ran.of("flag")] == ["timing", "timing"]  # and it was said at once
+
+
+@pytest.mark.parametrize(
+    ("abort", "kind", "code", "least"), [(False, ScanStopped, 4, 11), (True, ScanAborted, 130, 11)]
+)
+def test_stop_and_abort_leave_a_readable_file(
+    tmp_path: Path, abort: bool, kind: type[ScanStopped], code: int, least: int
+) -> None:
+    stop = StopRequest()
+    wish = stop.abort if abort else stop.stop
+    ran = Ran(tmp_path, Instrument(on_frame=lambda number: wish() if number == 10 else None), stop=stop)
+    assert type(ran.error) is kind
+    n = ran.of("scan_done")[0].data["n_frames"]
+    assert least <= n < 17
+    ran.assert_good_file(n, "stopped")
+    ran.assert_safe()
+    assert ran.of("failed")[0].data["exit_code"] == code
+
+
+def test_a_stop_before_the_start_makes_no_folder(tmp_path: Path) -> None:
+    stop = StopRequest()
+    stop.stop()
+    ran = Ran(tmp_path / "runs", Instrument(), stop=stop)
+    assert type(ran.error) is ScanAborted
+    assert ran.folder is None
+    assert ran.instrument.log == []
+
+
+def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    ran = Ran(tmp_path / "runs", Instrument(), "scan.period_s=0.021")
+    assert isinstance(ran.error, ConfigError)
+    assert "nothing was started" in str(ran.error)
+    assert ran.folder is None
+    assert ran.instrument.log == []
+    assert ran.events == []
+
+
+def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(Faults(errors={10: 99})))
+    assert isinstance(ran.error, DeviceError)
+    ran.assert_good_file(10, "failed")
+    ran.assert_safe()
+    assert ran.of("scan_done")[0].data["status"] == "failed"
+    assert ran.of("failed")[0].data["exit_code"] == 3
+
+
+def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:
+    class Full(NXtomoWriter):
+        def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+            if frame.index == at:
+                raise failure
+            super().append(frame, digest, flags)
+
+    return Full
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [DataError("the disk is full. The first 8 frames are safe in scan.h5."), OSError(errno.ENOSPC, "No space left")],
+)
+def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, failure))
+    ran = Ran(tmp_path, Instrument(), "scan.angles.views=200", "scan.period_s=0.05")
+    assert isinstance(ran.error, DataError)
+    assert re.search(r"first 8 frames are safe in .*scan\.h5", str(ran.error))
+    ran.assert_good_file(8, "failed")
+    ran.assert_safe()
+    assert ran.instrument.stage.position() == pytest.approx(100 * COUNT)  # the devices are well: back to the start
+    assert ran.of("failed")[0].data["exit_code"] == 5
+
+
+def test_logs_on_a_full_disk_do_not_hide_why_the_run_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A text file writes what it still holds when it is closed, and then it is closed in vain."""
+
+    class FullLog(io.StringIO):
+        def flush(self) -> None:
+            raise OSError(errno.ENOSPC, "No space left")
+
+        def close(self) -> None:
+            raise OSError(errno.ENOSPC, "No space left")
+
+    usual = Path.open
+
+    def opened(path: Path, mode: str = "r", *args: object, **kwargs: object) -> object:
+        return FullLog() if path.suffix in (".jsonl", ".log") else usual(path, mode, *args, **kwargs)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(Path, "open", opened)
+    monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
+    ran = Ran(tmp_path, Instrument())
+    assert str(ran.error) == "the first 8 frames are safe."
+    ran.assert_good_file(8, "failed")
+
+
+def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    ran = Ran(tmp_path, instrument := Instrument())
+    assert isinstance(ran.error, DataError)
+    assert re.search(
+        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing has moved", str(ran.error)
+    )
+    assert not instrument.is_open
+
+
+def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import threading
+
+    free = threading.Event()
+
+    class Hanging(NXtomoWriter):
+        def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+            if frame.index == 6:
+                free.wait(60)
+            super().append(frame, digest, flags)
+
+    monkeypatch.setattr(module, "NXtomoWriter", Hanging)
+    monkeypatch.setattr(recorder_module, "STALL", 0.05)
+    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))
+    try:
+        ran = Ran(tmp_path, Instrument())
+    finally:
+        free.set()
+    assert isinstance(ran.error, DataError)
+    assert "took no frame" in str(ran.error)
+    ran.assert_safe()
+
+
+def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Path) -> None:
+    """Half a turn in 6 views is 3000 counts of the stage; a view every 2200 s would be 1.36 counts a second."""
+    ran = Ran(tmp_path, Instrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.result.flags == {}
+    with h5py.File(ran.result.path) as file:
+        times = file["entry/frame_log/time"][5:11]
+        assert file["entry/record/period"][()] == pytest.approx(3000)
+        assert json.loads(file["entry/record/plan"][()])["period_s"] == 2200
+    np.testing.assert_allclose(np.diff(times), 3000, atol=1e-3)
+
+
+def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, Instrument(Faults(repeats={9, 10, 11})))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    assert ran.result.flags == {"stuck": 3}
+    assert [(e.data["check"], e.data["view"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
+    with h5py.File(ran.folder / "scan.h5") as file:
+        flags = file["entry/frame_log/flags"][()]
+    assert np.flatnonzero(flags).tolist() == [9, 10, 11]
+    assert flags[9] == (1 << 2) | (1 << 18)
+
+
+def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))  # on a virtual clock the writer would be far behind
+    ran = Ran(
+        tmp_path, Instrument(Faults(repeats={9})), "monitor.on_alarm=stop", "scan.angles.views=60", "scan.period_s=0.1"
+    )
+    assert type(ran.error) is ScanStopped
+    assert "stuck check raised an alarm" in str(ran.error)
+    done = ran.of("scan_done")[0].data
+    assert done["status"] == "stopped"
+    assert 10 <= done["n_frames"] < 20
+    ran.assert_safe()
+
+
+def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(recorder_module.monitor, "watch", broken)
+    ran = Ran(tmp_path, Instrument())
+    assert ran.error is None
+    ran.assert_good_file(19, "complete")
+    assert ["monitor failed at row 0" in event.data["message"] for event in ran.of("warning")] == [True]
+
+
+def test_an_interpreter_interrupt_closes_the_file_too(tmp_path: Path) -> None:
+    def interrupt(number: int) -> None:
+        if number == 10:
+            raise KeyboardInterrupt
+
+    ran = Ran(tmp_path, Instrument(on_frame=interrupt))
+    assert isinstance(ran.error, KeyboardInterrupt)
+    ran.assert_good_file(10, "failed")
+    ran.assert_safe()
+
+
+def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise DeviceError("stage", "its port does not close")
+
+    bench = replace(Instrument().bench(), close=fail)
+    monkeypatch.setattr(module, "connect", lambda config, ask, heed: bench)
+    events: list[Event] = []
+    with pytest.raises(DeviceError, match="does not close"):
+        run_scan(small(), tmp_path, [events.append])
+    done = [event.data for event in events if event.event == "scan_done"]
+    assert [(data["status"], data["n_frames"]) for data in done] == [("complete", 19)]
+
+
+def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
+    config = load(
+        config_folder() / "simulated.yaml",
+        [
+            *SMALL,
+            "scan.angles.views=30",
+            "devices.stage.low_deg=-30",
+            "scan.period_s=0.3",
+            "simulation.clock=virtual",
+            "scan.exposure_s=0.05",
+        ],
+        environment={},
+    )
+    result = run_scan(config, tmp_path)
+    assert (result.n_frames, result.missing) == (37, ())
+    assert result.flags == {}  # noise, hot pixels, zingers and a drifting beam profile are no findings
+    with open_scan(result.path) as source:
+        views = source.image_key == FrameKind.PROJECTION
+        np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
+        flats, darks = (source.read(np.flatnonzero(source.image_key == kind)).mean() for kind in (1, 2))
+        assert flats > darks + 1000
+
+
+@pytest.mark.parametrize("preview_bin", [1, 3])
+def test_the_bytes_foretold_are_what_the_file_takes(tmp_path: Path, preview_bin: int) -> None:
+    overrides = [*SMALL, "simulation.clock=virtual", "devices.stage.low_deg=-60", f"storage.preview_bin={preview_bin}"]
+    config = load(config_folder() / "simulated.yaml", overrides, environment={})
+    events: list[Event] = []
+    result = run_scan(config, tmp_path, [events.append])
+    foretold = next(event.data["total_bytes"] for event in events if event.event == "run_started")
+    assert 0 < result.bytes - foretold < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_the_duration_foretold_is_what_it_takes(tmp_path: Path, mode: str) -> None:
+    """From the stage's zero through a quarter turn away from it and back, with darks and flats at both ends."""
+    angles = "scan.angles={scheme: sector, views: 12, first_deg: 200, last_deg: 290}"
+    overrides = [*SMALL, f"scan.mode={mode}", angles, "simulation.clock=virtual", "scan.darks.at=both"]
+    overrides += ["devices.camera.roi=[1148, 2028, 8, 40]", "scan.flats.exposure_s=0.5"]
+    config = load(config_folder() / "simulated.yaml", overrides, environment={})
+    with connect(config) as bench:
+        began = bench.clock.now()
+        events: list[Event] = []
+        run_scan(config, tmp_path, [events.append], bench=bench)
+        seconds = bench.clock.now() - began
+        assert bench.devices.stage.position() == 0.0
+    foretold = next(event.data["duration"] for event in events if event.event == "run_started")
+    assert foretold == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
+
+
+def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:
+    """A cylinder about the axis, Beer-Lambert without effects: 2 mu sqrt(r^2 - u^2) in each column, from every side."""
+    radius, attenuation, pitch = 0.05, 5.0, 4e-3
+    overrides = [
+        *SMALL,
+        "scan.mode=step",
+        "scan.flats.exposure_s=0.005",
+        "devices.camera.roi=[1148, 2028, 8, 40]",
+        f"optics.pixel_size_um={pitch * 1e3}",
+        "simulation.clock=virtual",
+        "simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.05, height: 9.0,"
+        " attenuation: 5.0}]}, beam: {photons_per_s: 3.0e+5}}",
+    ]
+    result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
+    assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
+    with open_scan(result.path) as source:
+        selection = Selection(axis_col=19.5, correction=CorrectionSettings(air="none"))
+        prepared = prepare(source, selection, pytest.fail)
+        assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
+    u = (np.arange(40) - 19.5) * pitch
+    expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))
+    # 14 000 counts in a flat of 5 ms, rounded to a half: 4e-5 of its light.
+    np.testing.assert_allclose(prepared.projections.data, np.broadcast_to(expected, (12, 8, 40)), atol=1e-4)
+
+
+@pytest.mark.parametrize("below", ["", "deeper/still"])
+def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> None:
+    (tmp_path / "runs").write_text("a file")
+    instrument = Instrument()
+    with pytest.raises(ConfigError, match="there is a file at"):
+        run_scan(small(), tmp_path / "runs" / below, bench=instrument.bench())
+    assert instrument.log == []
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (InstrumentError("x"), 3),
+        (DeviceError("stage", "x"), 3),
+        (ConfigError("x"), 2),
+        (KeyboardInterrupt(), 130),
+        (ZeroDivisionError(), 1),
+    ],
+)
+def test_exit_codes(error: BaseException, code: int) -> None:
+    assert module.exit_code(error) == code

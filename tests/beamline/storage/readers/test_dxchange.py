@@ -1,0 +1,141 @@
+"""Data Exchange: three separate stacks seen as one scan; nothing about it is guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.open import open_scan
+from drivers.frame import Frame, FrameKind
+
+Parts = dict[str, np.ndarray]
+
+
+@pytest.fixture
+def parts(rng: np.random.Generator) -> Parts:
+    return {
+        "data": rng.integers(0, 900, (5, 4, 6)).astype(np.uint16),
+        "data_white": rng.integers(900, 1000, (3, 4, 6)).astype(np.uint16),
+        "data_dark": rng.integers(0, 10, (2, 4, 6)).astype(np.uint16),
+        "theta": np.linspace(0, 180, 5),
+    }
+
+
+def store(path: Path, parts: Parts, units: str | None = "deg") -> Path:
+    with h5py.File(path, "w") as file:
+        for name, values in parts.items():
+            file[f"exchange/{name}"] = values
+        if units is not None and "theta" in parts:
+            file["exchange/theta"].attrs["units"] = units
+    return path
+
+
+def test_darks_then_flats_then_projections(tmp_path: Path, parts: Parts) -> None:
+    with open_scan(store(tmp_path / "s.h5", parts)) as source:
+        assert (source.format, source.quantity, source.finished) == ("data_exchange", "counts", True)
+        assert source.image_key.tolist() == [2, 2, 1, 1, 1, 0, 0, 0, 0, 0]
+        whole = np.concatenate([parts["data_dark"], parts["data_white"], parts["data"]])
+        np.testing.assert_array_equal(source.read(slice(None)), whole)
+        np.testing.assert_array_equal(source.read([9, 0, 4, 5, 2], slice(1, 3)), whole[[9, 0, 4, 5, 2], 1:3])
+        np.testing.assert_allclose(source.angles[5:], np.linspace(0, np.pi, 5))
+        assert np.isnan(source.angles[:5]).all()
+        replayed = list(source.frames())
+    assert [frame.trigger for frame in replayed] == [0, 1, 0, 1, 2, 0, 1, 2, 3, 4]
+    assert [frame.kind for frame in replayed[:3]] == [FrameKind.DARK, FrameKind.DARK, FrameKind.FLAT]
+    np.testing.assert_array_equal(replayed[7].counts, parts["data"][2])
+
+
+def test_float_references_keep_their_fractions(tmp_path: Path, parts: Parts) -> None:
+    parts["data_white"] = parts["data_white"].astype(np.float32) + 0.25
+    with open_scan(store(tmp_path / "s.h5", parts)) as source:
+        assert source.dtype == np.float32
+        np.testing.assert_array_equal(source.read([2])[0], parts["data_white"][0])
+        with pytest.raises(DataError, match="uint16"):
+            next(source.frames())
+
+
+@pytest.mark.parametrize(
+    ("units", "factor"), [("deg", np.pi / 180), ("degrees", np.pi / 180), (None, np.pi / 180), ("rad", 1.0)]
+)
+def test_theta_is_in_degrees_unless_it_says_radians(
+    tmp_path: Path, parts: Parts, units: str | None, factor: float
+) -> None:
+    with open_scan(store(tmp_path / "s.h5", parts, units)) as source:
+        np.testing.assert_allclose(source.angles[5:], parts["theta"] * factor)
+
+
+@pytest.mark.parametrize("missing", [("data_white",), ("data_dark",), ("data_white", "data_dark")])
+def test_without_references_the_quantity_is_unknown_until_it_is_said(
+    tmp_path: Path, parts: Parts, missing: tuple[str, ...]
+) -> None:
+    path = store(tmp_path / "s.h5", {name: values for name, values in parts.items() if name not in missing})
+    with open_scan(path) as source:
+        assert source.quantity == "unknown"
+    with open_scan(path, quantity="line_integrals") as source:
+        assert source.quantity == "line_integrals"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"theta": None}, "no /exchange/theta"),
+        ({"theta": np.zeros(4)}, "4 angles for 5 projections"),
+        ({"data_white": np.zeros((3, 4, 5))}, r"/exchange/data_white \(3, 4, 5\)"),
+        ({"data": np.zeros((4, 6))}, r"expected frames \[frame, row, col\]"),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    tmp_path: Path, parts: Parts, change: dict[str, np.ndarray | None], said: str
+) -> None:
+    changed = {name: values for name, values in (parts | change).items() if values is not None}
+    with pytest.raises(DataError, match=said):
+        open_scan(store(tmp_path / "s.h5", changed))
+
+
+def test_wrong_units_of_theta_are_refused(tmp_path: Path, parts: Parts) -> None:
+    with pytest.raises(DataError, match="units 'mm'"):
+        open_scan(store(tmp_path / "s.h5", parts, "mm"))
+
+
+def test_our_own_exchange_view_reads_like_the_scan(
+    write: Callable[[list[Frame]], Path], frames: list[Frame], tmp_path: Path
+) -> None:
+    """A reader that knows only Data Exchange sees the same frames as one that knows NXtomo."""
+    path = write(frames)
+    with open_scan(path) as native, h5py.File(path, "r") as file, h5py.File(tmp_path / "only_dx.h5", "w") as other:
+        for name in file["exchange"]:
+            other[f"exchange/{name}"] = file["exchange"][name][()]
+        other["exchange/theta"].attrs["units"] = "deg"
+        expected, angles = native.read(slice(None)), native.angles
+    with open_scan(tmp_path / "only_dx.h5") as source:
+        np.testing.assert_array_equal(source.read(slice(None)), expected)
+        np.testing.assert_allclose(source.angles, angles)
+
+
+def test_real_files(shared_data: Path) -> None:
+    with open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as source:
+        assert (source.shape, source.quantity, source.dtype) == ((135, 160), "counts", np.float32)
+        np.testing.assert_allclose(np.degrees(source.angles[[2, -1]]), [-88.2, 91.8], atol=1e-3)
+    with open_scan(shared_data / "aps2bm_tooth_181x2x640.h5") as source:
+        assert np.bincount(source.image_key).tolist() == [181, 10, 10]
+        assert source.attributes["sample"] == "Tooth"
+    with open_scan(shared_data / "walnut_parallel_rebinned_240x96x256.h5") as source:
+        assert source.quantity == "unknown"
+        assert source.pixel_size_mm == pytest.approx(0.152172, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "said"), [("S3", "text"), ("c8", "complex numbers"), ("?", "true and false"), ([("a", "f4")], "records")]
+)
+@pytest.mark.parametrize("name", ["data", "data_dark", "theta"])
+def test_what_is_no_real_number_is_refused(tmp_path: Path, parts: Parts, name: str, dtype: object, said: str) -> None:
+    parts[name] = np.zeros(parts[name].shape, dtype)  # type: ignore[call-overload]
+    path = store(tmp_path / "s.h5", parts)
+    with pytest.raises(DataError) as error:
+        open_scan(path)
+    assert str(error.value) == f"/exchange/{name} in {path} holds {said}; expected whole or real numbers."

@@ -1,0 +1,267 @@
+"""Reading NXtomo: replay gives back the frames; foreign files are read by their structure, and never guessed at."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.core.errors import DataError
+from beamline.monitor.digest import digest
+from beamline.storage.readers.open import NotReadyError, open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.frame import Frame, FrameKind
+from tests.beamline.storage.conftest import INFO, StandingClock
+
+Write = Callable[[list[Frame]], Path]
+
+
+@st.composite
+def scans(draw: st.DrawFn) -> list[Frame]:
+    shape = draw(st.tuples(st.integers(1, 9), st.integers(1, 9)))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    return [
+        Frame(
+            counts=rng.integers(0, 65536, shape).astype(np.uint16),
+            kind=draw(st.sampled_from(FrameKind)),
+            index=i,
+            trigger=draw(st.integers(0, 2**40)),
+            framestamp=draw(st.integers(-1, 2**40)),
+            angle=draw(st.floats(-20, 20) | st.just(np.nan)),
+            time=draw(st.floats(0, 4e9)),
+            exposure=draw(st.floats(1e-6, 1e4)),
+        )
+        for i in range(draw(st.integers(0, 6)))
+    ]
+
+
+@settings(max_examples=25, deadline=None)
+@given(frames=scans(), flush_every=st.integers(1, 4))
+def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) -> None:
+    shape = frames[0].counts.shape if frames else (2, 3)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scan.h5"
+        with NXtomoWriter(path, INFO, shape, clock=StandingClock(), flush_every=flush_every) as writer:
+            for frame in frames:
+                writer.append(frame, digest(frame.counts))
+        with open_scan(path) as source:
+            found = list(source.frames())
+    assert len(found) == len(frames)
+    for a, b in zip(found, frames, strict=True):
+        np.testing.assert_array_equal(a.counts, b.counts)
+        assert a.counts.dtype == np.uint16
+        assert (a.kind, a.index, a.trigger, a.framestamp) == (b.kind, b.index, b.trigger, b.framestamp)
+        assert (a.time, a.exposure) == (b.time, b.exposure)
+        np.testing.assert_allclose(a.angle, b.angle, rtol=1e-15)  # degrees in the file
+
+
+def test_what_the_file_says_about_the_scan(write: Write, frames: list[Frame]) -> None:
+    with open_scan(write(frames)) as source:
+        assert source.format == "nxtomo"
+        assert (source.quantity, source.dtype, source.shape) == ("counts", np.uint16, (12, 16))
+        assert (source.pixel_size_mm, source.energy_kev, source.axis_col) == (0.0046, 25.0, 7.25)
+        assert source.finished
+        assert source.attributes["sample"] == "battery"
+        assert source.attributes["distance_mm"] == 100.0
+        assert source.attributes["exposure_s"] == 0.05
+
+
+def test_each_frame_has_its_own_exposure(tmp_path: Path, write: Write, frames: list[Frame]) -> None:
+    own = [replace(frame, exposure=0.01 * (frame.index + 1)) for frame in frames]
+    with open_scan(write(own)) as source:
+        np.testing.assert_allclose(source.exposures, 0.01 * np.arange(1, 15))
+    with open_scan(tmp_path / "scan.h5", flats=np.ones((2, 12, 16), np.uint16)) as source:
+        np.testing.assert_allclose(source.exposures, [np.nan] * 2 + [frame.exposure for frame in own])
+    with open_scan(foreign(tmp_path / "ms.nxs")) as source:
+        np.testing.assert_allclose(source.exposures, np.full(6, 0.02))
+    for values, expected in (([20.0], [0.02] * 6), ([0, 0, 0, 20, 20, 20], [np.nan] * 3 + [0.02] * 3)):
+        with h5py.File(foreign(tmp_path / "f.nxs"), "r+") as file:
+            del file["entry1/tomo_entry/instrument/detector/count_time"]
+            file["entry1/tomo_entry/instrument/detector/count_time"] = values
+            file["entry1/tomo_entry/instrument/detector/count_time"].attrs["units"] = "ms"
+        with open_scan(tmp_path / "f.nxs") as source:
+            np.testing.assert_allclose(source.exposures, expected)
+
+
+def test_frames_come_in_the_order_asked_for(write: Write, frames: list[Frame]) -> None:
+    everything = np.stack([frame.counts for frame in frames])
+    with open_scan(write(frames)) as source:
+        for wanted in ([3, 1, 2, 3], [-1, 0], np.arange(4, 9), [], slice(2, 9, 3), slice(None, None, -1)):
+            np.testing.assert_array_equal(
+                source.read(wanted), everything[wanted if isinstance(wanted, slice) else np.array(wanted, int)]
+            )
+        np.testing.assert_array_equal(source.read([5, 4], slice(2, 7)), everything[[5, 4], 2:7])
+        with pytest.raises(IndexError, match=r"only 0\.\.13"):
+            source.read([14])
+        with pytest.raises(IndexError, match="whole numbers"):
+            source.read([0.5])
+
+
+def foreign(path: Path, *, units: str | None = "degree", dtype: str = "u2", entry: str = "entry1/tomo_entry") -> Path:
+    """An NXtomo as others write it: other entry name, no record of ours."""
+    with h5py.File(path, "w") as file:
+        group = file.create_group(entry)
+        group["definition"] = "NXtomo"
+        group["instrument/detector/data"] = np.arange(6 * 4 * 5).reshape(6, 4, 5).astype(dtype)
+        group["instrument/detector/image_key"] = [2, 1, 0, 0, 0, 3]
+        group["instrument/detector/count_time"] = np.full(6, 20.0)
+        group["instrument/detector/count_time"].attrs["units"] = "ms"
+        group["instrument/detector/x_pixel_size"] = 2.5e-6
+        group["instrument/detector/x_pixel_size"].attrs["units"] = "m"
+        group["instrument/beam/incident_energy"] = 30500.0
+        group["instrument/beam/incident_energy"].attrs["units"] = "eV"
+        group["sample/rotation_angle"] = [0.0, 0, 0, 90, 180, 180]
+        if units is not None:
+            group["sample/rotation_angle"].attrs["units"] = units
+    return path
+
+
+def test_a_foreign_nxtomo_in_savus_place(tmp_path: Path) -> None:
+    with open_scan(foreign(tmp_path / "f.nxs")) as source:
+        np.testing.assert_allclose(source.angles[2:5], [0, np.pi / 2, np.pi])
+        assert source.pixel_size_mm == pytest.approx(0.0025)
+        assert source.energy_kev == pytest.approx(30.5)
+        assert source.axis_col is None
+        replayed = list(source.frames())
+        assert [frame.trigger for frame in replayed] == [0, 0, 0, 1, 2, 0]
+        assert replayed[3].exposure == pytest.approx(0.02)
+        assert (replayed[3].framestamp, np.isnan(replayed[3].time)) == (-1, True)
+
+
+def test_radians_are_taken_as_radians(tmp_path: Path) -> None:
+    with open_scan(foreign(tmp_path / "f.nxs", units="rad")) as source:
+        assert source.angles[3] == 90
+
+
+@pytest.mark.parametrize(("units", "said"), [(None, "no units attribute"), ("mm", "units 'mm'")])
+def test_angles_without_a_unit_are_refused_unless_the_caller_brings_angles(
+    tmp_path: Path, units: str | None, said: str
+) -> None:
+    path = foreign(tmp_path / "f.nxs", units=units)
+    with pytest.raises(DataError, match=said):
+        open_scan(path)
+    with open_scan(path, angles=[0.0, 1.0, 2.0]) as source:
+        np.testing.assert_array_equal(source.angles, [np.nan, np.nan, 0, 1, 2, np.nan])
+
+
+def test_float_frames_are_of_unknown_quantity_and_no_frames_of_a_camera(tmp_path: Path) -> None:
+    with open_scan(foreign(tmp_path / "f.nxs", dtype="f4")) as source:
+        assert source.quantity == "unknown"
+        with pytest.raises(DataError, match="uint16"):
+            next(source.frames())
+
+
+def test_counts_that_do_not_agree_are_named(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.nxs")
+    with h5py.File(path, "r+") as file:
+        del file["entry1/tomo_entry/instrument/detector/image_key"]
+        file["entry1/tomo_entry/instrument/detector/image_key"] = [0, 0]
+    with pytest.raises(DataError, match="6 frames, 2 image keys and 6 angles"):
+        open_scan(path)
+
+
+def test_several_entries_need_a_default(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.nxs", entry="entry0000")
+    with h5py.File(path, "r+") as file:
+        file.copy("entry0000", "entry0001")
+        file["entry0001/sample/rotation_angle"][...] = 7
+    with pytest.raises(DataError, match="several tomography entries"):
+        open_scan(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["default"] = "entry0001"
+    with open_scan(path) as source:
+        np.testing.assert_allclose(source.angles, np.radians(7))
+
+
+def test_frames_in_a_linked_file_that_is_gone(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.nxs")
+    with h5py.File(path, "r+") as file, h5py.File(tmp_path / "pixels.h5", "w") as pixels:
+        detector = file["entry1/tomo_entry/instrument/detector"]
+        pixels["data"] = detector["data"][()]
+        del detector["data"]
+        detector["data"] = h5py.ExternalLink("pixels.h5", "data")
+    with open_scan(path) as source:
+        assert source.read([5])[0, -1, -1] == 119
+    (tmp_path / "pixels.h5").unlink()
+    with pytest.raises(DataError, match=r"pixels\.h5:data is not there"):
+        open_scan(path)
+
+
+def test_virtual_frames_of_a_file_that_is_gone_are_no_zeros(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.nxs")
+    with h5py.File(path, "r+") as file, h5py.File(tmp_path / "pixels.h5", "w") as pixels:
+        detector = file["entry1/tomo_entry/instrument/detector"]
+        pixels["data"] = detector["data"][()]
+        del detector["data"]
+        virtual = h5py.VirtualLayout((6, 4, 5), "u2")
+        virtual[:] = h5py.VirtualSource(pixels["data"])
+        detector.create_virtual_dataset("data", virtual)
+    with open_scan(path) as source:
+        assert source.read([5])[0, -1, -1] == 119
+    (tmp_path / "pixels.h5").unlink()
+    with pytest.raises(DataError, match=r"draws its frames from .*pixels\.h5, which is not there"):
+        open_scan(path)
+
+
+def test_a_file_that_is_not_there_yet_can_be_waited_for(tmp_path: Path) -> None:
+    with pytest.raises(NotReadyError, match="is not there"):
+        open_scan(tmp_path / "soon.h5", follow=True)
+    (tmp_path / "soon.h5").write_bytes(b"")
+    with pytest.raises(NotReadyError, match="cannot be followed yet"):
+        open_scan(tmp_path / "soon.h5", follow=True)
+
+
+def test_diamond_nexus_with_external_links(shared_data: Path) -> None:
+    with open_scan(shared_data / "fixtures" / "diad_k11-18014.nxs") as source:
+        assert (source.format, source.shape, source.quantity) == ("diamond_nexus", (22, 26), "counts")
+        assert np.bincount(source.image_key).tolist() == [3001, 100, 100]
+        assert np.isnan(source.angles).all()  # they are in a file that did not come with it
+        assert "gts_theta_value_set" in str(source.attributes["angles"])
+        with h5py.File(shared_data / "fixtures" / "k11-18014" / "k11-18014-imaging.h5") as pixels:
+            np.testing.assert_array_equal(source.read([0, 3200]), pixels["entry/detector/detector"][[0, 3200]])
+    angles = np.linspace(0, np.pi, 3001)
+    with open_scan(shared_data / "fixtures" / "diad_k11-18014.nxs", angles=angles) as source:
+        np.testing.assert_array_equal(source.angles[source.image_key == 0], angles)
+
+
+def test_esrf_nxtomo(shared_data: Path) -> None:
+    with open_scan(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx") as source:
+        assert source.format == "nxtomo"
+        assert [int((source.image_key == kind).sum()) for kind in (0, 1, 2, -1)] == [11, 2, 2, 5]
+        assert (source.pixel_size_mm, source.energy_kev) == (pytest.approx(6.69e-4), 26.0)
+        assert source.axis_col is None  # 0.0 in the file, which counts from the middle
+        np.testing.assert_allclose(np.degrees(source.angles[4:15]), np.linspace(0, 360, 11), atol=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "said"), [("S3", "text"), ("c8", "complex numbers")])
+@pytest.mark.parametrize(
+    "where", ["instrument/detector/data", "instrument/detector/image_key", "sample/rotation_angle"]
+)
+def test_what_is_no_real_number_is_refused(
+    write: Write, frames: list[Frame], where: str, dtype: str, said: str
+) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        shape, attributes = file["entry"][where].shape, dict(file["entry"][where].attrs)
+        del file["entry"][where]
+        file["entry"][where] = np.zeros(shape, dtype)
+        file["entry"][where].attrs.update(attributes)
+    with pytest.raises(DataError, match=rf"^/entry/{where} in .* holds {said}; expected whole or real numbers\.$"):
+        open_scan(path)
+
+
+def test_exposures_that_are_text_are_not_known(write: Write, frames: list[Frame]) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        del file["entry/instrument/detector/count_time"]
+        file["entry/instrument/detector/count_time"] = np.full(len(frames), b"long")
+        file["entry/instrument/detector/count_time"].attrs["units"] = "s"
+    with open_scan(path) as source:
+        assert np.isnan(source.exposures).all()

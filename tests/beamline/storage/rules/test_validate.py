@@ -1,0 +1,326 @@
+"""Each rule against a file that breaks it, and against one that breaks nothing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.monitor.digest import digest
+from beamline.storage.describe import describe
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import reconstruction_blockers, validate
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.frame import Frame, FrameKind
+from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
+
+Write = Callable[[list[Frame]], Path]
+DETECTOR = "entry/instrument/detector"
+ANGLE = "entry/sample/rotation_angle"
+
+
+def found(path: Path, **how: object) -> set[tuple[str, str]]:
+    return {(finding.severity, finding.rule) for finding in validate(path, **how)}  # type: ignore[arg-type]
+
+
+def test_a_good_scan_has_no_finding(write: Write, frames: list[Frame]) -> None:
+    assert validate(write(frames)) == []
+
+
+def test_exposures_that_do_not_go_together_are_told(write: Write, frames: list[Frame]) -> None:
+    def told(seconds: dict[FrameKind, float], last: float = 0.05) -> list[str]:
+        changed = [replace(frame, exposure=seconds.get(frame.kind, 0.05)) for frame in frames]
+        changed[-1] = replace(changed[-1], exposure=last)
+        path = write(changed)
+        said = [finding.message for finding in validate(path) if finding.rule == "exposures"]
+        path.unlink()
+        return said
+
+    assert told({FrameKind.FLAT: 0.01}) == []
+    assert told({FrameKind.DARK: 0.05000001}) == []
+    (darks,) = told({FrameKind.DARK: 0.2})
+    assert "darks were exposed for 0.2 s and the projections for 0.05 s" in darks
+    (views,) = told({}, last=0.1)
+    assert "exposed for 0.05 to 0.1 s" in views
+
+
+def swap(file: h5py.File, path: str, values: object, **attributes: str) -> None:
+    """Replace a dataset, also where NXdata links to it."""
+    old = file[path]
+    attrs = {name: old.attrs[name] for name in old.attrs} | attributes
+    name = path.rsplit("/", 1)[1]
+    del file[path]
+    file[path] = values
+    for key, value in attrs.items():
+        file[path].attrs[key] = value
+    if name in file["entry/data"]:
+        del file["entry/data"][name]
+        file["entry/data"][name] = file[path]
+
+
+def no_definition(file: h5py.File) -> None:
+    del file["entry/definition"]
+
+
+def float_frames(file: h5py.File) -> None:
+    swap(file, f"{DETECTOR}/data", file[f"{DETECTOR}/data"][()].astype(np.float32))
+
+
+def short_key(file: h5py.File) -> None:
+    swap(file, f"{DETECTOR}/image_key", file[f"{DETECTOR}/image_key"][:-2])
+
+
+def code_seven(file: h5py.File) -> None:
+    file[f"{DETECTOR}/image_key"][4] = 7
+
+
+def short_angles(file: h5py.File) -> None:
+    swap(file, ANGLE, file[ANGLE][:-1])
+
+
+def no_units(file: h5py.File) -> None:
+    del file[ANGLE].attrs["units"]
+
+
+def wrong_units(file: h5py.File) -> None:
+    file[ANGLE].attrs["units"] = "mm"
+
+
+def nan_angle(file: h5py.File) -> None:
+    file[ANGLE][8] = np.nan
+
+
+def one_direction(file: h5py.File) -> None:
+    file[ANGLE][5:] = 30.0
+
+
+def limited(file: h5py.File) -> None:
+    file[ANGLE][5:] = np.linspace(0, 90, 9)
+
+
+def no_target(file: h5py.File) -> None:
+    del file[f"{DETECTOR}/data"].attrs["target"]
+
+
+def false_target(file: h5py.File) -> None:
+    file[f"{DETECTOR}/data"].attrs["target"] = "/entry/digest/preview"
+
+
+def no_link(file: h5py.File) -> None:
+    del file["entry/data/image_key"]
+
+
+def copied_link(file: h5py.File) -> None:
+    del file["entry/data/data"]
+    file["entry/data/data"] = file[f"{DETECTOR}/data"][()]
+
+
+def dot_axes(file: h5py.File) -> None:
+    file["entry/data"].attrs["axes"] = ["rotation_angle", ".", "."]
+
+
+def turned_axes(file: h5py.File) -> None:
+    file["entry/data"].attrs["axes"] = ["y", "x", "rotation_angle"]
+
+
+def no_name(file: h5py.File) -> None:
+    del file["entry/sample/name"]
+
+
+def german_time(file: h5py.File) -> None:
+    file["entry/end_time"][()] = "20.11.2026 5 Uhr"
+
+
+def ends_first(file: h5py.File) -> None:
+    file["entry/end_time"][()] = "2020-01-01T00:00:00+00:00"
+
+
+def time_back(file: h5py.File) -> None:
+    file["entry/frame_log/time"][6] -= 10
+
+
+def repeated_stamp(file: h5py.File) -> None:
+    file["entry/frame_log/framestamp"][9] = 3
+
+
+def skipped_stamp(file: h5py.File) -> None:
+    file["entry/frame_log/framestamp"][9:] += 2
+
+
+def stuck(file: h5py.File) -> None:
+    file["entry/digest/checksum"][9] = file["entry/digest/checksum"][8]
+
+
+def counted_too_many(file: h5py.File) -> None:
+    file["entry/progress/frames_committed"][()] = 99
+
+
+def not_finished(file: h5py.File) -> None:
+    file["entry/progress/finished"][()] = 0
+
+
+def stopped(file: h5py.File) -> None:
+    file["entry/progress/status"][()] = b"stopped"
+
+
+def lost_triggers(file: h5py.File) -> None:
+    file["entry/progress/missing_triggers"].resize(2, 0)
+
+
+def no_beam(file: h5py.File) -> None:
+    pixels = file[f"{DETECTOR}/data"]
+    pixels[2:5] = pixels[()][[0, 1, 0]] + np.uint16(3)
+
+
+def dead_projections(file: h5py.File) -> None:
+    file[f"{DETECTOR}/data"][5:] = 65535
+
+
+def huge_pixels(file: h5py.File) -> None:
+    file[f"{DETECTOR}/x_pixel_size"].attrs["units"] = "m"
+    file[f"{DETECTOR}/x_pixel_size"][()] = 4.6
+
+
+@pytest.mark.parametrize(
+    ("spoil", "severity", "rule", "said"),
+    [
+        (no_definition, "warning", "definition", "expected 'NXtomo'"),
+        (float_frames, "error", "integer-frames", "float32"),
+        (short_key, "error", "key-length", "12 entries for 14 frames"),
+        (code_seven, "error", "key-codes", r"\[7\]"),
+        (short_angles, "error", "angle-length", "13 angles for 14 frames"),
+        (no_units, "error", "angle-units", "no units attribute"),
+        (wrong_units, "error", "angle-units", "'mm'"),
+        (nan_angle, "error", "angles", "1 of 9 projections .* frame 8"),
+        (one_direction, "error", "angle-spread", "All 9 projections are at 30 degrees"),
+        (limited, "warning", "angle-spread", "90.00 degrees"),
+        (no_target, "warning", "links", "no @target"),
+        (false_target, "warning", "links", "something else"),
+        (no_link, "warning", "links", "image_key is not there"),
+        (copied_link, "warning", "links", "another dataset"),
+        (dot_axes, "warning", "axes", "no float dataset"),
+        (turned_axes, "warning", "axes", "expected rotation_angle"),
+        (no_name, "warning", "names", "sample/name"),
+        (german_time, "warning", "iso-times", "not ISO 8601"),
+        (ends_first, "warning", "iso-times", "before it starts"),
+        (time_back, "error", "time-order", "frame 6, by 9.88 s"),
+        (repeated_stamp, "error", "framestamps", "frame 9, framestamp 3 after 3"),
+        (skipped_stamp, "warning", "framestamps", "2 frames .* frame 9"),
+        (stuck, "warning", "stuck-frames", r"first: 9\)"),
+        (counted_too_many, "error", "unfinished", "99 frames .* 14 are there"),
+        (not_finished, "warning", "unfinished", "14 frames can be trusted"),
+        (stopped, "warning", "unfinished", "'stopped'"),
+        (lost_triggers, "warning", "missing-frames", "2 triggers"),
+        (no_beam, "error", "no-beam", "was the shutter open"),
+        (dead_projections, "error", "pixels", "is 65535"),
+        (huge_pixels, "error", "pixel-size", "4600 mm"),
+    ],
+)
+def test_each_rule_finds_what_it_is_for(
+    write: Write, frames: list[Frame], spoil: Callable[[h5py.File], None], severity: str, rule: str, said: str
+) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        spoil(file)
+    hits = [finding for finding in validate(path) if finding.rule == rule]
+    assert hits, f"found only {found(path)}"
+    assert hits[0].severity == severity
+    assert re.search(said, hits[0].message), hits[0].message
+    others = {(finding.severity, finding.rule) for finding in validate(path)} - {(severity, rule)}
+    assert not {other for other in others if other[0] == "error"} or spoil is float_frames
+
+
+def test_missing_references(write: Write, frames: list[Frame]) -> None:
+    projections = [replace(frame, index=i) for i, frame in enumerate(frames[5:])]
+    hits = [finding for finding in validate(write(projections)) if finding.rule == "references"]
+    assert [finding.severity for finding in hits] == ["error", "error"]
+    assert "without flats" in hits[0].message
+    assert "without darks" in hits[1].message
+
+
+def test_one_view_is_no_scan(write: Write, frames: list[Frame]) -> None:
+    assert ("error", "views") in found(write(frames[:6]))
+
+
+def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Frame]) -> None:
+    """Interlaced passes arm the camera once each: the count starts again at 0 within the projections."""
+    again = [replace(frame, framestamp=(frame.framestamp % 4)) for frame in frames]
+    assert validate(write(again)) == []
+    lost = [replace(frame, index=i) for i, frame in enumerate(again[:9] + again[10:])]  # the first of the second pass
+    assert [frame.framestamp for frame in lost[5:]] == [0, 1, 2, 3, 1, 2, 3, 0]
+    assert validate(write(lost, "lost.h5")) == []  # type: ignore[call-arg]
+    back = [replace(frame, trigger=0, framestamp=0) if frame.index == 12 else frame for frame in frames]
+    assert ("error", "framestamps") in found(write(back, "back.h5"))  # type: ignore[call-arg]
+
+
+def test_degrees_that_are_radians(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+    with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
+        for frame in frames[:5]:
+            writer.append(frame, digest(frame.counts))
+        for i in range(40):
+            frame = replace(frames[5], index=5 + i, framestamp=i, angle=np.radians(i * np.pi / 39))
+            frame.counts[0, 0] = i
+            writer.append(frame, digest(frame.counts))
+    hits = [finding for finding in validate(tmp_path / "s.h5") if finding.rule == "angle-spread"]
+    assert "radians" in hits[0].message
+
+
+def test_float_frames_that_are_all_nan(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data"] = np.full((4, 5, 6), np.nan, np.float32)
+        file["exchange/theta"] = [0.0, 60, 120, 180]
+    assert ("error", "pixels") in found(tmp_path / "s.h5", quantity="line_integrals")
+    assert ("error", "quantity") in found(tmp_path / "s.h5")
+
+
+def test_what_cannot_be_opened_is_a_finding(tmp_path: Path) -> None:
+    (tmp_path / "s.h5").write_bytes(b"no HDF5")
+    assert found(tmp_path / "s.h5") == {("error", "readable")}
+    assert found(tmp_path / "nowhere.h5") == {("error", "readable")}
+    with h5py.File(tmp_path / "empty.h5", "w"):
+        pass
+    assert found(tmp_path / "empty.h5") == {("error", "readable")}
+
+
+def test_a_growing_file_can_be_validated(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    assert found(tmp_path / "s.h5") == {("warning", "unfinished")}
+    writer.close()
+
+
+def test_describe(write: Write, frames: list[Frame]) -> None:
+    said = describe(write(frames))
+    assert said["format"] == "nxtomo"
+    assert said["kinds"] == {"projection": 9, "flat": 3, "dark": 2}
+    assert (said["first_angle_deg"], said["last_angle_deg"]) == (0, pytest.approx(180))
+    assert said["step_deg"] == pytest.approx(22.5)
+    assert (said["quantity"], said["exposure_s"], said["missing_triggers"]) == ("counts", 0.05, 0)
+    assert said["findings"] == []
+    assert said["reconstructable"] is True
+
+
+def test_the_beamless_scan_is_refused(shared_data: Path) -> None:
+    with open_scan(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx") as source:
+        blockers = reconstruction_blockers(source)
+    assert [finding.rule for finding in blockers] == ["no-beam"]
+    assert "must not be reconstructed" in blockers[0].message
+    assert describe(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx")["reconstructable"] is False
+
+
+def test_real_scans_can_be_reconstructed(shared_data: Path) -> None:
+    for name, how in (
+        ("diamond_24737_parallel_91x135x160.h5", {}),
+        ("diamond_24737_tiff_series.zip", {"angle_rows": "10:101"}),
+        ("aps2bm_tooth_181x2x640.h5", {}),
+        ("walnut_parallel_rebinned_240x96x256.h5", {"quantity": "line_integrals"}),
+    ):
+        with open_scan(shared_data / name, **how) as source:  # type: ignore[arg-type]
+            assert reconstruction_blockers(source) == [], name
+            assert int((source.image_key == FrameKind.PROJECTION).sum()) >= 91

@@ -1,0 +1,345 @@
+"""The writer: what it writes, what it refuses, and what is left when its process is killed."""
+
+from __future__ import annotations
+
+import gc
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.monitor.digest import digest
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers import layout
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.frame import Frame, FrameKind
+from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, StandingClock
+
+Write = Callable[[list[Frame]], Path]
+
+
+def test_paths_types_and_units_of_nxtomo(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        entry = file["entry"]
+        assert entry["definition"][()] == b"NXtomo"
+        assert entry["title"][()] == b"a test"
+        data = entry["instrument/detector/data"]
+        assert data.dtype == np.dtype("<u2")
+        assert data.chunks == (1, *SHAPE)
+        np.testing.assert_array_equal(data[()], [frame.counts for frame in frames])
+        np.testing.assert_array_equal(entry["instrument/detector/image_key"][()], [2, 2, 1, 1, 1, *[0] * 9])
+        angle = entry["sample/rotation_angle"]
+        assert angle.attrs["units"] == "degree"
+        np.testing.assert_allclose(angle[5:], np.linspace(0, 180, 9))
+        assert np.isnan(angle[:5]).all()
+        for path, value, unit in (
+            ("instrument/detector/x_pixel_size", 0.0046, "mm"),
+            ("instrument/detector/y_pixel_size", 0.0046, "mm"),
+            ("instrument/detector/distance", 100.0, "mm"),
+            ("instrument/beam/incident_energy", 25.0, "keV"),
+            ("record/axis_col", 7.25, "pixel"),
+        ):
+            assert (entry[path][()], entry[path].attrs["units"]) == (value, unit)
+        classes = {name: item.attrs["NX_class"] for name, item in entry.items() if isinstance(item, h5py.Group)}
+        assert classes["instrument"] == "NXinstrument"
+        assert classes["sample"] == "NXsample"
+        assert classes["data"] == "NXdata"
+        assert entry["instrument/devices/stage/counts_per_turn"][()] == 360000
+        assert entry["record/plan"][()] == b'{"views": 9}'
+
+
+def test_nxdata_holds_hard_links_that_name_their_target(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        nxdata = file["entry/data"]
+        assert nxdata.attrs["signal"] == "data"
+        assert list(nxdata.attrs["axes"]) == ["rotation_angle", "y", "x"]
+        for name in ("data", "rotation_angle", "image_key"):
+            assert isinstance(nxdata.get(name, getlink=True), h5py.HardLink)
+            assert file[nxdata[name].attrs["target"]] == nxdata[name]
+        np.testing.assert_allclose(nxdata["x"][()], np.arange(SHAPE[1]) * 0.0046)
+        assert nxdata["y"].shape == (SHAPE[0],)
+
+
+def test_times_are_iso_8601(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        for name in ("start_time", "end_time"):
+            said = datetime.fromisoformat(file["entry"][name][()].decode())
+            assert said == datetime.fromtimestamp(EPOCH, UTC)
+
+
+def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: StandingClock) -> None:
+    """Variable-length text written under SWMR is not (h5py issue 1273); ours is all made before, or of fixed length."""
+    writer = NXtomoWriter(tmp_path / "s.h5", replace(INFO, sample="Prüfkörper µ"), SHAPE, clock=clock)
+    look = (
+        "import h5py, sys\n"
+        "found = []\n"
+        "with h5py.File(sys.argv[1], 'r', swmr=True) as file:\n"
+        "    def see(name, item):\n"
+        "        found.extend(str(value) for value in item.attrs.values())\n"
+        "        if isinstance(item, h5py.Dataset) and item.shape == ():\n"
+        "            found.append(item.asstr()[()] if h5py.check_string_dtype(item.dtype) else str(item[()]))\n"
+        "    file.visititems(see)\n"
+        "sys.stdout.buffer.write(chr(10).join(found).encode())"
+    )
+    done = subprocess.run([sys.executable, "-c", look, str(tmp_path / "s.h5")], capture_output=True, timeout=60)
+    said = done.stdout.decode().splitlines()
+    assert done.returncode == 0, done.stderr.decode()
+    assert {"Prüfkörper µ", "NXtomo", "running", "NXentry", "degree", "PM16C"} <= set(said)
+    writer.close()
+
+
+def test_a_file_that_cannot_be_laid_out_is_not_left_half_made(tmp_path: Path, clock: StandingClock) -> None:
+    info = replace(INFO, devices={"stage": {"model": object()}})  # type: ignore[dict-item]
+    with pytest.raises(TypeError):
+        NXtomoWriter(tmp_path / "s.h5", info, SHAPE, clock=clock)
+    assert list(tmp_path.iterdir()) == []
+    NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock).close()
+
+
+def test_digest_and_preview_are_stored_beside_the_frame(write: Write, frames: list[Frame]) -> None:
+    with h5py.File(write(frames)) as file:
+        for i, frame in enumerate(frames):
+            expected = digest(frame.counts)
+            np.testing.assert_array_equal(file["entry/digest/preview"][i], expected.preview)
+            for name in ("minimum", "maximum", "mean", "variance", "sum_abs", "entropy", "checksum"):
+                assert file[f"entry/digest/{name}"][i] == getattr(expected, name)
+
+
+def test_exchange_view_shows_the_same_frames_and_moves_with_the_file(
+    write: Write, frames: list[Frame], tmp_path: Path
+) -> None:
+    frames = [*frames, replace(frames[2], index=14, trigger=0, framestamp=0)]  # a flat at the end: two runs of flats
+    path = write(frames)
+    (tmp_path / "elsewhere").mkdir()
+    path = path.rename(tmp_path / "elsewhere" / "moved.h5")
+    with h5py.File(path) as file:
+        for name, kind in (
+            ("data", FrameKind.PROJECTION),
+            ("data_white", FrameKind.FLAT),
+            ("data_dark", FrameKind.DARK),
+        ):
+            assert file["exchange"][name].is_virtual
+            expected = [frame.counts for frame in frames if frame.kind is kind]
+            np.testing.assert_array_equal(file["exchange"][name][()], expected)
+        np.testing.assert_allclose(file["exchange/theta"][()], np.linspace(0, 180, 9))
+        assert file["exchange/theta"].attrs["units"] == "deg"
+        assert file["implements"][()] == b"exchange"
+
+
+def test_a_stopped_scan_has_a_view_of_the_rows_that_exist(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    for frame in frames[:7]:
+        writer.append(frame, digest(frame.counts))
+    clock.sleep(10)
+    writer.close("stopped", missing=[7, 9])
+    writer.close("complete")  # the second close changes nothing
+    assert writer.remarks == []
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert file["exchange/data"].shape == (2, *SHAPE)
+        assert file["entry/progress/status"][()] == b"stopped"
+        assert file["entry/progress/missing_triggers"][()].tolist() == [7, 9]
+        assert file["entry/progress/frames_committed"][()] == 7
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.attributes["status"], source.attributes["missing_triggers"]) == ("stopped", 2)
+
+
+def test_an_empty_scan_is_still_a_file(tmp_path: Path, clock: StandingClock) -> None:
+    NXtomoWriter(tmp_path / "s.h5", ScanInfo("nothing"), SHAPE, clock=clock).close("failed")
+    with open_scan(tmp_path / "s.h5") as source:
+        assert source.refresh() == 0
+        assert source.read(slice(None)).shape == (0, *SHAPE)
+        assert source.pixel_size_mm is None
+
+
+def test_an_alignment_frame_is_a_projection_to_those_who_do_not_know_it(write: Write, frames: list[Frame]) -> None:
+    path = write([*frames, replace(frames[-1], index=14, kind=FrameKind.ALIGNMENT)])
+    with h5py.File(path) as file:
+        assert file["entry/instrument/detector/image_key"][14] == 0
+        assert file["entry/instrument/detector/image_key_control"][14] == -1
+        assert file["exchange/data"].shape[0] == 9
+    with h5py.File(write(frames, "plain.h5")) as file:  # type: ignore[call-arg]
+        assert "image_key_control" not in file["entry/instrument/detector"]
+    with open_scan(path) as source:
+        assert source.image_key[14] == FrameKind.ALIGNMENT
+
+
+def test_an_exception_inside_leaves_a_failed_but_readable_file(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    with (
+        pytest.raises(RuntimeError, match="camera"),
+        NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer,
+    ):
+        writer.append(frames[0], digest(frames[0].counts))
+        raise RuntimeError("camera unplugged")
+    with open_scan(tmp_path / "s.h5") as source:
+        assert source.attributes["status"] == "failed"
+        np.testing.assert_array_equal(source.read([0])[0], frames[0].counts)
+
+
+def test_never_overwrites(tmp_path: Path, clock: StandingClock) -> None:
+    path = tmp_path / "s.h5"
+    path.write_bytes(b"precious")
+    with pytest.raises(DataError, match="never overwrites"):
+        NXtomoWriter(path, INFO, SHAPE, clock=clock)
+    assert path.read_bytes() == b"precious"
+    with pytest.raises(DataError, match="cannot be created"):
+        NXtomoWriter(tmp_path / "no" / "folder.h5", INFO, SHAPE, clock=clock)
+
+
+def test_wrong_frames_are_refused_and_nothing_is_written(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+    good = frames[1]
+    for bad, said in (
+        (replace(good, counts=good.counts[:-1]), r"uint16 \(11, 16\), expected uint16 \(12, 16\)"),
+        (replace(good, counts=good.counts.astype(np.float32)), "float32"),
+        (replace(good, counts=good.counts.astype(np.int16)), "int16"),
+        (replace(good, index=2), "index is 2, expected 1"),
+        (replace(good, index=0), "index is 0, expected 1"),
+    ):
+        with pytest.raises(DataError, match=said):
+            writer.append(bad, digest(good.counts))
+    with pytest.raises(DataError, match="preview"):
+        writer.append(good, digest(good.counts, preview_bin=2))
+    with pytest.raises(DataError, match="32-bit"):
+        writer.append(good, digest(good.counts), flags=-1)
+    with pytest.raises(ValueError, match="Status"):
+        writer.close("splendid")
+    assert (writer.rows, writer.committed) == (1, 1)
+    writer.close()
+    with pytest.raises(DataError, match="closed"):
+        writer.append(good, digest(good.counts))
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert {file[path].shape[0] for path in layout.COLUMNS} == {1}
+        assert file["entry/instrument/detector/data"].shape[0] == 1
+
+
+def test_rows_only_grow(tmp_path: Path, frames: list[Frame]) -> None:
+    """Writing an earlier row again keeps those after it."""
+    with h5py.File(tmp_path / "s.h5", "x") as file:
+        layout.create(file, INFO, SHAPE, np.dtype("<u2"), quantity="counts", preview_bin=4, start=None)
+        rows = layout.Rows(file)
+        for row in (0, 1, 2, 0):
+            counts = frames[row].counts
+            rows.write(row, counts, digest(counts), layout.Record(frames[row].kind, 0.0))
+        assert {file[path].shape[0] for path in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {3}
+
+
+def test_a_disk_that_takes_no_more_is_named_and_the_rows_before_stay(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer._table, "write", full)
+        with pytest.raises(DataError, match=r"s\.h5 could not.*No space left.*are free.*first 1 frames are safe in it"):
+            writer.append(frames[1], digest(frames[1].counts))
+    with pytest.raises(DataError, match="earlier write failed"):
+        writer.append(frames[1], digest(frames[1].counts))
+    writer.close()
+    assert not writer.remarks
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
+
+
+def no_room(call: str = "take") -> RuntimeError:
+    """As h5py tells of a full disk where it has no number for it."""
+    return RuntimeError(
+        f"Can't {call} (file write failed: time = Fri Nov 20 06:31:51 2026\n, filename = 'scan.h5', "
+        "file descriptor = 5, errno = 28, error message = 'No space left on device', buf = 0x5, offset = 7)"
+    )
+
+
+def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_committed(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To close the file would be to write once more what the disk did not take, with a traceback for each id."""
+    path = tmp_path / "s.h5"
+    writer = NXtomoWriter(path, INFO, SHAPE, clock=clock)
+    for frame in frames[:2]:
+        writer.append(frame, digest(frame.counts))
+
+    def full(*_: object) -> None:
+        raise no_room()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer._table, "write", full)
+        with pytest.raises(DataError, match=r"could not take the frame \(No space left on device\)"):
+            writer.append(frames[2], digest(frames[2].counts))
+        patch.setattr(h5py.File, "close", full)
+        patch.setattr(h5py.File, "flush", full)
+        writer.close()
+    gc.collect()  # what other tests left open must not be counted
+    opened = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL)
+    del writer
+    gc.collect()
+    assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL) == opened
+    code = (
+        "import sys; from beamline.storage.readers.open import open_scan\n"
+        "with open_scan(sys.argv[1]) as s: "
+        "print(s.image_key.size, s.finished, s.attributes['status'], s.read([1]).sum())"
+    )
+    said = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["2", "True", "failed", str(frames[1].counts.sum())]
+
+
+def test_a_disk_that_is_full_when_the_scan_ends_is_named(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+
+    def full(*_: object) -> None:
+        raise no_room()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.File, "flush", full)
+        with pytest.raises(DataError, match=r"s\.h5 could not be finished \(No space.*first 1 frames are safe"):
+            writer.close()
+    writer.close()
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
+
+
+def test_no_view_is_begun_where_there_is_no_room_for_it(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    writer.append(frames[0], digest(frames[0].counts))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000_000))
+    writer.close()
+    assert len(writer.remarks) == 1
+    assert "no /exchange view (only 5 MB are free on its disk). Its 1 frames are safe" in writer.remarks[0]
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert "exchange" not in file
+        assert file[layout.STATUS][()] == b"complete"
+
+
+def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
+    tmp_path: Path, clock: StandingClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise no_room()
+
+    monkeypatch.setattr(layout, "create", full)
+    with pytest.raises(DataError, match=r"s\.h5 cannot be begun \(No space left on device\)"):
+        NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,149 @@
+"""Reconstruction files: whole or absent, never overwritten, and everything comes back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.storage.writers import recon_file
+from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction, write_reconstruction
+from recon.base.volume import Grid, Volume
+
+
+def _record(shape: tuple[int, int, int] = (3, 4, 5), voxel: float = 0.25) -> ReconRecord:
+    data = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
+    return ReconRecord(
+        volume=Volume(data, Grid(shape, voxel, (0.5, 0.0, -1.0))),
+        length_unit="mm",
+        raw_file="scan.h5",
+        title="a test",
+        sample="battery",
+        time=1795150000.0,
+        parameters={"axis_col": 85.75, "views": np.array([0, 2, 4]), "method": "r2", "seed": 3, "densify": True},
+        metrics={"psnr": 31.5},
+        history={"step": np.array([0, 10]), "loss": np.array([1.0, 0.5])},
+    )
+
+
+def test_follows_nxtomoproc(tmp_path: Path) -> None:
+    """Paths and classes as the NXtomoproc definition lists them."""
+    write_reconstruction(tmp_path / "out.h5", _record())
+    with h5py.File(tmp_path / "out.h5") as file:
+        classes = {
+            "entry": "NXentry",
+            "entry/instrument": "NXinstrument",
+            "entry/instrument/source": "NXsource",
+            "entry/sample": "NXsample",
+            "entry/reconstruction": "NXprocess",
+            "entry/reconstruction/parameters": "NXparameters",
+            "entry/data": "NXdata",
+        }
+        assert {path: file[path].attrs["NX_class"] for path in classes} == classes
+        assert file["entry/definition"].asstr()[()] == "NXtomoproc"
+        assert file["entry/reconstruction/parameters/raw_file"].asstr()[()] == "scan.h5"
+        assert file["entry/reconstruction/date"].asstr()[()] == "2026-11-20T04:46:40+00:00"
+        data = file["entry/data/data"]
+        assert (data.dtype, data.shape, data.attrs["units"]) == (np.float32, (3, 4, 5), "1/mm")
+        assert list(file["entry/data"].attrs["axes"]) == ["z", "y", "x"]
+        np.testing.assert_allclose(file["entry/data/z"][:], 0.5 + 0.25 * np.array([-1, 0, 1]))
+        assert file["entry/data/x"].attrs["units"] == "mm"
+
+
+@given(
+    shape=st.tuples(*[st.integers(1, 4)] * 3),
+    voxel=st.floats(1e-4, 10),
+)
+@settings(max_examples=10, deadline=None)
+def test_everything_comes_back(
+    tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], voxel: float
+) -> None:
+    path = tmp_path_factory.mktemp("recon") / "out.h5"
+    written = _record(shape, voxel)
+    write_reconstruction(path, written)
+    read = read_reconstruction(path)
+    np.testing.assert_array_equal(read.volume.data, written.volume.data)
+    assert read.volume.grid.centre == pytest.approx(written.volume.grid.centre)
+    if max(shape) > 1:
+        assert read.volume.grid.voxel_size == pytest.approx(voxel)
+    np.testing.assert_array_equal(read.parameters["views"], [0, 2, 4])
+    scalars = ("axis_col", "method", "seed", "densify")
+    assert {k: read.parameters[k] for k in scalars} == {k: written.parameters[k] for k in scalars}
+    assert read.metrics == written.metrics
+    np.testing.assert_array_equal(read.history["loss"], [1.0, 0.5])
+    assert (read.raw_file, read.title, read.sample, read.time) == ("scan.h5", "a test", "battery", written.time)
+
+
+def test_never_overwrites(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    path.write_text("precious")
+    with pytest.raises(DataError, match="never overwritten"):
+        write_reconstruction(path, _record())
+    assert path.read_text() == "precious"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_refuses_a_file_that_appeared_meanwhile(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    with pytest.raises(DataError, match="never overwritten"), whole_file(path) as partial:
+        partial.write_text("ours")
+        path.write_text("theirs")
+    assert path.read_text() == "theirs"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_replaces_in_one_step_when_asked(tmp_path: Path) -> None:
+    path = tmp_path / "snapshot.h5"
+    write_reconstruction(path, _record(), replace=True)
+    write_reconstruction(path, replace(_record(), title="newer"), replace=True)
+    assert read_reconstruction(path).title == "newer"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_the_system_does_not_let_go_of_is_left_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows, where nothing replaces a file that a viewer holds open."""
+    path = tmp_path / "snapshot.h5"
+    write_reconstruction(path, _record())
+
+    def held(self: Path, target: Path) -> Path:
+        raise PermissionError(13, "it is being used by another process")
+
+    monkeypatch.setattr(Path, "replace", held)
+    with pytest.raises(DataError, match=r"another process.*untouched"):
+        write_reconstruction(path, replace(_record(), title="newer"), replace=True)
+    assert read_reconstruction(path).title == _record().title
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(entry: h5py.Group, record: ReconRecord) -> None:
+        entry["definition"] = "NXtomoproc"
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(recon_file, "_write_entry", full_disk)
+    with pytest.raises(DataError, match="No space left"):
+        write_reconstruction(tmp_path / "out.h5", _record())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="does not exist"):
+        write_reconstruction(tmp_path / "no" / "out.h5", _record())
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["entry/data/data"] = np.zeros((2, 2, 2))
+    for name in ("text.h5", "other.h5", "missing.h5"):
+        with pytest.raises(DataError, match="cannot be read as a reconstruction"):
+            read_reconstruction(tmp_path / name)

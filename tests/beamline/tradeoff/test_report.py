@@ -1,0 +1,98 @@
+"""The trade-off's table in words, CSV, JSON and on a page: the same figures everywhere, and conclusions that add up."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from beamline.core.machine import machine
+from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
+from beamline.tradeoff.table import Table
+from beamline.tradeoff.trials import Depth, Outcome, Trial, plan
+
+BASE = Trial("method", "fbp", 10)
+FIT = Trial("method", "r2", 10, steps=100, gaussians=2000)
+
+
+def _table(*outcomes: Outcome, by: str = "psnr") -> Table:
+    return Table(outcomes, by, "mm", machine(), {"file": "a <b>.h5"}, "beamline tradeoff 'a <b>.h5'")
+
+
+def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
+    return Outcome(trial, "done", seconds, memory, {"psnr": psnr, "ssim3d": 0.5})
+
+
+@pytest.mark.parametrize("depth", ["quick", "full"])
+def test_the_table_fits_into_120_columns(depth: Depth) -> None:
+    """Also with four-digit numbers of views, and with everything that can be measured."""
+    metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784, "resolution": 0.6221}
+    methods = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
+    outcomes = tuple(
+        Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4)
+        for trial in plan(methods, 1801, 200_000, depth)
+    )
+    said = text(Table(outcomes, "psnr", "mm", machine(), {}, ""))
+    rows = said.split("\n\n")[1].splitlines()[1:]
+    assert len(rows) == sum(o.trial.group != "precision" for o in outcomes)
+    assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's
+    head = next(line for line in said.splitlines() if line.startswith("  trial"))
+    assert {len(row) for row in rows} == {len(head)}
+    assert all(" 12346 " in row and " 40000 " in row for row in rows)
+
+
+def test_each_further_decibel_is_told_with_its_price() -> None:
+    worse = replace(FIT, group="steps", steps=50)
+    table = _table(_done(BASE, 2.0, 20.0), _done(FIT, 12.0, 24.0), _done(worse, 13.0, 23.0))
+    quality, fastest, step = conclusions(table)
+    assert quality == "Quality: PSNR, dB."
+    assert fastest == "Fastest: fbp, 10 views: 20.00 dB in 2 s."
+    assert step == "+4.00 dB for 10 s more (2.5 s a dB): r2, 10 views, 100 steps, 2k Gaussians."
+    assert conclusions(_table())[-1] == "No trial has both a time and a quality."
+
+
+def test_a_held_out_residual_is_told_in_decibels_below_the_data() -> None:
+    judged = Outcome(BASE, "done", 1.0, None, {"residual_held_out": 0.1})
+    table = _table(judged, by="residual_held_out")
+    assert table.qualities == [pytest.approx(20.0)]
+    assert "−20 log₁₀ of the held-out residual" in conclusions(table)[0]
+    row = next(line for line in text(table).splitlines() if line.startswith("* fbp"))
+    assert row.split()[-4:] == ["1.00", "n/a", "n/a", "0.1000"]  # s, CPU s, MB, residual: two are not known
+
+
+def test_csv_and_json_hold_what_was_measured_and_nothing_where_nothing_was(tmp_path: Path) -> None:
+    table = _table(_done(BASE, 2.0, math.inf), Outcome(FIT, "failed", message='no "room", said\nthe system'))
+    first, second = csv.DictReader(io.StringIO(to_csv(table)))
+    assert (first["seconds"], first["psnr"], first["ssim3d"], first["steps"]) == ("2.0", "", "0.5", "")
+    assert (second["status"], second["seconds"], second["gaussians"]) == ("failed", "", "2000")
+    assert second["message"] == 'no "room", said\nthe system'
+    write_table(tmp_path, table)
+    record = json.loads((tmp_path / "tradeoff.json").read_text(encoding="utf-8"))
+    assert [trial["metrics"].get("psnr") for trial in record["trials"]] == [None, None]
+    assert record["trials"][1]["trial"]["label"] == FIT.label
+    assert (tmp_path / "tradeoff.csv").read_text(encoding="utf-8") == to_csv(table)
+
+
+def test_the_page_shows_words_of_others_as_words() -> None:
+    page = to_html(_table(_done(BASE, 2.0, 20.0), Outcome(FIT, "failed", message="<script>")), [])
+    assert "<script>" not in page and "&lt;script&gt;" in page
+    assert "a <b>" not in page and "a &lt;b&gt;.h5" in page
+    assert f"<strong>{BASE.label}</strong>" in page and f"<strong>{FIT.label}" not in page
+    assert "1 of 2 trials" in page
+
+
+def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
+    write_figures(tmp_path, _table(Outcome(BASE, "failed")))
+    assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html"}
+    curve = ((0.1, 3.0), (0.2, 4.0))
+    write_figures(tmp_path, _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")))
+    assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html", "quality_seconds.png", "curves.png"}
+
+
+def test_what_is_not_finite_is_nothing() -> None:
+    assert finite({"a": [1, math.nan, (math.inf, "x")], 2: None}) == {"a": [1, None, [None, "x"]], "2": None}

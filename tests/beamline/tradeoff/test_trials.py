@@ -1,0 +1,90 @@
+"""The plan of a trade-off: every method once as it is, then one change at a time."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.tradeoff.trials import Outcome, Timed, Trial, decibels, plan, seconds_left, work
+
+METHODS = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
+CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
+VARIED = {
+    "views": {"views"}, "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"binning", "gaussians", "steps"},
+    "loss": {"loss"}, "start": {"start"}, "cut-off": {"sigmas"}, "iterations": {"iterations"},
+}  # fmt: skip
+
+
+@given(CHOICES, st.integers(2, 2000), st.integers(1, 400_000), st.sampled_from(["quick", "full"]))
+def test_one_change_at_a_time_about_each_methods_baseline(
+    methods: list[str], n_views: int, gaussians: int, depth: str
+) -> None:
+    trials = plan(methods, n_views, gaussians, depth)  # type: ignore[arg-type]
+    assert len(set(trials)) == len(trials)
+    bases = {t.method: t for t in trials if t.group == "method"}
+    assert list(bases) == methods == [t.method for t in trials[: len(methods)]]
+    assert all(base.halves and base.views == n_views for base in bases.values())
+    for trial in trials[len(methods) :]:
+        if trial.group == "precision":
+            continue
+        base = bases[trial.method]
+        changed = {f.name for f in fields(Trial) if getattr(trial, f.name) != getattr(base, f.name)}
+        assert changed - {"group", "halves"} <= VARIED[trial.group]
+        assert 2 <= trial.views <= n_views
+        assert not trial.halves
+    assert sum(t.group == "precision" for t in trials) == ("r2" in methods)
+
+
+def test_full_tries_more_than_quick() -> None:
+    quick, full = (plan(METHODS, 90, 50_000, depth) for depth in ("quick", "full"))
+    assert len(quick) < 0.7 * len(full)
+    assert sum(map(work, quick)) < 0.5 * sum(map(work, full))
+    assert len({t.label for t in full}) == len(full)
+
+
+def test_labels_say_what_is_not_the_default() -> None:
+    trial = Trial("method", "r2", 60, steps=500, gaussians=50_000)
+    assert trial.label == "r2, 60 views, 500 steps, 50k Gaussians"
+    assert replace(trial, sigmas=3.0, loss="l1", binning=2).label == (
+        "r2, 60 views, bin 2, 500 steps, 50k Gaussians, l1, cut at 3 σ"
+    )
+    assert replace(trial, start="tv").label == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
+    assert Trial("iterations", "sart", 9, iterations=1).label == "sart, 9 views, 1 iteration"
+    assert Trial("iterations", "sart", 9, iterations=30).label == "sart, 9 views, 30 iterations"
+
+
+@given(st.floats(0.1, 1e4), st.integers(1, 20), st.floats(0, 10))
+def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start: float) -> None:
+    base = Trial("method", "r2", 60, steps=100, gaussians=1000)
+    left = [replace(base, steps=100 * k) for k in range(1, n + 1)]
+    expected = n * start + speed * sum(map(work, left))
+    one = Timed(base, start + speed * work(base), speed * work(base))
+    assert seconds_left([one], left) == pytest.approx(expected)
+    assert seconds_left([one], []) == 0
+    assert seconds_left([], left) is None
+    # Of a method never tried nothing better is known than the mean of what was.
+    done = [Timed(base, 7.0, 4.0), Timed(base, 11.0, 8.0)]
+    assert seconds_left(done, [Trial("method", "fbp", 60)]) == pytest.approx(3 + 6)
+
+
+def test_where_the_time_of_a_trial_went() -> None:
+    trial = Trial("steps", "r2", 60, steps=100, gaussians=1000)
+    assert Timed.of(Outcome(trial, "done", 4.0), 7.0) == Timed(trial, 7.0, 4.0)
+    base = replace(trial, group="method", halves=True)
+    assert Timed.of(Outcome(base, "done", 4.0), 15.0).working == 12.0
+    assert Timed.of(Outcome(base, "done", 4.0), 10.0).working == 10.0
+    assert Timed.of(Outcome(trial, "failed"), 3.0) == Timed(trial, 3.0, 0.0)
+
+
+def test_quality_is_decibels_either_way_and_a_record_is_plain() -> None:
+    outcome = Outcome(Trial("method", "fbp", 4), "done", 1.0, metrics={"psnr": 30.0, "residual_held_out": 0.1})
+    assert outcome.quality("psnr") == 30
+    assert outcome.quality("residual_held_out") == pytest.approx(20)
+    assert math.isnan(Outcome(outcome.trial, "failed").quality("psnr"))
+    assert math.isnan(decibels("residual_held_out", 0.0))
+    assert json.loads(json.dumps(outcome.as_record()))["trial"]["label"] == "fbp, 4 views"

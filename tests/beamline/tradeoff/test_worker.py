@@ -1,0 +1,189 @@
+"""One trial: the arrays come through the file as they were, the figures are those of the volume it made."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from beamline.tradeoff import worker as module
+from beamline.tradeoff.data import Data
+from beamline.tradeoff.trials import Trial
+from beamline.tradeoff.worker import main, on_grid, run
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.voxels.fbp import fbp
+from recon.voxels.projector import data_residual
+from tests.beamline.scans import TwoCylinders
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+
+
+@pytest.fixture
+def data() -> Data:
+    views = Geometry.parallel(SCAN.angles, SCAN.shape, 0.5, SCAN.axis_col)
+    integrals = SCAN.line_integrals().astype(np.float32)
+    held = np.arange(3, 30, 9)
+    used = np.setdiff1d(np.arange(30), held)
+    half = TwoCylinders(SCAN.angles, SCAN.shape, SCAN.axis_col, 0.5)
+    return Data(
+        integrals[used], views.select(used), (integrals[held], views.select(held)), half.truth(Grid.matching(views))
+    )
+
+
+def _silent(line: object) -> None:
+    pass
+
+
+def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: Data) -> None:
+    found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0, _silent)
+    expected = fbp(data.projections, data.geometry, filter="hann")
+    assert data.truth is not None and data.held_out is not None
+    assert found["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
+    volume = Volume(expected, Grid.matching(data.geometry))
+    assert found["metrics"]["residual_held_out"] == pytest.approx(data_residual(volume, *data.held_out))
+    assert 2 * 0.5 <= found["metrics"]["resolution"] < 12  # between two voxels and the inner cylinder's size
+    assert found["peak_bytes"] is None or found["peak_bytes"] > 1e7
+    assert found["seconds"] > 0 and found["gaussians"] is None
+
+
+def test_fewer_views_are_worse_and_spread_over_all_angles(data: Data) -> None:
+    all_views, few = (run(Trial("views", "fbp", n, halves=False), data, 0, _silent)["metrics"] for n in (27, 9))
+    assert few["psnr"] < all_views["psnr"] - 1
+    assert "resolution" not in few
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"binning": 2}, {"loss": "l1"}, {"loss": "l2+ssim"}, {"loss": "poisson+ssim"}, {"sigmas": 2.5},
+     {"start": "tv"}],
+)  # fmt: skip
+def test_a_fit_with_each_setting(data: Data, change: dict[str, Any]) -> None:
+    said: list[Any] = []
+    trial = Trial("method", "r2", 27, steps=120, gaussians=150, **change)
+    found = run(trial, data, 0, said.append)
+    assert found["metrics"]["psnr"] > 15
+    assert found["gaussians"] >= 100 and found["curve_of"] == "views held out"
+    assert found["curve"][-1][1] > 15
+    assert said and said[0]["steps"] == 120
+    json.dumps(found)
+
+
+def test_a_fit_is_judged_by_views_that_it_does_not_see(data: Data) -> None:
+    """Its record ends with the residual of the views held out, and spoiling them changes nothing but that."""
+    trial = Trial("method", "r2", 27, steps=100, gaussians=150)
+    assert data.held_out is not None
+    spoilt = replace(data, held_out=(2 * data.held_out[0], data.held_out[1]))
+    kept, other = (run(trial, d, 0, _silent) for d in (data, spoilt))
+    assert kept["metrics"]["psnr"] == other["metrics"]["psnr"]
+    assert kept["curve"][-1][1] > other["curve"][-1][1] + 5
+
+
+@pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
+def test_iterations(data: Data, method: str) -> None:
+    few, more = (run(Trial("iterations", method, 27, iterations=n), data, 0, _silent) for n in (1, 4))
+    assert more["metrics"]["residual_held_out"] < few["metrics"]["residual_held_out"]
+    assert len(more["curve"]) == 4 and more["curve_of"] == "views used" and more["gaussians"] is None
+
+
+def test_the_two_precisions(data: Data) -> None:
+    found = run(Trial("precision", "r2", 27), data, 0, _silent)
+    assert found["details"]["difference"] < 0.1
+    assert found["seconds"] == found["details"]["seconds_float32"]
+
+
+def test_a_volume_of_joined_pixels_lies_where_the_fine_one_does() -> None:
+    fine = Geometry.parallel([0.0], (8, 12), 0.5)
+    coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)
+
+    def ramp(on: Grid) -> np.ndarray[Any, np.dtype[np.float32]]:
+        z, y, x = on.coordinates()
+        return (z[:, None, None] + 2 * y[:, None] - 3 * x).astype(np.float32)
+
+    moved = on_grid(Volume(ramp(coarse), coarse), grid)
+    inner = (slice(1, -1),) * 3  # a linear function is interpolated exactly where nothing is beyond the ends
+    np.testing.assert_allclose(moved.data[inner], ramp(grid)[inner], atol=1e-5)
+
+
+def _cone(data: Data, **leaning: float) -> Data:
+    """The same pixels as if they were a cone's."""
+    around = Geometry.cone(2 * data.geometry.angles, SCAN.shape, 1.0, 60.0, 120.0, SCAN.axis_col, **leaning)
+    return replace(data, geometry=around, held_out=None)
+
+
+@pytest.mark.parametrize("leaning", [{}, {"tilt": 0.1}])
+def test_a_job_may_be_to_compile(
+    tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    leaning: dict[str, float],
+) -> None:  # fmt: skip
+    """It compiles for the geometry of the data and says nothing, also of methods that do not take such views."""
+    _cone(data, **leaning).save(tmp_path / "data.npz")
+    trials = [Trial("method", "cgls", 60, iterations=10), Trial("method", "r2", 60, steps=500, gaussians=1000)]
+    job = {"data": str(tmp_path / "data.npz"), "compile": [asdict(trial) for trial in trials]}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    fitted: list[Geometry] = []
+    plain = module.reconstruct
+    monkeypatch.setattr(module, "reconstruct", lambda *said: fitted.append(said[2]) or plain(*said))
+    assert main(tmp_path / "job.json") == 0
+    assert capsys.readouterr().out == ""
+    assert len(fitted) == 2 and all(views.is_cone and views.is_straight != bool(leaning) for views in fitted)
+
+
+def test_trials_of_a_cone(data: Data) -> None:
+    cone = _cone(data)
+    views = cone.geometry.n_views
+    for trial in (Trial("method", "fbp", views), Trial("method", "r2", views, steps=5, gaussians=50)):
+        assert np.isfinite(run(trial, cone, 0, _silent)["metrics"]["psnr"])
+
+
+def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: Data, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views half a turn apart are not the same ones of a cone: neither may one half of them be half the circle."""
+    cone = _cone(data)
+    around = replace(cone, geometry=cone.geometry.at(np.linspace(0, 2 * np.pi, 27, endpoint=False)))
+    seen: list[NDArray[np.float64]] = []
+    plain = module.reconstruct
+    monkeypatch.setattr(module, "warm_up", lambda *_: None)
+    monkeypatch.setattr(module, "reconstruct", lambda *said: seen.append(said[2].angles) or plain(*said))
+    run(Trial("method", "fbp", 8, halves=True), around, 0, _silent)
+    for angles in seen:
+        gaps = np.diff(np.sort(angles), append=angles.min() + 2 * np.pi)
+        assert gaps.max() < 1.6 * 2 * np.pi / angles.size
+    assert [angles.size for angles in seen] == [8, 4, 4]
+
+
+def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys: pytest.CaptureFixture[str]) -> None:
+    data.save(tmp_path / "data.npz")
+    job = {"data": str(tmp_path / "data.npz"), "trial": asdict(Trial("method", "fbp", 27)), "seed": 0}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert main(tmp_path / "job.json") == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "result"
+    Data(np.zeros_like(data.projections), data.geometry, data.held_out, None).save(tmp_path / "data.npz")
+    job["trial"] = asdict(Trial("method", "r2", 27, steps=2, gaussians=10))
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert main(tmp_path / "job.json") == 1
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last["event"] == "failed" and "no matter" in last["message"]
+
+
+def test_it_ends_when_whoever_wanted_its_result_is_gone() -> None:
+    program = "import time; from beamline.tradeoff.worker import end_with; end_with(0); print('up', flush=True); "
+    command = [sys.executable, "-c", program + "time.sleep(100)"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment) as process:
+        assert process.stdin is not None and process.stdout is not None
+        assert process.stdout.readline().strip() == b"up"
+        assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(timeout=30) == 1

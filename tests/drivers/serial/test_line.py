@@ -1,0 +1,321 @@
+"""Serial line: framing, timeouts and finding the step again, on a wire that misbehaves."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+
+import pytest
+import serial
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.clock import SystemClock
+from drivers.errors import DeviceError, DeviceTimeout
+from drivers.serial.line import Probe, SerialLine
+from drivers.serial.transcript import TOLD_LINES
+from simulators.devices.clock import VirtualClock
+from simulators.wires.serial_url import register
+
+NAMES = (f"line-test-{number}" for number in itertools.count())
+NUMBER = r"-?\d+"
+
+
+class Echo:
+    """A device that answers "N?n" with n and "ID?" with "ECHO"; a test says what it sends instead, and when.
+
+    `spoil` maps the number of a request (from 0) to pieces (s after the request, bytes).
+    """
+
+    def __init__(self, spoil: dict[int, list[tuple[float, bytes]]] | None = None) -> None:
+        self.clock = VirtualClock(start=0.0)
+        self.heard: list[str] = []
+        self._spoil = spoil or {}
+        self._coming: list[tuple[float, bytes]] = []
+
+    def receive(self, data: bytes) -> None:
+        for line in data.decode().split("\r\n")[:-1]:
+            usual = {"ID?": "ECHO"}.get(line, line.removeprefix("N?")) if "?" in line else None
+            pieces = [(0.0, f"{usual}\r\n".encode())] if usual is not None else []
+            for delay, piece in self._spoil.get(len(self.heard), pieces):
+                self._coming.append((self.clock.now() + delay, piece))
+            self.heard.append(line)
+
+    def transmit(self) -> bytes:
+        due = [piece for time, piece in self._coming if time <= self.clock.now()]
+        self._coming = [(time, piece) for time, piece in self._coming if time > self.clock.now()]
+        return b"".join(due)
+
+
+def connect(echo: Echo, timeout: float = 1.0) -> SerialLine:
+    return SerialLine(
+        register(next(NAMES), echo),
+        device="echo",
+        probe=Probe("ID?", "ECHO"),
+        clock=echo.clock,
+        timeout=timeout,
+        baudrate=9600,
+        unsolicited="STOP[0-9A-F]",
+    )
+
+
+def ask(line: SerialLine, n: int) -> int:
+    return int(line.query(f"N?{n}", NUMBER, "a number", "Nothing has moved")[0])
+
+
+# in step
+
+
+@given(st.lists(st.integers(), max_size=10))
+def test_each_request_gets_its_own_reply(numbers: list[int]) -> None:
+    line = connect(Echo())
+    assert [ask(line, n) for n in numbers] == numbers
+
+
+def test_commands_without_a_reply_go_out_and_leave_the_line_in_step() -> None:
+    echo = Echo()
+    line = connect(echo)
+    line.send("GO")
+    assert ask(line, 5) == 5
+    assert echo.heard == ["GO", "N?5"]
+
+
+@given(st.lists(st.integers(1, 4), max_size=6))
+def test_a_reply_in_pieces_is_one_reply(sizes: list[int]) -> None:
+    whole, pieces = b"-12345\r\n", []
+    for k, size in enumerate(sizes):
+        pieces.append((0.1 * k, whole[:size]))
+        whole = whole[size:]
+    pieces.append((0.1 * len(sizes), whole))
+    assert ask(connect(Echo({0: pieces})), 0) == -12345
+
+
+def test_notes_that_nobody_asked_for_are_passed_over() -> None:
+    line = connect(Echo({0: [(0.0, b"STOPB\r\n7"), (0.1, b"7\r\nSTOP0\r\n")]}))
+    assert ask(line, 0) == 77
+    assert ask(line, 1) == 1
+
+
+class Crossing(Echo):
+    """Lets another thread go on between a request and its reply."""
+
+    def receive(self, data: bytes) -> None:
+        super().receive(data)
+        time.sleep(0)
+
+
+def test_threads_do_not_take_each_others_replies() -> None:
+    line = connect(Crossing())
+    wrong: list[int] = []
+
+    def many(first: int) -> None:
+        wrong.extend(n for n in range(first, first + 200) if ask(line, n) != n)
+
+    threads = [threading.Thread(target=many, args=(1000 * k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+# out of step
+
+
+def test_silence_is_a_timeout_that_says_all_there_is_to_know() -> None:
+    line = connect(Echo({0: []}), timeout=0.5)
+    with pytest.raises(DeviceTimeout) as error:
+        ask(line, 3)
+    assert (error.value.device, error.value.request, error.value.expected) == ("echo", "N?3", "a number")
+    assert "within 0.5 s" in str(error.value)
+    assert "Nothing has moved" in str(error.value)
+
+
+def test_the_timeout_is_for_the_whole_reply_however_it_trickles() -> None:
+    echo = Echo({0: [(0.3 * k, b"1") for k in range(100)]})
+    with pytest.raises(DeviceTimeout, match="Answered '1111'"):
+        ask(connect(echo, timeout=1.0), 3)
+    assert echo.clock.now() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_reply_that_is_whole_at_the_very_deadline_is_taken_or_not_but_never_taken_for_another() -> None:
+    """To the last millisecond it is the reply; beyond, a late one. From the deadline itself either is right."""
+    for late in (-0.06, -0.002, -0.001, 0.0, 0.001, 0.002, 0.06):
+        echo = Echo({0: [(0.0, b"1"), (0.5, b"1"), (1.0 + late, b"1\r\n")]})
+        line = connect(echo, timeout=1.0)
+        try:
+            assert ask(line, 111) == 111
+            assert late < 0.06
+        except DeviceTimeout:
+            assert late >= 0.0
+        assert [ask(line, n) for n in (222, 333)] == [222, 333]
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.049, 0.051, 0.1])
+def test_a_reply_byte_by_byte_is_whole_however_slowly_they_come(gap: float) -> None:
+    whole = b"-123456\r\n"
+    echo = Echo({0: [(gap * k, whole[k : k + 1]) for k in range(len(whole))]})
+    line = connect(echo, timeout=1.5)
+    assert ask(line, 0) == -123456
+    assert echo.clock.now() == pytest.approx(gap * (len(whole) - 1), abs=0.06)
+    assert ask(line, 7) == 7
+
+
+def test_a_late_reply_is_not_taken_for_the_next_ones() -> None:
+    line = connect(Echo({0: [(1.3, b"111\r\n")]}))
+    with pytest.raises(DeviceTimeout):
+        ask(line, 111)
+    assert ask(line, 222) == 222
+    assert ask(line, 333) == 333
+
+
+def test_a_reply_so_late_that_it_comes_between_probe_and_answer_is_passed_over() -> None:
+    line = connect(Echo({0: [(1.2, b"111\r\n")], 1: [(0.4, b"ECHO\r\n")]}))
+    with pytest.raises(DeviceTimeout):
+        ask(line, 111)
+    assert ask(line, 222) == 222
+
+
+def test_a_late_answer_to_an_earlier_probe_is_not_left_behind() -> None:
+    """The probe itself timed out once; its late answer ends the second probe, whose own must not meet a request."""
+    echo = Echo({0: [], 1: [(1.15, b"ECHO\r\n")], 2: [(0.08, b"ECHO\r\n")]})
+    line = connect(echo)
+    for _ in range(2):
+        with pytest.raises(DeviceTimeout):
+            ask(line, 1)
+    assert ask(line, 2) == 2
+    echo.clock.sleep(1.0)
+    assert ask(line, 3) == 3
+    assert echo.heard == ["N?1", "ID?", "ID?", "N?2", "N?3"]
+
+
+@pytest.mark.parametrize("reply", [b"\xff\x80garbage\r\n", b"\r\n", b"1 2\r\n", b"12\n\r\n", b"ECHO\r\n"])
+def test_a_reply_of_another_form_is_named_and_not_believed(reply: bytes) -> None:
+    echo = Echo({0: [(0.0, reply)]})
+    line = connect(echo)
+    with pytest.raises(DeviceError, match="does not have the form") as error:
+        ask(line, 1)
+    assert not isinstance(error.value, DeviceTimeout)
+    assert ask(line, 2) == 2
+    assert echo.heard == ["N?1", "ID?", "N?2"]
+
+
+def test_an_endless_line_is_given_up_long_before_the_timeout() -> None:
+    echo = Echo({0: [(0.0, b"x" * 5000)]})
+    line = connect(echo, timeout=100.0)
+    with pytest.raises(DeviceTimeout, match="no whole reply"):
+        ask(line, 1)
+    assert echo.clock.now() < 1.0
+    assert ask(line, 2) == 2
+
+
+def test_a_device_that_never_stops_sending_is_named() -> None:
+    line = connect(Echo({0: [(0.01 * k, b"x\r\n") for k in range(400)]}))
+    with pytest.raises(DeviceError):
+        ask(line, 1)
+    with pytest.raises(DeviceTimeout, match="without pause"):
+        ask(line, 2)
+
+
+def test_a_dead_device_is_named_again_at_each_request_until_it_answers() -> None:
+    line = connect(Echo({0: [], 1: [], 2: []}))
+    with pytest.raises(DeviceTimeout, match="no whole reply"):
+        ask(line, 1)
+    for _ in range(2):
+        with pytest.raises(DeviceTimeout, match="still no answer after an earlier failure"):
+            ask(line, 1)
+    assert ask(line, 4) == 4
+
+
+def test_a_command_without_reply_goes_out_at_once_even_out_of_step() -> None:
+    echo = Echo({0: []})
+    line = connect(echo)
+    with pytest.raises(DeviceTimeout):
+        ask(line, 1)
+    before = echo.clock.now()
+    line.send("STOP NOW")
+    assert (echo.heard[-1], echo.clock.now()) == ("STOP NOW", before)
+
+
+# what errors tell of the wire
+
+
+def test_an_error_tells_what_last_went_over_the_wire_and_when() -> None:
+    echo = Echo({1: [(0.25, b"4")]})
+    line = connect(echo)
+    ask(line, 7)
+    echo.clock.sleep(2.0)
+    with pytest.raises(DeviceTimeout) as error:
+        ask(line, 42)
+    *before, last = error.value.wire.split(", ")
+    assert [entry.split(" (")[0] for entry in (*before, last)] == ["> N?7", "< 7", "> N?42"]
+    ages = [float(entry.split("(")[1].split()[0]) for entry in (*before, last)]
+    assert ages == pytest.approx([3.0, 3.0, 1.0], abs=0.15)
+    assert str(error.value).endswith(f"On the wire: {error.value.wire}.")
+
+
+def test_a_device_that_stays_silent_is_told_with_the_request_that_it_first_missed() -> None:
+    line = connect(Echo({0: [], 1: []}))
+    with pytest.raises(DeviceTimeout):
+        ask(line, 1)
+    with pytest.raises(DeviceTimeout) as error:
+        ask(line, 2)
+    said = [entry.split(" (")[0] for entry in error.value.wire.split(", ")]
+    assert said == ["> N?1", "! out of step: probing", "> ID?"]
+
+
+def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
+    line = connect(Echo({9: [(0.0, b"x" * 900 + b"\r\n")]}))
+    for n in range(9):
+        ask(line, n)
+    with pytest.raises(DeviceError, match="does not have the form") as error:
+        ask(line, 9)
+    told = error.value.wire.split(", ")
+    assert len(told) == TOLD_LINES
+    assert told[0].startswith("> N?7 ")
+    assert told[-1].startswith("< " + "x" * 40 + "... (")
+    assert len(error.value.wire) < 300
+
+
+# the port
+
+
+@pytest.mark.parametrize("url", ["sim://nobody", "nonsense://x", "/no/such/port", "socket://127.0.0.1:1"])
+def test_a_port_that_does_not_open_is_named(url: str) -> None:
+    with pytest.raises(DeviceError, match="does not open") as error:
+        SerialLine(url, device="d", probe=Probe("ID?", ""), clock=SystemClock(), timeout=0.1, baudrate=9600)
+    assert url in str(error.value)
+    assert "Nothing was sent" in str(error.value)
+
+
+def test_a_port_that_vanishes_is_named_on_reading_and_on_writing() -> None:
+    class Unplugged(Echo):
+        gone = False
+
+        def receive(self, data: bytes) -> None:
+            if self.gone:
+                raise serial.SerialException("device disconnected")
+            super().receive(data)
+            self.gone = True
+
+        def transmit(self) -> bytes:
+            if self.gone:
+                raise serial.SerialException("device disconnected")
+            return b""
+
+    line = connect(Unplugged())
+    for _ in range(2):
+        with pytest.raises(DeviceError, match=r"port failed: device disconnected\. Asked 'N\?1'\. Expected a port"):
+            ask(line, 1)
+    with pytest.raises(DeviceError, match=r"port failed: device disconnected\. Asked 'GO'\. Expected a port"):
+        line.send("GO")
+
+
+def test_a_port_that_takes_no_bytes_is_a_timeout() -> None:
+    class Stuck(Echo):
+        def receive(self, data: bytes) -> None:
+            raise serial.SerialTimeoutException("write timeout")
+
+    with pytest.raises(DeviceTimeout, match=r"took no bytes.*Asked 'GO'\. Expected a device that takes.*may still be"):
+        connect(Stuck()).send("GO")

@@ -1,0 +1,263 @@
+"""PI GCS 2.0 driver: what is this controller's own; what every stage does stands in conformance."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import RotationStage
+from drivers.stages.pi_gcs.limits import limits_of
+from tests.drivers.stage_bench import LONG, SPEED
+from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+# opening and closing
+
+
+def test_it_is_a_rotation_stage_and_says_what_it_found(rig: Rig) -> None:
+    stage: RotationStage = rig.open()
+    described = stage.describe()
+    assert "C-863.12" in str(described["identity"])
+    assert (described["axis"], described["trigger_output"]) == ("1", "digital output 2")
+
+
+def test_opening_asks_who_it_is_switches_the_servo_on_and_the_trigger_off(rig: Rig) -> None:
+    rig.say("TRO 2 1")
+    rig.open()
+    assert rig.sent() == [
+        "*IDN?", "CSV?", "SAI?", "#5", "SPA? 1 0xE", "SPA? 1 0xF", "TRO 2 0", "TRO? 2", "SVO? 1", "SVO 1 1", "SVO? 1",
+        "ACC 1 60", "ACC? 1", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
+    ]  # fmt: skip
+    assert (rig.say("SVO?"), rig.say("TRO? 2")) == ("1=1", "2=0")
+
+
+def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) -> None:
+    rig.say("XYZ", b"MOV 1 5")
+    stage = rig.open()
+    assert stage.status().fault == ""
+    assert stage.position() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"axis": "2"}, r"no axis '2', but 1"),
+        ({"trigger_line": 7}, r"error 36.*trigger_line"),
+        ({"acceleration": 1e4}, r"error 17.*acceleration"),
+        ({"counts_per_turn": 100_000}, r"counts 90000 a turn, which is no multiple of the configured 100000"),
+        ({"counts_per_turn": 0}, "a turn cannot have 0 counts"),
+        ({"max_speed": 0.0}, "no speed"),
+        ({"max_speed": 1e-9}, "must be 1e-06 deg/s"),
+        ({"acceleration": math.nan}, "no acceleration"),
+        ({"pulse_width": 1e-3}, "Nothing was sent"),
+        ({"first_pulse": "some time"}, "some time"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_with_what_would(rig: Rig, settings: dict[str, object], says: str) -> None:
+    with pytest.raises(DeviceRefused, match=says):
+        rig.open(**settings)
+    rig.open().close()
+
+
+def test_counts_that_are_whole_counts_of_the_controllers_will_do(rig: Rig) -> None:
+    rig.open(counts_per_turn=COUNTS // 3).close()
+    rig = Rig(wire={"unknown": {"SPA?"}})
+    rig.open().close()
+
+
+def test_limits_in_the_controller_that_leave_no_room_are_respected() -> None:
+    rig = Rig(low=-4.0, high=1e9)
+    with pytest.raises(DeviceRefused, match=re.escape("limited to -4.0000 deg to 1000000000.0000 deg")):
+        rig.open()
+    rig.open(low=math.radians(-4)).close()
+
+
+@pytest.mark.parametrize("vast", ["1.79769e+308", f"{1.7e308:.6f}"])
+def test_the_limits_of_an_endless_stage_may_be_as_large_as_numbers_are(rig: Rig, vast: str) -> None:
+    rig.spoil = lambda reply: reply.replace(b"720.000000", vast.encode())
+    rig.open().close()
+    rig.spoil = lambda reply: reply.replace(b"=720.000000", b"=50.0").replace(b"720.000000", vast.encode())
+    with pytest.raises(DeviceRefused, match=r"limited to -360000000000\.0000 deg to 50\.0000 deg"):
+        rig.open()
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "says"),
+    [
+        ((b"(c)2026 Physik Instrumente", b"(c)2026 Somebody"), "identity of a PI controller"),
+        ((b"2.0\n", b"1.1\n"), "does not talk GCS 2.0"),
+    ],
+)
+def test_another_controller_on_the_port_is_named(rig: Rig, spoilt: tuple[bytes, bytes], says: str) -> None:
+    rig.spoil = lambda reply: reply.replace(*spoilt)
+    with pytest.raises(DeviceError, match=says):
+        rig.open()
+    rig.spoil = lambda reply: reply
+    rig.open().close()
+
+
+def test_limits_are_what_was_configured(rig: Rig) -> None:
+    stage = rig.open()
+    figures = (COUNTS, math.radians(30), math.radians(60), math.radians(-5), math.radians(100))
+    assert stage.limits == limits_of(*figures)
+
+
+def test_a_transcript_has_the_dialogue(rig: Rig, tmp_path: Path) -> None:
+    stage = rig.open(transcript=tmp_path / "wire.txt")
+    stage.close()
+    assert "ACC 1 60" in (tmp_path / "wire.txt").read_text()
+
+
+def test_where_acc_and_dec_are_missing_parameters_do() -> None:
+    rig = Rig(wire={"unknown": {"ACC", "DEC"}})
+    stage = rig.open()
+    assert (rig.say("SPA? 1 0xB"), rig.say("SPA? 1 0xC")) == ("1 0xB=60.000000", "1 0xC=60.000000")
+    assert stage.status().fault == ""
+
+
+# moves and the reference
+
+
+def test_a_move_on_the_wire(rig: Rig) -> None:
+    stage = rig.open()
+    rig.sent()
+    stage.start_move(math.radians(10.5), math.radians(20))
+    assert rig.sent() == ["#5", "VEL 1 20", "VEL? 1", "MOV 1 10.5", "MOV? 1"]
+    stage.stop()
+    assert rig.sent()[:2] == ["HLT 1", "#5"]
+    stage.abort()
+    assert rig.sent() == ["#24"]
+
+
+def test_an_unreferenced_axis_does_not_move_until_it_has_searched() -> None:
+    rig = Rig(referenced=False, found_at=3.0)
+    stage = rig.open()
+    assert stage.status().homed is False
+    with pytest.raises(DeviceRefused, match=r"no reference yet.*'MOV 1 10'.*start_home.*Nothing has moved"):
+        stage.start_move(math.radians(10), SPEED)
+    stage.start_home()
+    assert stage.wait(LONG) == 0.0
+    assert stage.status().homed is True
+    stage.start_move(math.radians(10), SPEED)
+    stage.wait(LONG)
+    assert math.degrees(rig.line.angle_at(rig.clock.now())) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(("reference", "has"), [("FRF", "reference sensor"), ("FNL", "limit switches")])
+def test_a_search_for_a_switch_that_is_not_there_is_refused(reference: str, has: str) -> None:
+    rig = Rig(reference_switch=False, limit_switches=False)
+    stage = rig.open(reference=reference)
+    with pytest.raises(DeviceRefused, match=f"{reference} is not possible.*{has}.*Nothing has moved"):
+        stage.start_home()
+    assert not stage.moving()
+
+
+def test_a_search_by_the_positive_limit_switch_ends_there() -> None:
+    rig = Rig(high=110.0)
+    stage = rig.open(reference="FPL")
+    stage.start_home()
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(110.0)
+
+
+def test_a_search_that_fails_says_so_and_leaves_the_axis_unreferenced() -> None:
+    rig = Rig(reference_fails=True, found_at=3.0)
+    stage = rig.open()
+    stage.start_home()
+    with pytest.raises(DeviceError, match=r"error 45.*not those of the reference"):
+        stage.wait(LONG)
+    assert stage.status().homed is False
+
+
+def test_a_search_ends_a_train(rig: Rig) -> None:
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.stage.start_home()
+    bench.stage.wait(LONG)
+    bench.go(10.0)
+    assert bench.pulses() == []
+
+
+def test_a_servo_that_needs_its_time_is_waited_for() -> None:
+    rig = Rig(settle=0.4)
+    stage = rig.open()
+    stage.start_move(math.radians(10), SPEED)
+    begun = rig.clock.now()
+    stage.wait(LONG)
+    assert rig.clock.now() - begun == pytest.approx(10 / 10 + 10 / 60 + 0.4, abs=0.06)
+    assert rig.say("ONT?") == "1=1"
+
+
+def test_a_servo_that_never_settles_but_is_near_has_arrived() -> None:
+    rig = Rig(settle=1e9)
+    stage = rig.open()
+    stage.start_move(math.radians(10), SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(10.0)
+
+
+# what stops a move
+
+
+def test_a_motion_error_is_named_with_where_it_stands_and_no_move_follows_before_it_was_looked_at() -> None:
+    rig = Rig(stall_at=2500)
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(
+        DeviceError, match=r"stopped short of 30\.0000 deg \(error 1024, motion error.*servo is off"
+    ) as e:
+        stage.wait(LONG)
+    assert "stands at 10.0000 deg, 2500 counts" in str(e.value)
+    assert not isinstance(e.value, DeviceTimeout | DeviceRefused)
+    assert "1024" in stage.status().fault
+    with pytest.raises(DeviceRefused, match=r"servo is off.*Nothing has moved"):
+        stage.start_move(math.radians(5), SPEED)
+    stage.close()
+    stage = rig.open()
+    stage.start_move(math.radians(5), SPEED)
+    stage.wait(LONG)
+    assert stage.status().fault == ""
+
+
+def test_a_servo_that_is_switched_off_on_the_way_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.say("SVO 1 0")
+    with pytest.raises(DeviceError, match=r"stopped short.*the servo is off"):
+        stage.wait(LONG)
+
+
+@pytest.mark.parametrize(("degrees", "side"), [(30.0, "positive"), (-4.0, "negative")])
+def test_a_limit_switch_is_named(degrees: float, side: str) -> None:
+    rig = Rig(switch_at=round(math.copysign(500, degrees)))
+    stage = rig.open()
+    stage.start_move(math.radians(degrees), SPEED)
+    with pytest.raises(DeviceError, match=rf"stopped short.*\({side} limit switch\)"):
+        stage.wait(LONG)
+    assert stage.status().fault == f"{side} limit switch"
+
+
+def test_a_stop_from_another_program_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.say("STP")
+    with pytest.raises(DeviceError, match="error 10, stopped by command"):
+        stage.wait(LONG)
+
+
+def test_limits_that_another_program_narrowed_are_the_controllers_to_name() -> None:
+    rig = Rig(low=-5.0, high=200.0)
+    stage = rig.open(low=math.radians(-5), high=math.radians(200))
+    object.__setattr__(rig.controller.box.axis.build, "high", 50.0)
+    with pytest.raises(DeviceRefused, match=r"error 7, position out of limits.*TMX\?"):
+        stage.start_move(math.radians(60), SPEED)
+    assert not stage.moving()

@@ -1,0 +1,107 @@
+"""PI GCS 2.0 trains: what is sent, where firmware puts the first pulse, the times of pulses, and trains refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from drivers.errors import DeviceRefused
+from drivers.protocols import TriggerTrain
+from simulators.wires.pi_gcs.trigger import FirstPulse
+from tests.drivers.stage_bench import LONG, SPEED
+from tests.drivers.stages.pi_gcs_rig import Rig
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_arming_on_the_wire(rig: Rig) -> None:
+    """One item a line, each read back; the stop threshold half a step behind the last pulse at 1.9."""
+    stage = rig.open()
+    rig.sent()
+    stage.arm(TriggerTrain(250, 25, 10))
+    assert [line for line in rig.sent() if line[:4] not in ("CTO?", "POS?")] == [
+        "#5", "TRO 2 0", "TRO? 2", "CTO 2 2 1", "CTO 2 3 0", "CTO 2 7 1", "CTO 2 1 0.1", "CTO 2 8 1", "CTO 2 9 1.95",
+        "TRO 2 1", "TRO? 2",
+    ]  # fmt: skip
+    stage.disarm()
+    assert rig.sent() == ["TRO 2 0", "TRO? 2"]
+    assert stage.remaining_pulses() is None
+
+
+@pytest.mark.parametrize("rule", list(FirstPulse))
+@pytest.mark.parametrize(("first", "step", "n"), [(250, 25, 10), (500, 5, 1), (-500, -100, 6), (375, 125, 30)])
+def test_wherever_the_firmware_puts_the_first_pulse_a_train_is_at_its_counts(
+    rule: FirstPulse, first: int, step: int, n: int
+) -> None:
+    bench = Rig(first_pulse=rule).bench(first_pulse=rule.value, low=math.radians(-20))
+    bench.stage.arm(TriggerTrain(first, step, n))
+    bench.go(math.copysign(18.0, step) if step < 0 else 40.0)
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [first + k * step for k in range(n)]
+
+
+@pytest.mark.parametrize(
+    ("rule", "says", "expected"),
+    [("at_threshold", "step_after", 4), ("step_after", "at_threshold", 2)],
+)
+def test_the_wrong_rule_shows_in_the_number_of_pulses(rule: str, says: str, expected: int) -> None:
+    """That is how it is found out at an instrument: one too many, or one too few."""
+    bench = Rig(first_pulse=FirstPulse(rule)).bench(first_pulse=says)
+    bench.stage.arm(bench.train(2.0, 1.0, 3))
+    bench.go(20.0)
+    assert len(bench.pulses()) == expected
+
+
+def test_a_train_off_the_grid_is_refused_where_the_firmware_has_one() -> None:
+    stage = Rig(first_pulse=FirstPulse.GRID).open(first_pulse="grid")
+    with pytest.raises(DeviceRefused, match="whole multiples of 100 counts only"):
+        stage.arm(TriggerTrain(250, 100, 3))
+
+
+def test_arming_too_near_before_the_first_pulse_is_refused_where_a_step_goes_before_it() -> None:
+    rig = Rig(first_pulse=FirstPulse.STEP_AFTER)
+    bench = rig.bench(first_pulse="step_after")
+    bench.go(3.0)
+    with pytest.raises(DeviceRefused, match=r"at or past 2\.5000 deg.*Move back by 1\.0000 deg"):
+        bench.stage.arm(bench.train(3.5, 1.0, 3))
+    with pytest.raises(DeviceRefused, match="at or past the first pulse"):
+        bench.stage.arm(bench.train(3.0, 1.0, 3))
+    bench.go(2.0)
+    bench.stage.arm(bench.train(3.5, 1.0, 3))
+    bench.go(10.0)
+    assert [round(math.degrees(pulse.angle), 3) for pulse in bench.pulses()] == [3.5, 4.5, 5.5]
+
+
+def test_the_pulses_on_the_cable_come_at_the_times_of_a_trapezoid(rig: Rig) -> None:
+    """Ramp of v/a = 1/6 s over v²/2a = 5/6 degree, then 10 degrees/s."""
+    bench = rig.bench()
+    bench.stage.arm(bench.train(0.2, 0.2, 50))
+    bench.stage.start_move(math.radians(20), SPEED)
+    begun = rig.controller.box.axis.move.begin
+    bench.stage.wait(LONG)
+    expected = [
+        begun + (math.sqrt(2 * at / 60) if at < 5 / 6 else 1 / 6 + (at - 5 / 6) / 10)
+        for at in (0.2 * (k + 1) for k in range(50))
+    ]
+    assert [pulse.time for pulse in bench.pulses()] == pytest.approx(expected, abs=1e-6, rel=0)
+
+
+def test_pulses_a_servo_cycle_late_still_belong_to_their_counts() -> None:
+    """At 10 degrees/s a cycle of 50 µs is an eighth of a count."""
+    bench = Rig(servo_period=50e-6).bench()
+    train = bench.train(1.0, 0.5, 30)
+    bench.stage.arm(train)
+    bench.go(20.0)
+    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [250 + 125 * k for k in range(30)]
+
+
+def test_pulses_that_would_merge_are_refused() -> None:
+    """At 30 degrees/s a count of 0.004 degrees lasts 133 µs."""
+    stage = Rig().open(firmware_pulse=60e-6)
+    stage.arm(TriggerTrain(100, 1, 3))
+    stage.close()
+    with pytest.raises(DeviceRefused, match="cannot be emitted"):
+        Rig().open(firmware_pulse=70e-6).arm(TriggerTrain(100, 1, 3))

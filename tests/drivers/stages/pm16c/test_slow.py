@@ -1,0 +1,79 @@
+"""PM16C driver and a controller that takes its time over settings, older firmware, and where the first pulse comes."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.protocols import TriggerTrain
+from drivers.stages.pm16c.train import FirstPulse
+from tests.drivers.pm16c_rig import Rig
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("fires_at_start", [True, False])
+def test_a_train_is_right_whether_the_start_point_fires_or_not_as_long_as_that_is_known(
+    sign: int, fires_at_start: bool
+) -> None:
+    known = FirstPulse.AT_START if fires_at_start else FirstPulse.INTERVAL_AFTER
+    bench = Rig(fires_at_start=fires_at_start).bench(low=-2.0, high=2.0, first_pulse=known)
+    for first, interval, n in ((500, 100, 12), (2000, 7, 3), (3000, 4, 1), (3100, 1, 9)):
+        before = len(bench.pulses())
+        bench.stage.arm(TriggerTrain(sign * first, sign * interval, n))
+        bench.go(sign * 20.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()[before:]]
+        assert counts == [sign * (first + interval * k) for k in range(n)]
+        bench.go(0.0)
+    assert bench.stage.describe()["first_pulse"] == known
+    bench.stage.close()
+
+
+def test_the_room_before_the_first_pulse_is_in_the_limits_and_asked_for() -> None:
+    bench = Rig(fires_at_start=False).bench(first_pulse="interval_after")
+    assert bench.stage.limits.run_up == 1
+    with pytest.raises(DeviceRefused, match="pulses are let through"):
+        bench.stage.arm(bench.train(1.0, 1.0, 5))
+    bench.stage.close()
+    bench = Rig().bench()
+    assert bench.stage.limits.run_up == 0
+    bench.stage.close()
+    with pytest.raises(DeviceRefused, match="sometimes"):
+        Rig().open(first_pulse="sometimes")
+
+
+def test_a_setting_that_is_lost_once_is_sent_again_and_one_that_is_lost_for_good_is_told() -> None:
+    rig = Rig()
+    stage = rig.open()
+    rig.lose("SPDHB3")
+    with pytest.raises(DeviceError, match=r"setting was not taken.*Asked 'SPDHB3000'.*Nothing has moved"):
+        stage.start_move(0.5, stage.to_angle(3000))
+    rig.lose("nothing")
+    stage.start_move(0.5, stage.to_angle(3000))
+    stage.wait(60.0)
+    stage.close()
+
+
+def test_firmware_without_the_status_of_one_channel_is_refused_in_words() -> None:
+    rig = Rig(version="1.46 06-10-14 PM16C-04X")
+    with pytest.raises(DeviceRefused, match=r"firmware 1\.46.*Expected 1\.47 or later.*Nothing has moved"):
+        rig.open()
+    Rig(version="1.47 12-10-14 PM16C-04XD").open().close()
+
+
+def test_the_status_of_another_channel_is_not_believed() -> None:
+    rig = Rig()
+    stage = rig.open()
+    transmit = rig.transmit
+    rig.transmit = lambda: transmit().replace(b"RBS", b"RAS")  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="form"):
+        stage.status()
+    rig.transmit = transmit  # type: ignore[method-assign]
+    stage.close()
+
+
+@pytest.mark.parametrize("width", [10 * 1e-6, 100 * 1e-6, 0.2 * 1e-6, 1000 * 1e-6])
+def test_a_width_in_microseconds_times_a_millionth_is_that_width(width: float) -> None:
+    """10 * 1e-6 is not 1e-05, and 0.2 * 1e-6 not 200e-9, in floating point."""
+    stage = Rig().open(pulse_width=width)
+    assert stage.describe()["pulse_width_s"] == pytest.approx(width)
+    stage.close()

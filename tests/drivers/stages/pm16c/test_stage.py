@@ -1,0 +1,189 @@
+"""PM16C-04XD driver: what is this controller's own; what every stage does stands in conformance."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import RotationStage, TriggerTrain
+from drivers.stages.pm16c.limits import limits_of
+from drivers.stages.pm16c.rates import RATES, steepest_code
+from tests.drivers.pm16c_rig import COUNTS, Rig
+from tests.drivers.stage_bench import LONG, SPEED
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+# opening and closing
+
+
+def test_it_is_a_rotation_stage_and_says_what_it_found(rig: Rig) -> None:
+    stage: RotationStage = rig.open()
+    described = stage.describe()
+    assert (described["firmware"], described["channel"]) == ("1.50 17-04-01 PM16C-04XDL-SIMULATED", 11)
+
+
+def test_opening_takes_remote_and_position_controller_a_and_closing_gives_the_panel_back(rig: Rig) -> None:
+    stage = rig.open()
+    assert rig.say("STS?").startswith("RB123/SSSS/")
+    stage.close()
+    assert rig.say("STQ?") == "L4"
+
+
+def test_a_controller_found_in_remote_is_left_there(rig: Rig) -> None:
+    rig.say("REM")
+    rig.open().close()
+    assert rig.say("STQ?") == "R4"
+
+
+def test_remote_that_is_not_granted_is_named(rig: Rig) -> None:
+    """Another axis moves, and the panel was switched to LOCAL after it started: the controller ignores REM."""
+    rig.say("REM", "ABS3+50000")
+    rig.controller.box.remote = False
+    with pytest.raises(DeviceRefused, match="in LOCAL"):
+        rig.open()
+
+
+def test_another_controller_on_the_port_is_named() -> None:
+    rig = Rig(garbled={0})
+    with pytest.raises(DeviceError, match=r"'VER\?'.*PM16C-04XD"):
+        rig.open()
+    rig.open().close()
+
+
+@pytest.mark.parametrize("channel", [-1, 16])
+def test_a_channel_that_does_not_exist_is_refused(rig: Rig, channel: int) -> None:
+    with pytest.raises(DeviceRefused, match="0 to 15"):
+        rig.open(channel=channel)
+
+
+def test_limits_in_the_controller_that_leave_no_room_are_respected(rig: Rig) -> None:
+    rig.say("REM", "FLB+20000", "BLB-2000", "SETLSB10000000")
+    for limits in ({}, {"low": math.radians(-8.1), "high": 1.0}):
+        with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
+            rig.open(**limits)
+    rig.open(low=math.radians(-8), high=math.radians(80)).close()
+    assert (rig.say("FL?B"), rig.say("SETLS?B")) == ("+0020000", "10000000")
+
+
+# acceleration
+
+
+def test_acceleration_codes_are_the_published_ones() -> None:
+    published = {0: 1000, 1: 910, 23: 110, 24: 100, 36: 33, 48: 10, 72: 1.0, 95: 0.11, 96: 0.10, 114: 0.018, 115: 0.016}
+    assert len(RATES) == 116
+    assert {code: RATES[code] for code in published} == pytest.approx(published)
+
+
+@pytest.mark.parametrize("code", [1, 17, 60, 115])
+def test_the_steepest_code_not_above_an_acceleration(code: int) -> None:
+    acceleration = 1e6 / RATES[code]
+    assert [steepest_code(acceleration * factor) for factor in (0.999, 1.0, 1.001)] == [code - 1, code, code]
+
+
+def test_the_acceleration_that_the_stage_names_is_the_one_that_it_has(rig: Rig) -> None:
+    stage = rig.open()
+    assert stage.limits == limits_of(
+        COUNTS, stage.limits.max_speed, math.radians(60), stage.limits.low, stage.limits.high
+    )
+    assert 0.9 * math.radians(60) < stage.limits.acceleration <= math.radians(60)
+    stage.start_move(math.radians(60), math.radians(30))
+    begun = rig.clock.now()
+    rig.clock.sleep(0.25)
+    assert rig.line.angle_at(begun + 0.25) == pytest.approx(0.5 * stage.limits.acceleration * 0.25**2, rel=1e-5)
+
+
+def test_an_acceleration_gentler_than_any_is_refused(rig: Rig) -> None:
+    with pytest.raises(DeviceRefused, match="Nothing was sent"):
+        rig.open(acceleration=1e-6)
+
+
+# triggers of this controller
+
+
+def test_pulses_are_the_widest_that_the_interval_allows(rig: Rig) -> None:
+    """At 30 deg/s = 7500 pulses/s an interval of 15 lasts 2 ms, room for 1 ms pulses; 14 does not."""
+    stage = rig.open()
+    for interval, mode in ((15, "5"), (14, "4"), (1, "3")):
+        stage.arm(TriggerTrain(100, interval, 3))
+        assert rig.say("TMGM?B") == mode
+
+
+def test_a_chosen_width_is_the_one_set_and_a_single_pulse_may_be_wide(rig: Rig) -> None:
+    stage = rig.open(pulse_width=1e-3)
+    assert stage.describe()["pulse_width_s"] == 1e-3
+    with pytest.raises(DeviceRefused, match=r"not closer than 0\.002 s"):
+        stage.arm(TriggerTrain(100, 14, 3))
+    for train in (TriggerTrain(100, 15, 3), TriggerTrain(100, 1, 1)):
+        stage.arm(train)
+        assert rig.say("TMGM?B") == "5"
+
+
+def test_what_cannot_be_set_is_refused_before_anything_is_sent(rig: Rig) -> None:
+    for settings in ({"pulse_width": 5e-3}, {"pulse_width": math.nan}, {"active_high": False}):
+        with pytest.raises(DeviceRefused, match="Nothing was sent"):
+            rig.open(**settings)
+    assert rig.controller.queries == 0
+
+
+def test_the_transcript_holds_the_opening(rig: Rig, tmp_path: Path) -> None:
+    rig.open(transcript=tmp_path / "line.txt").close()
+    text = (tmp_path / "line.txt").read_text()
+    assert text.index(r"> b'VER?\r\n'") < text.index("PM16C-04XDL-SIMULATED") < text.index(r"> b'LOC\r\n'")
+
+
+def test_a_setting_that_another_program_took_back_is_noticed(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("LOC")
+    with pytest.raises(DeviceRefused, match="in LOCAL"):
+        stage.arm(TriggerTrain(100, 10, 3))
+    with pytest.raises(DeviceRefused, match="in LOCAL"):
+        stage.start_move(0.1, SPEED)
+    assert not stage.moving()
+
+
+# what stops a move
+
+
+def test_a_move_that_stops_short_says_where_and_why() -> None:
+    rig = Rig(stall_at=2500)
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(DeviceError, match=r"stopped short of 30\.0000 deg.*emergency stop") as error:
+        stage.wait(LONG)
+    assert "stands at 10.0000 deg, 2500 counts" in str(error.value)
+    assert not isinstance(error.value, DeviceTimeout)
+
+
+def test_a_limit_set_later_in_the_controller_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("FLB+5000", "SETLSB10000000")
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(DeviceError, match=r"stopped short.*\(limit\)"):
+        stage.wait(LONG)
+    with pytest.raises(DeviceError, match=r"did not start \(limit\)"):
+        stage.start_move(math.radians(30), SPEED)
+
+
+def test_a_stop_button_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.say("ASSTP")
+    with pytest.raises(DeviceError, match="stop command"):
+        stage.wait(LONG)
+
+
+def test_a_fifth_motor_cannot_start_and_the_controllers_words_are_given(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("ABS0+90000", "ABS1+90000", "ABS2+90000", "ABS3+90000")
+    with pytest.raises(DeviceError, match="MCC06 BUSY ERROR"):
+        stage.start_move(math.radians(30), SPEED)
+    assert stage.position() == 0.0

@@ -1,0 +1,271 @@
+"""Zaber driver: what is this controller's own, from identity to faults, and a disturbed line."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import RotationStage
+from drivers.stages.zaber.limits import native_limits
+from simulators.wires.zaber.wire import Fault
+from tests.drivers.stage_bench import LONG, SPEED
+from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+# opening and closing
+
+
+@pytest.mark.parametrize("identity", ["device.id", "deviceid"])
+def test_it_is_a_rotation_stage_and_says_what_it_found(identity: str) -> None:
+    stage: RotationStage = Rig(identity=identity).open()
+    described = stage.describe()
+    assert (described["model"], described["serial"], described["firmware"]) == ("Zaber device 50952", "123456", "7.38")
+    assert described["pulse_width_s"] == 1e-3
+
+
+def test_opening_demands_checksums_and_closing_leaves_settings_as_they_were(rig: Rig) -> None:
+    rig.say("/1 1 set maxspeed 4321", "/1 1 set motion.accelonly 33", "/1 1 set motion.decelonly 44")
+    stage = rig.open()
+    assert rig.say("/1 0 get comm.checksum") == "1"
+    stage.start_move(0.1, SPEED)
+    stage.wait(LONG)
+    stage.close()
+    settings = ("/1 1 get maxspeed", "/1 1 get motion.accelonly", "/1 1 get motion.decelonly", "/1 0 get comm.checksum")
+    assert [rig.say(setting) for setting in settings] == ["4321", "33", "44", "0"]
+
+
+def test_every_packet_has_a_checksum_and_an_id_of_its_own(rig: Rig) -> None:
+    rig.bench().go(3.0)
+    forms = [re.fullmatch(r"/1 [01] (\d\d)( [^:]*)?:[0-9A-F]{2}", packet) for packet in rig.sent if packet]
+    assert all(forms)
+    assert len(forms) > 20
+    ids = [int(form[1]) for form in forms if form is not None]
+    assert ids == [k % 98 for k in range(len(ids))]
+
+
+def test_a_real_stages_turn_is_checked() -> None:
+    rig = Rig(counts_per_turn=384_000)
+    with pytest.raises(DeviceRefused, match="a turn has 384000 microsteps"):
+        rig.open()
+    stage = rig.open(counts_per_turn=384_000)
+    assert stage.limits.counts_per_turn == 384_000
+
+
+def test_limits_in_the_controller_that_leave_no_room_are_respected() -> None:
+    rig = Rig(low=-8000, high=80_000)
+    for limits in ({}, {"low": math.radians(-8.1), "high": 1.0}):
+        with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
+            rig.open(**limits)
+    rig.open(low=math.radians(-8), high=math.radians(80)).close()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"device": 0},
+        {"axis": 0},
+        {"output": 0},
+        {"toggle": True, "pulse_width": 1e-3},
+        {"acceleration": 1e-6},
+        {"max_speed": 0.0},
+    ],
+)
+def test_settings_that_it_cannot_have_are_refused_before_anything_is_sent(rig: Rig, wrong: dict[str, Any]) -> None:
+    with pytest.raises(DeviceRefused, match="Nothing was sent"):
+        rig.open(**wrong)
+    assert rig.sent == []
+
+
+def test_another_device_in_the_chain_and_an_axis_that_is_not_there(rig: Rig) -> None:
+    with pytest.raises(DeviceTimeout):
+        rig.open(device=2)
+    with pytest.raises(DeviceRefused, match=r"no such axis \(BADAXIS\)"):
+        rig.open(axis=2)
+    Rig(address=37).open(device=37).close()
+
+
+# units
+
+
+def test_native_units_are_speed_times_a_factor_and_acceleration_ten_thousand_times_less() -> None:
+    """384 000 microsteps a turn, 10 deg/s and 100 deg/s²: 10 666.7/s and 106 667/s² times 1.6384."""
+    assert native_limits(384_000, math.radians(10), math.radians(100)) == (17_476, 17)
+    assert native_limits(384_000, math.radians(10), math.radians(100), speed_unit=1.0) == (10_667, 10)
+
+
+def test_the_acceleration_that_the_stage_names_is_the_one_that_it_has(rig: Rig) -> None:
+    stage = rig.open()
+    assert 0.9 * math.radians(60) < stage.limits.acceleration <= math.radians(60)
+    stage.start_move(math.radians(60), math.radians(30))
+    begun = rig.clock.now()
+    rig.clock.sleep(0.25)
+    assert rig.line.angle_at(begun + 0.25) == pytest.approx(0.5 * stage.limits.acceleration * 0.25**2, rel=1e-9)
+
+
+# references and faults
+
+
+def test_without_a_reference_it_does_not_move_until_it_has_searched_one() -> None:
+    stage = Rig(homed=False).open()
+    assert stage.status().homed is False
+    with pytest.raises(DeviceRefused, match=r"not referenced.*home.*Nothing has moved"):
+        stage.start_move(0.1, SPEED)
+    stage.start_home()
+    assert stage.wait(LONG) == 0.0
+    assert stage.status().homed is True
+    stage.start_move(0.1, SPEED)
+    assert stage.wait(LONG) == pytest.approx(0.1, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"), [("stall_at", "stalled and stopped .FS."), ("switch_at", "limit error .FE.")]
+)
+def test_a_move_that_ends_early_says_where_and_why(fault: str, words: str) -> None:
+    stage = Rig(**{fault: 10_000}).open()
+    stage.start_move(math.radians(30), SPEED)
+    with pytest.raises(DeviceError, match=rf"stopped short of 30\.0000 deg.*stands at 10\.0000 deg.*{words}") as error:
+        stage.wait(LONG)
+    assert not isinstance(error.value, DeviceTimeout)
+    assert "Find" in error.value.advice
+    assert re.search(words, stage.status().fault)
+    stage.start_move(0.0, SPEED)
+    assert stage.wait(LONG) == 0.0
+    assert stage.status().fault == ""
+
+
+def test_a_driver_that_somebody_disabled_is_named(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("/1 1 driver disable")
+    assert "driver disabled (FO)" in stage.status().fault
+    with pytest.raises(DeviceRefused, match=r"its driver is disabled \(DRIVERDISABLED\).*Nothing has moved"):
+        stage.start_move(0.1, SPEED)
+
+
+def test_a_move_of_somebody_else_is_waited_for_or_named(rig: Rig) -> None:
+    stage = rig.open()
+    rig.say("/1 1 move abs 20000")
+    with pytest.raises(DeviceRefused, match="moves"):
+        stage.start_move(0.1, SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(20.0)
+
+
+def test_a_stop_is_named_by_its_flag(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(90), SPEED)
+    rig.clock.sleep(1.0)
+    stage.stop()
+    with pytest.raises(DeviceError, match=r"stopped short.*movement interrupted \(NI\)"):
+        stage.wait(LONG)
+
+
+def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -> None:
+    stage = rig.open()
+    output = stage.digital_output(2)
+    output.set(True)
+    assert output.get()
+    assert rig.say("/1 0 io get do") == "0 1 0 0"
+    with pytest.raises(DeviceRefused, match="trigger pulses"):
+        stage.digital_output(1)
+
+
+# a disturbed line
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (Fault.SILENT, "no whole reply within 1 s"),
+        (Fault.TRUNCATED, "no whole reply within 1 s"),
+        (Fault.WRONG_CHECKSUM, "damaged on the way: its checksum is"),
+        (Fault.NOISE, "does not have the form"),
+        (Fault.OTHER_ID, "does not have the form.*reply to message"),
+    ],
+)
+def test_a_reply_that_is_none_is_named_and_the_next_request_is_in_step_again(fault: Fault, words: str) -> None:
+    rig = Rig(faults={REPLIES_TO_OPEN: fault})
+    stage = rig.open()
+    with pytest.raises(DeviceError, match=words):
+        stage.position()
+    assert stage.position() == 0.0
+    assert stage.status().fault == ""
+
+
+@pytest.mark.parametrize("fault", [Fault.ALERT, Fault.AGAIN])
+def test_an_alert_is_passed_over_and_a_request_to_repeat_is_followed(fault: Fault) -> None:
+    rig = Rig(faults=dict.fromkeys(range(0, 200, 2), fault))
+    bench = rig.bench()
+    rig.say("/1 0 set comm.alert 1")
+    assert bench.go(5.0) == pytest.approx(5.0)
+    assert rig.controller.replies > 20
+
+
+def test_a_device_that_asks_to_repeat_for_ever_is_named() -> None:
+    stage = Rig(faults=dict.fromkeys(range(REPLIES_TO_OPEN, 1000), Fault.AGAIN)).open()
+    with pytest.raises(DeviceRefused, match="again and again"):
+        stage.position()
+
+
+def test_alerts_may_come_at_any_time(rig: Rig) -> None:
+    rig.say("/1 0 set comm.alert 1")
+    stage = rig.open()
+    for _ in range(5):
+        rig.controller.alert()
+        assert stage.position() == 0.0
+    stage.start_move(0.1, SPEED)
+    rig.clock.sleep(30.0)
+    rig.controller.alert()
+    assert stage.wait(LONG) == pytest.approx(0.1, abs=1e-4)
+
+
+def test_an_echoing_line_is_understood() -> None:
+    assert Rig(echo=True).bench().go(5.0) == pytest.approx(5.0)
+
+
+def test_a_stop_that_got_lost_is_noticed(rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(100), math.radians(1))
+    rig.lose("stop")
+    with pytest.raises(DeviceTimeout, match=r"still moving .* after the stop command"):
+        stage.stop()
+
+
+class Junk(Rig):
+    """A rig whose next replies are replaced by other bytes."""
+
+    instead: tuple[bytes, ...] = ()
+
+    def transmit(self) -> bytes:
+        data = super().transmit()
+        if data and self.instead:
+            data, self.instead = self.instead[0], self.instead[1:]
+        return data
+
+
+LINES = st.sampled_from(
+    [b"", b"@", b"@01 1 ", b"@01 1 16 OK IDLE -- ", b"!01 1 IDLE --\r\n", b"#01 1 x\r\n", b"/1 1\r\n"]
+)
+
+
+@given(LINES, st.binary(max_size=60), st.booleans())
+def test_whatever_comes_instead_of_a_reply_is_an_error_or_passed_over_and_never_a_position(
+    begin: bytes, junk: bytes, end: bool
+) -> None:
+    rig = Junk()
+    stage = rig.open()
+    stage.start_move(0.1, SPEED)
+    where = stage.wait(LONG)
+    rig.instead = (begin + junk + (b"\r\n" if end else b""),)
+    with pytest.raises(DeviceError):
+        stage.position()
+    assert stage.position() == where

@@ -1,0 +1,267 @@
+"""Zaber pulse trains: the triggers they become, and the pulses that come of them from any place on any firmware."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.protocols import TriggerTrain
+from drivers.stages.zaber.train import PulseSettings, pulses_of, remaining, set_up
+from tests.drivers.stage_bench import LONG, SPEED, StageBench
+from tests.drivers.zaber_rig import Rig
+
+
+def counts_of(bench: StageBench) -> list[int]:
+    return [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+
+
+def points(train: TriggerTrain) -> list[int]:
+    return list(range(train.start, train.end + (1 if train.interval > 0 else -1), train.interval))
+
+
+# what is sent
+
+
+def test_the_starter_stands_one_step_before_and_enables_the_repeater() -> None:
+    setup = set_up(PulseSettings(output=3), TriggerTrain(5000, 200, 37), axis=1, counts=0)
+    assert setup.commands == (
+        "trigger 1 disable",
+        "trigger 2 disable",
+        "io set do 3 0",
+        "trigger 2 when 1 dist 200",
+        "trigger 2 action a io set do 3 1 schedule 1 0",
+        "trigger 2 action b none",
+        "trigger 1 when 1 pos >= 4800",
+        "trigger 1 action a none",
+        "trigger 1 action b trigger 2 enable 37",
+    )
+    assert (setup.enable, setup.stand) == ("trigger 1 enable 1", None)
+
+
+def test_within_the_last_step_the_starter_gives_the_first_pulse() -> None:
+    settings = PulseSettings(width=None, measured=True, starter=4, repeater=6)
+    setup = set_up(settings, TriggerTrain(-500, -200, 3), axis=2, counts=-450)
+    assert setup.commands[3:] == (
+        "trigger 6 when 2 encoder dist 100",
+        "trigger 6 action a io set do 1 t",
+        "trigger 6 action b none",
+        "trigger 4 when 2 encoder.pos <= -500",
+        "trigger 4 action a io set do 1 t",
+        "trigger 4 action b trigger 6 enable 5",
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "shown", "left"),
+    [
+        (PulseSettings(), "1 d d d d d", 5),
+        (PulseSettings(), "d 5 d d d d", 5),
+        (PulseSettings(), "d 2 d d d d", 2),
+        (PulseSettings(), "d d", 0),
+        (PulseSettings(width=None), "d 10", 5),
+        (PulseSettings(width=None), "d 9", 4),
+        (PulseSettings(width=None), "d 1", 0),
+        (PulseSettings(chained=False), "d 4", 4),
+    ],
+)
+def test_pulses_to_come_from_what_the_controller_shows(settings: PulseSettings, shown: str, left: int) -> None:
+    assert remaining(settings, TriggerTrain(100, 10, 5), shown) == left
+
+
+def test_a_controller_with_fewer_triggers_is_noticed() -> None:
+    with pytest.raises(ValueError, match="trigger 2"):
+        remaining(PulseSettings(), TriggerTrain(100, 10, 5), "d")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 0.0},
+        {"width": 0.0015},
+        {"width": math.nan},
+        {"starter": 2},
+        {"output": 0},
+        {"chained": False, "fires_when_enabled": True},
+    ],
+)
+def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        PulseSettings(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("made", "nearest"), [({"pulse_width": 2e-3}, 120), ({"toggle": True}, 60), ({"pulse_width": 1e-3}, 60), ({}, 60)]
+)
+def test_trains_that_would_run_together_are_refused(made: dict[str, Any], nearest: int) -> None:
+    """At 30 deg/s = 30 000 counts/s: a width and as long again of rest, or two fires 1 ms apart."""
+    stage = Rig().bench(**made).stage
+    stage.arm(TriggerTrain(1000, nearest, 9))
+    with pytest.raises(DeviceRefused, match=f"at full speed, which are {nearest} counts"):
+        stage.arm(TriggerTrain(1000, nearest - 2, 9))
+    stage.arm(TriggerTrain(1000, 1, 1))
+
+
+def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
+    rest = PulseSettings(chained=False, shortest=2e-3, width=5e-3)
+    made = pulses_of(rest, output=3, width=None, active_high=False, toggle=False)
+    assert made == PulseSettings(3, 1e-3, False, chained=False, shortest=2e-3)
+    assert pulses_of(rest, output=1, width=4e-3, active_high=True, toggle=False).spacing == 8e-3
+    toggled = pulses_of(rest, output=1, width=None, active_high=True, toggle=True)
+    assert (toggled.width, toggled.spacing) == (None, 4e-3)
+    with pytest.raises(ValueError, match="a toggled output has no pulse width"):
+        pulses_of(rest, output=1, width=4e-3, active_high=True, toggle=True)
+
+
+# what comes of it
+
+
+@given(
+    start=st.integers(-1000, 33_000),  # the longest train from there just ends within the stage's 100 deg
+    interval=st.integers(100, 3000).map(lambda half: 2 * half),
+    n=st.integers(1, 12),
+    before=st.integers(1, 5000),
+    settings=st.sampled_from([{}, {"toggle": True}, {"active_high": False}]),
+)
+def test_pulses_come_at_their_counts_from_wherever_it_stands(
+    start: int, interval: int, n: int, before: int, settings: dict[str, Any]
+) -> None:
+    train = TriggerTrain(start, interval, n)
+    bench = Rig(active_high=settings.get("active_high", True)).bench(**settings)
+    stage = bench.stage
+    stage.start_move(stage.to_angle(max(start - before, -5000)), SPEED)
+    stage.wait(LONG)
+    stage.arm(train)
+    stage.start_move(stage.to_angle(train.end + 500), SPEED)
+    stage.wait(LONG)
+    assert counts_of(bench) == points(train)
+    assert stage.remaining_pulses() == 0
+    stage.close()
+
+
+def test_latency_of_the_firmware_shifts_all_pulses_by_the_same_angle() -> None:
+    """Two actions one after the other, each 1 ms late, at 10 000 counts/s: 20 counts."""
+    bench = Rig(latency=1e-3).bench()
+    train = TriggerTrain(5000, 200, 100)
+    bench.stage.arm(train)
+    bench.go(40.0)
+    assert counts_of(bench) == [count + 20 for count in points(train)]
+
+
+def test_pulse_times_are_those_of_the_closed_form() -> None:
+    bench = Rig().bench()
+    limits = bench.stage.limits
+    begun = bench.clock.now()
+    bench.stage.arm(bench.train(0.5, 0.5, 60))
+    bench.stage.start_move(math.radians(40), SPEED)
+    bench.stage.wait(LONG)
+    ramp = SPEED / limits.acceleration
+    for pulse in bench.pulses():
+        way = 0.5 * SPEED * ramp
+        expected = math.sqrt(2 * pulse.angle / limits.acceleration)
+        if pulse.angle > way:
+            expected = ramp + (pulse.angle - way) / SPEED
+        assert pulse.time - begun == pytest.approx(expected, rel=1e-4)
+    assert len(bench.pulses()) == 60
+
+
+def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle() -> None:
+    rig = Rig()
+    bench = rig.bench(toggle=True)
+    for first, stand in ((1.0, 5.0), (6.0, 6.2)):
+        bench.stage.arm(bench.train(first, 1.0, 3))
+        bench.go(stand)
+        bench.stage.disarm()
+        assert rig.say("/1 0 io get do 1") == "0"
+    assert len(bench.pulses()) == 4
+
+
+# firmware that is less able
+
+
+def test_firmware_without_schedule_says_so_and_is_served_by_toggling() -> None:
+    rig = Rig(can_schedule=False)
+    bench = rig.bench()
+    with pytest.raises(DeviceRefused, match=r"cannot be set up.*schedule.*toggle.*not armed"):
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+    bench.go(10.0)
+    assert bench.pulses() == []
+    bench.stage.close()
+    rig.bench(toggle=True).stage.close()
+
+
+def test_firmware_whose_actions_enable_no_triggers_says_so_and_is_served_unchained() -> None:
+    rig = Rig(can_chain=False)
+    bench = rig.bench()
+    train = bench.train(10.0, 1.0, 5)
+    with pytest.raises(DeviceRefused, match="chained"):
+        bench.stage.arm(train)
+    bench.stage.close()
+    bench = rig.bench(pulses=PulseSettings(chained=False))
+    bench.stage.arm(train)
+    assert math.degrees(bench.stage.position()) == pytest.approx(9.0)
+    assert bench.stage.remaining_pulses() == 5
+    bench.go(20.0)
+    assert counts_of(bench) == points(train)
+
+
+@pytest.mark.parametrize(("back", "pulses"), [(8.5, 0), (9.0, 5)])
+def test_an_unchained_train_ends_when_it_is_turned_away_from(back: float, pulses: int) -> None:
+    bench = Rig(can_chain=False).bench(pulses=PulseSettings(chained=False))
+    bench.stage.arm(bench.train(10.0, 1.0, 5))
+    bench.go(back)
+    bench.go(20.0)
+    assert len(bench.pulses()) == pulses
+
+
+def test_an_unchained_train_without_room_before_it_is_refused() -> None:
+    bench = Rig(can_chain=False).bench(pulses=PulseSettings(chained=False))
+    bench.go(-5.0)
+    with pytest.raises(DeviceRefused, match="room for one step"):
+        bench.stage.arm(bench.train(-4.5, 1.0, 5))
+
+
+def test_firmware_without_triggers_turns_but_does_not_arm() -> None:
+    bench = Rig(firmware="7.05").bench()
+    assert not bench.stage.limits.trigger_output
+    with pytest.raises(DeviceRefused, match=r"7\.05 has no triggers.*7\.06"):
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+    assert bench.go(3.0) == pytest.approx(3.0)
+
+
+def test_an_odd_interval_cannot_be_toggled() -> None:
+    bench = Rig().bench(toggle=True)
+    with pytest.raises(DeviceRefused, match=r"cannot be emitted.*even"):
+        bench.stage.arm(TriggerTrain(1000, 501, 3))
+
+
+def test_a_train_that_a_dead_program_left_behind_gives_nothing() -> None:
+    rig = Rig()
+    rig.say("/1 trigger 1 when 1 pos >= 100", "/1 trigger 1 action a io set do 1 t", "/1 trigger 1 enable")
+    bench = rig.bench()
+    bench.go(5.0)
+    assert bench.pulses() == []
+
+
+def test_closing_takes_an_armed_train_away() -> None:
+    rig = Rig()
+    bench = rig.bench()
+    bench.stage.arm(bench.train(1.0, 1.0, 30))
+    bench.stage.close()
+    assert rig.say("/1 0 trigger show") == "d d d d d d"
+
+
+def test_a_setting_lost_on_the_way_is_noticed_and_nothing_is_emitted() -> None:
+    for lost in ("when 1 dist", "when 1 pos", "action a io", "action b trigger", "trigger 1 enable"):
+        rig = Rig()
+        bench = rig.bench()
+        rig.lose(lost)
+        with pytest.raises(DeviceError, match=f"no whole reply.*{lost}"):
+            bench.stage.arm(bench.train(1.0, 1.0, 3))
+        rig.lose("nothing")
+        bench.go(20.0)
+        assert bench.pulses() == []

@@ -1,0 +1,171 @@
+"""Metrics against closed forms and against skimage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from recon.assess.metrics import inscribed_cuboid, kmeans_mask, nrmse, psnr, snr_cnr, ssim2d, ssim3d
+
+
+def blobs(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    grid = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
+    total = np.zeros(shape)
+    for _ in range(6):
+        centre = [rng.uniform(0, n) for n in shape]
+        total += np.exp(-sum((g - c) ** 2 for g, c in zip(grid, centre, strict=True)) / (2 * rng.uniform(1, 5) ** 2))
+    return total
+
+
+@given(peak=st.floats(0.1, 100), error=st.floats(1e-3, 10))
+def test_psnr_of_a_constant_error(peak: float, error: float) -> None:
+    truth = np.array([0.0, peak, peak / 2])
+    assert psnr(truth, truth + error) == pytest.approx(20 * np.log10(peak / error), abs=1e-6)
+    assert psnr(truth, truth + error, peak=1.0) == pytest.approx(-20 * np.log10(error), abs=1e-6)
+
+
+def test_psnr_and_nrmse_agree_with_skimage(rng: np.random.Generator) -> None:
+    metrics = pytest.importorskip("skimage.metrics")
+    truth = blobs(rng, (8, 9, 10)).astype(np.float32)
+    volume = (truth + rng.normal(0, 0.1, truth.shape)).astype(np.float32)
+    theirs = metrics.peak_signal_noise_ratio(truth, volume, data_range=float(truth.max()))
+    assert psnr(truth, volume) == pytest.approx(theirs, abs=1e-4)
+    assert nrmse(truth, volume) == pytest.approx(metrics.normalized_root_mse(truth, volume), rel=1e-5)
+    assert psnr(truth, truth) == np.inf
+    assert nrmse(truth, truth) == 0
+
+
+@pytest.mark.parametrize("shape", [(40, 53), (11, 30)])
+@pytest.mark.parametrize("data_range", [None, 2.5])
+def test_ssim2d_is_skimage_on_the_interior(
+    rng: np.random.Generator, shape: tuple[int, int], data_range: float | None
+) -> None:
+    metrics = pytest.importorskip("skimage.metrics")
+    truth = blobs(rng, shape)
+    image = truth + rng.normal(0, 0.2, shape)
+    theirs = metrics.structural_similarity(
+        truth,
+        image,
+        data_range=np.ptp(truth) if data_range is None else data_range,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    assert ssim2d(truth, image, data_range) == pytest.approx(theirs, abs=1e-9)
+
+
+def test_ssim3d_is_the_mean_over_three_directions_of_slices(rng: np.random.Generator) -> None:
+    truth = blobs(rng, (35, 14, 17)).astype(np.float32)
+    volume = (truth + rng.normal(0, 0.15, truth.shape)).astype(np.float32)
+    span = float(np.ptp(truth))
+    directions = [
+        np.mean([ssim2d(truth.take(i, axis), volume.take(i, axis), span) for i in range(truth.shape[axis])])
+        for axis in range(3)
+    ]
+    assert ssim3d(truth, volume) == pytest.approx(np.mean(directions), abs=1e-5)
+    assert ssim3d(truth, truth) == pytest.approx(1, abs=1e-6)
+
+
+def test_ssim3d_of_two_slices_only(rng: np.random.Generator) -> None:
+    truth = blobs(rng, (2, 20, 20))
+    assert ssim3d(truth, truth) == pytest.approx(1, abs=1e-6)
+    assert 0 < ssim3d(truth, truth + rng.normal(0, 0.1, truth.shape)) < 1
+
+
+def test_ssim_of_a_shift_in_brightness_is_its_luminance_term() -> None:
+    """Constant images a and b: (2ab + C1) / (a² + b² + C1) (Wang et al. 2004, eq. 6), the structure term being 1."""
+    a, b, span = 0.4, 0.7, 1.0
+    c1 = (0.01 * span) ** 2
+    expected = (2 * a * b + c1) / (a * a + b * b + c1)
+    assert ssim2d(np.full((20, 20), a), np.full((20, 20), b), span) == pytest.approx(expected)
+    cube = np.full((12, 12, 12), a), np.full((12, 12, 12), b)
+    assert ssim3d(*cube, span) == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_of_values_far_from_zero_is_not_rounding(rng: np.random.Generator) -> None:
+    truth = blobs(rng, (12, 20, 20))
+    volume = truth + rng.normal(0, 0.1, truth.shape)
+    slices = [zip(np.moveaxis(truth, k, 0), np.moveaxis(volume, k, 0), strict=True) for k in range(3)]
+    expected = np.mean([np.mean([ssim2d(a + 1e4, b + 1e4, 2.0) for a, b in pairs]) for pairs in slices])
+    assert ssim3d(truth + 1e4, volume + 1e4, 2.0) == pytest.approx(expected, abs=2e-3)
+
+
+def particles(rng: np.random.Generator, noise: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """A can (bright wall at the rim) with dense particles inside, [z, y, x]."""
+    z, y, x = np.meshgrid(np.arange(30), np.arange(64), np.arange(64), indexing="ij")
+    inside = np.zeros(z.shape, bool)
+    for cz, cy, cx in [(8, 24, 30), (20, 40, 36), (15, 30, 42)]:
+        inside |= (z - cz) ** 2 + (y - cy) ** 2 + (x - cx) ** 2 < 36
+    volume = np.where(inside, 3.0, 1.0) + rng.normal(0, noise, z.shape)
+    volume[np.hypot(y - 31.5, x - 31.5) > 29] = 20
+    return volume.astype(np.float32), inside
+
+
+def test_kmeans_finds_the_particles_and_leaves_the_wall_out(rng: np.random.Generator) -> None:
+    volume, inside = particles(rng, 0.1)
+    mask = kmeans_mask(volume, seed=1)
+    box = inscribed_cuboid(volume.shape)
+    np.testing.assert_array_equal(mask[box] == 1, inside[box])
+    outside = np.ones(volume.shape, bool)
+    outside[box] = False
+    assert (mask[outside] == -1).all()
+    assert (mask[box] >= 0).all()
+    np.testing.assert_array_equal(mask, kmeans_mask(volume, seed=2))
+
+
+def test_snr_and_cnr_in_closed_form(rng: np.random.Generator) -> None:
+    volume, _ = particles(rng, 0.1)
+    snr, cnr = snr_cnr(volume, kmeans_mask(volume))
+    assert snr == pytest.approx(20 * np.log10(3 / 0.1), abs=0.1)
+    assert cnr == pytest.approx(20 * np.log10(2 / 0.1), abs=0.1)
+
+
+def test_snr_of_exact_numbers() -> None:
+    volume = np.array([[[5.0, 5.0, 1.0, 3.0, 99.0]]])
+    mask = np.array([[[1, 1, 0, 0, -1]]], np.int8)  # μ = 5, μ_b = 2, σ_b = 1
+    assert snr_cnr(volume, mask) == pytest.approx((20 * np.log10(5), 20 * np.log10(3)))
+    assert snr_cnr(volume[..., :4], mask[..., :4].astype(bool)) == pytest.approx((20 * np.log10(5), 20 * np.log10(3)))
+    flat = np.array([[[5.0, 5.0, 1.0, 1.0]]])
+    assert snr_cnr(flat, mask[..., :4]) == (np.inf, np.inf)
+    assert snr_cnr(-flat, mask[..., :4]) == (-np.inf, np.inf)
+
+
+@given(shape=st.tuples(st.integers(1, 40), st.integers(1, 60), st.integers(1, 60)), margin=st.floats(0, 0.49))
+def test_the_cuboid_lies_in_the_cylinder(shape: tuple[int, int, int], margin: float) -> None:
+    box = inscribed_cuboid(shape, margin)
+    for part, n in zip(box, shape, strict=True):
+        assert 0 <= part.start < part.stop <= n
+        assert part.start + part.stop in (n - 1, n, n + 1)  # centred
+    half_y, half_x = ((part.stop - part.start) / 2 for part in box[1:])
+    assert np.hypot(half_y, half_x) <= min(shape[1:]) / 2 + np.sqrt(2)  # the corners, to a voxel
+
+
+def test_bad_input_is_refused() -> None:
+    ones = np.ones((12, 12, 12))
+    with pytest.raises(ValueError, match=r"\(12, 12, 12\).*\(11, 12, 12\)"):
+        psnr(ones, ones[1:])
+    with pytest.raises(ValueError, match="peak must be positive"):
+        psnr(-ones, ones)
+    with pytest.raises(ValueError, match="zero everywhere"):
+        nrmse(0 * ones, ones)
+    with pytest.raises(ValueError, match="data range must be positive"):
+        ssim3d(ones, ones)
+    with pytest.raises(ValueError, match="row, col"):
+        ssim2d(ones, ones)
+    with pytest.raises(ValueError, match="z, y, x"):
+        ssim3d(ones[0], ones[0])
+    with pytest.raises(ValueError, match="all voxels are 1"):
+        kmeans_mask(ones)
+    with pytest.raises(ValueError, match="NaN"):
+        kmeans_mask(ones * np.nan)
+    with pytest.raises(ValueError, match="margin"):
+        inscribed_cuboid((3, 3, 3), 0.5)
+    with pytest.raises(ValueError, match="0 dense and 1728 empty"):
+        snr_cnr(ones, np.zeros(ones.shape, np.int8))
+    with pytest.raises(ValueError, match="NaN"):
+        snr_cnr(ones * np.nan, np.eye(12, dtype=np.int8)[None].repeat(12, 0))
+    with pytest.raises(ValueError, match="the mask"):
+        snr_cnr(ones, np.zeros((1, 1, 1), np.int8))

@@ -1,0 +1,78 @@
+"""Pixels that tell nothing: what stands in for them, and what they weigh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.base.masks import masked
+
+
+def test_whole_data_pass_as_they_are(rng: np.random.Generator) -> None:
+    data, weight = rng.random((2, 3, 4), np.float32), rng.random((2, 3, 4), np.float32) + 0.1
+    assert masked(data)[0] is data and masked(data)[1] is None
+    assert masked(data, weight)[0] is data and masked(data, weight)[1] is weight
+
+
+def test_what_is_not_finite_weighs_nothing_and_takes_its_neighbours_mean() -> None:
+    data = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    data[1, 1, 1], data[1, 1, 2], data[0, 0, 0] = np.nan, np.inf, -np.inf
+    before = data.copy()
+    filled, weight = masked(data)
+    assert weight is not None
+    np.testing.assert_array_equal(data, before)
+    np.testing.assert_array_equal(weight == 0, ~np.isfinite(data))
+    assert set(np.unique(weight)) == {0, 1}
+    assert filled[0, 0, 0] == pytest.approx((1 + 4 + 5) / 3)
+    assert filled[1, 1, 1] == pytest.approx((12 + 13 + 14 + 16 + 20 + 21 + 22) / 7)
+    np.testing.assert_array_equal(filled[np.isfinite(data)], data[np.isfinite(data)])
+
+
+def test_rays_of_no_weight_are_filled_too_and_others_keep_theirs() -> None:
+    data, weight = np.ones((1, 4, 4), np.float32), np.full((1, 4, 4), 0.25, np.float32)
+    data[0, 2, 2], weight[0, 2, 2] = 1e9, 0  # a saturated pixel, say
+    data[0, 0, 3] = np.nan
+    filled, given_back = masked(data, weight)
+    assert given_back is not None
+    np.testing.assert_array_equal(filled, np.ones((1, 4, 4)))
+    assert given_back[0, 2, 2] == 0 == given_back[0, 0, 3] and given_back[0, 0, 0] == 0.25
+
+
+def test_values_beyond_the_largest_count_as_not_finite() -> None:
+    data = np.ones((1, 4, 4), np.float32)
+    data[0, 0, 0], data[0, 2, 2], data[0, 3, 0] = 1e30, -1e7, 99.0
+    filled, weight = masked(data, largest=100.0)
+    assert weight is not None
+    np.testing.assert_array_equal(np.argwhere(weight[0] == 0), [[0, 0], [2, 2]])
+    np.testing.assert_array_equal(filled[0, 0, 0], 1.0)
+    assert masked(data)[1] is None and masked(data, largest=1e300)[1] is None
+    with pytest.raises(ValueError, match=r"1 of 1 views have no value that is finite, within ±0\.5"):
+        masked(data, largest=0.5)
+
+
+@pytest.mark.parametrize(
+    ("data", "weight", "message"),
+    [
+        (np.full((2, 2, 2), np.nan), None, "2 of 2 views have no value"),
+        (np.ones((1, 2, 2)), np.zeros((1, 2, 2)), "leave these views out"),
+        (np.ones((1, 2, 2)), -np.ones((1, 2, 2)), "0 or more"),
+        (np.ones((1, 2, 2)), np.full((1, 2, 2), np.nan), "finite"),
+        (np.ones((1, 2, 2)), np.ones((2, 2)), "shape"),
+    ],
+)
+def test_what_cannot_be_filled_is_refused(data: np.ndarray, weight: np.ndarray | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        masked(data.astype(np.float32), None if weight is None else weight.astype(np.float32))
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.floats(0, 0.99), st.integers(0, 1000))
+def test_what_is_filled_lies_between_what_is_known(rows: int, cols: int, share: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = rng.normal(size=(1, rows, cols)).astype(np.float32)
+    data[0][rng.random((rows, cols)) < share] = np.nan
+    data[0, 0, 0] = 1
+    filled, _ = masked(data)
+    low, high = np.nanmin(data), np.nanmax(data)
+    assert (filled >= low - 1e-6).all() and (filled <= high + 1e-6).all()

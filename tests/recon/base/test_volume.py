@@ -1,0 +1,135 @@
+"""The box of a fit: it holds what the views see however they are shifted, whatever volume is wanted of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.reconstruction import Reconstruction, reconstruct
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import place
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project, voxelize
+
+TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+
+
+def _sample(width: float, height: float, seed: int = 0) -> Gaussians:
+    """Blobs in a cylinder of this radius and half height, one of them at its rim."""
+    rng = np.random.default_rng(seed)
+    angle, radius = rng.uniform(0, 2 * np.pi, 25), width * np.sqrt(rng.uniform(0, 1, 25))
+    radius[0] = width
+    means = np.stack((radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-height, height, 25)), 1)
+    return Gaussians.from_physical(means, np.full((25, 3), 1.5), rng.uniform(0.05, 0.1, 25))
+
+
+def _fitted(data: np.ndarray, views: Geometry, grid: Grid | None = None, **options: object) -> Reconstruction:
+    return reconstruct(data, views, grid, **({"steps": 60, "gaussians": 600} | options))  # type: ignore[arg-type]
+
+
+def test_a_shift_of_all_views_is_fitted_as_an_axis_elsewhere() -> None:
+    # A detector beside the axis sees one half of the sample at a time.
+    moved = Geometry.parallel(TURN, (10, 32), axis_col=29.5)
+    shifted = Geometry.parallel(TURN, (10, 32), shifts=np.tile([14.0, 0.0], (48, 1)))
+    data, same = (project(_sample(24.0, 3.0), views).numpy() for views in (moved, shifted))
+    np.testing.assert_allclose(same, data, atol=1e-5 * data.max())
+    grid = Grid((10, 60, 60))
+    one, other = (_fitted(data, views, grid) for views in (moved, shifted))
+    np.testing.assert_allclose(other.volume.data, one.volume.data, atol=1e-3 * float(one.volume.data.max()))
+    assert other.history[-1].residual < 0.2
+
+
+def test_views_that_jump_along_the_axis_find_all_matter() -> None:
+    # Ten rows that see the lower half of a sample of twenty in one view, the upper half in the next, and no middle.
+    jumps = np.stack((np.zeros(48), np.where(np.arange(48) % 2, 10.0, -10.0)), 1)
+    views = Geometry.parallel(TURN, (10, 32), shifts=jumps)
+    sample = _sample(9.0, 3.0)
+    means = np.concatenate([sample.means.numpy() + np.array([0, 0, z], np.float32) for z in (-10.0, 10.0)])
+    both = Gaussians.from_physical(means, np.full((50, 3), 1.5), np.tile(sample.densities.double().numpy(), 2))
+    field = Grid.of_field(views, 1.0)
+    assert field == Grid((30, 32, 32))
+    placed = place(project(both, views).numpy(), views, field, 600, np.random.default_rng(0))
+    heights = placed.means.numpy()[:, 2]
+    assert (heights < -5).mean() > 0.35 and (heights > 5).mean() > 0.35
+    found = _fitted(project(both, views).numpy(), views, field).volume.data.sum(axis=(1, 2))
+    expected = voxelize(both, field).numpy().sum(axis=(1, 2))
+    for half in (slice(0, 10), slice(20, 30)):
+        assert found[half].sum() == pytest.approx(expected[half].sum(), rel=0.15)
+
+
+def _shifted(*shifts: tuple[float, float]) -> Geometry:
+    """Views of 10 x 32 pixels of half a millimetre, shifted like these (col, row) in turn."""
+    return Geometry.parallel(TURN, (10, 32), 0.5, shifts=np.resize(np.array(shifts), (48, 2)))
+
+
+def test_a_shift_of_all_views_moves_the_matching_volume_as_the_axis_row_does() -> None:
+    said = Geometry.parallel(TURN, (10, 32), 0.5, axis_row=11.5)
+    found = Grid.matching(_shifted((14.0, 7.0)))
+    assert found == Grid.matching(said)
+    assert found.centre[0] == pytest.approx(Grid.for_fit(_shifted((0.0, 7.0)), found).centre[0])
+
+
+def test_the_matching_volume_holds_what_views_that_jump_see() -> None:
+    up_and_down, sideways = _shifted((0.0, 10.0), (0.0, -10.0)), _shifted((16.0, 0.0), (-16.0, 0.0))
+    for views, shape in ((up_and_down, (30, 32, 32)), (sideways, (10, 64, 64))):
+        assert Grid.matching(views).shape == shape
+        assert Grid.matching(views) == Grid.for_fit(views, Grid.matching(views))
+    uneven = Grid.matching(_shifted((0.0, 3.0), (0.0, 3.0), (0.0, 3.0), (0.0, 9.0)))  # a quarter sees six rows more
+    assert uneven.shape == (10, 32, 32) and uneven.centre[0] == pytest.approx(-1.5)
+
+
+def test_small_shifts_leave_the_matching_volume_the_size_of_the_detector() -> None:
+    jitter = np.random.default_rng(0).uniform(-1.5, 1.5, (48, 2))
+    views = Geometry.parallel(TURN, (10, 32), shifts=jitter)
+    volume = Grid.matching(views)
+    assert volume.shape == (10, 32, 32) and abs(volume.centre[0]) < 0.5
+    box = Grid.for_fit(views, volume)
+    assert (box.edges[0] <= volume.edges[0]).all() and (volume.edges[1] <= box.edges[1]).all()
+
+
+def test_a_volume_of_no_stated_size_shows_all_heights_that_jumping_views_see() -> None:
+    views = Geometry.parallel(TURN, (10, 32), shifts=np.resize([[0.0, 10.0], [0.0, -10.0]], (48, 2)))
+    result = reconstruct(project(_sample(9.0, 12.0), views).numpy(), views, method="fbp")
+    planes = np.abs(result.volume.data).sum(axis=(1, 2))
+    assert result.volume.grid.shape[0] == 30 and (planes[:10] > 0).all() and (planes[20:] > 0).all()
+
+
+def test_an_axis_beyond_the_detector_is_no_end_of_the_field() -> None:
+    views = Geometry.parallel(TURN, (6, 48), axis_col=-20.0)  # sees what lies 19.5 to 67.5 pixels from the axis
+    ring = Gaussians.from_physical([[59.0, 11.0, 0.0], [-50.0, -33.0, 0.5]], np.full((2, 3), 2.0), [0.1, 0.1])
+    placed = place(project(ring, views).numpy(), views, Grid.of_field(views, 1.0), 300, np.random.default_rng(0))
+    near = np.linalg.norm(placed.means.numpy()[:, None] - ring.means.numpy()[None], axis=2).min(axis=1)
+    assert (near < 6).mean() > 0.3  # the others are on streaks: each point is seen from a third of the circle
+
+
+@pytest.mark.parametrize("edge", [1.0, 2.0, 32.0])
+def test_a_box_of_any_size_and_voxels_holds_what_the_whole_volume_holds_there(edge: float) -> None:
+    # The fit is that of voxels from one to four pixels wherever they are wanted: four for those of thirty-two.
+    views = Geometry.parallel(TURN[::2] / 2, (16, 32))
+    data = project(_sample(9.0, 5.0), views).numpy()
+    whole = Grid((16, 32, 32), 1.0)
+    small = Grid((1, 1, 1), edge, centre=(0.5, 2.5, -1.5))
+    like = _fitted(data, views, Grid((4, 8, 8), min(edge, 4.0)))
+    found = _fitted(data, views, small)
+    assert found.gaussians is not None and like.gaussians is not None
+    np.testing.assert_array_equal(found.gaussians.means.numpy(), like.gaussians.means.numpy())
+    everywhere = voxelize(found.gaussians, whole).numpy()
+    np.testing.assert_allclose(found.volume.data[0, 0, 0], everywhere[8, 18, 14], atol=1e-3 * everywhere.max())
+    assert found.history[-1].residual < 0.2
+
+
+@pytest.mark.parametrize("turn", [TURN, 0.7 * TURN])
+def test_a_cone_too_wide_for_a_box_of_its_pixels_is_fitted(turn: np.ndarray) -> None:
+    # The detector's half width at the axis is 20 mm, and so far away is the source, but for 2 mm.
+    views = Geometry.cone(turn, (9, 40), 2.0, 22.0, 44.0)
+    data = project(_sample(9.0, 2.0), views).numpy()
+    result = _fitted(data, views, Grid((9, 24, 24)))
+    assert result.history[-1].residual < 0.3
+
+
+def test_what_cannot_be_joined_is_told_before_anything_is_placed() -> None:
+    views = Geometry.parallel(TURN, (1, 32))
+    with pytest.raises(ValueError, match="coarse=2 joins 2 x 2 pixels, and the detector has 1 x 32"):
+        reconstruct(np.zeros((48, 1, 32)), views, steps=5, settings=FitSettings(coarse=2))

@@ -1,0 +1,156 @@
+"""The CPU backend keeps the protocol's promises: copies, shared memory, sums; and which device gets which backend."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numba import get_num_threads, set_num_threads
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
+from recon.base.volume import Grid
+from recon.splatting.backend import Cpu, backend_for
+from recon.splatting.gaussians import Gaussians
+from tests.recon.conftest import Make
+
+F32 = NDArray[np.float32]
+UNIT = 0.7
+CUT = (1e-3, 3.5)  # faint, σ
+
+
+def begin(backend: Cpu, g: Gaussians):  # type: ignore[no-untyped-def]
+    names = ("means", "log_scales", "quaternions", "raw_densities")
+    return backend.begin(*(g.arrays()[name] for name in names), UNIT)
+
+
+def geometry(shape: tuple[int, int]) -> Geometry:
+    return Geometry.parallel([0.7, 1.9], shape, pixel_pitch=0.5)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_misfit_is_the_ratio_of_norms(weighted: bool, rng: np.random.Generator) -> None:
+    image, target, w = rng.normal(size=(3, 9, 14)).astype(np.float32)
+    weights = np.abs(w) if weighted else None
+    factor = 1.0 if weights is None else weights.astype(np.float64)
+    expected = np.linalg.norm(factor * (image.astype(np.float64) - target)) / np.linalg.norm(factor * target)
+    assert Cpu().misfit(image, target, weights) == pytest.approx(expected, rel=1e-6)
+    assert Cpu().misfit(image, np.zeros_like(image), weights) == 0
+
+
+def test_lengths_are_added(rng: np.random.Generator) -> None:
+    vectors, sums = rng.normal(size=(50, 2)).astype(np.float32), np.full(50, 2.0, np.float32)
+    Cpu().add_lengths(vectors, 3.5, sums)
+    np.testing.assert_allclose(sums, 2 + 3.5 * np.hypot(*vectors.T), rtol=1e-6)
+
+
+def test_arrays_come_and_go_as_copies() -> None:
+    values = np.ones(4, np.float32)
+    array = Cpu().array(values)
+    back = Cpu().numpy(array)
+    values[0], array[1] = 5, 6
+    np.testing.assert_array_equal(array, [1, 6, 1, 1])
+    np.testing.assert_array_equal(back, 1)
+
+
+def test_views_of_any_shape_one_after_the_other_are_those_of_a_fresh_backend(
+    random_gaussians: Make, rng: np.random.Generator
+) -> None:
+    # Detectors and models of other sizes take turns, as in a fit that begins on joined pixels and then grows.
+    backend, models = Cpu(), (random_gaussians(30, 8.0), random_gaussians(45, 8.0))
+    for g, shape, view in ((0, (15, 22), 0), (1, (15, 22), 1), (1, (31, 9), 0), (0, (15, 22), 1), (0, (15, 22), 0)):
+        slope = rng.normal(size=shape).astype(np.float32)
+        results = []
+        for source in (backend, Cpu()):
+            run = begin(source, models[g])
+            seen = run.view(geometry(shape), view, *CUT, RayModel())
+            image = seen.image.copy()
+            results.append((image, seen.backward(slope), *run.gradients()))
+        for ours, fresh in zip(*results, strict=True):
+            np.testing.assert_array_equal(ours, fresh)
+
+
+def test_memory_made_for_other_threads_gives_the_same_view(random_gaussians: Make) -> None:
+    g, views, threads = random_gaussians(30, 8.0), geometry((15, 22)), get_num_threads()
+    backend, images = Cpu(), []
+    try:
+        for count in (1, threads, 1):
+            set_num_threads(count)
+            images.append(begin(backend, g).view(views, 0, *CUT, RayModel()).image)
+    finally:
+        set_num_threads(threads)
+    for image in images[1:]:
+        np.testing.assert_allclose(image, images[0], atol=1e-6 * float(images[0].max()))
+
+
+def test_views_gone_back_in_turn_add_up_and_keep_their_images(random_gaussians: Make, rng: np.random.Generator) -> None:
+    g, views, slopes = random_gaussians(30, 8.0), geometry((15, 22)), rng.normal(size=(2, 15, 22)).astype(np.float32)
+    apart = []
+    for view, slope in enumerate(slopes):
+        run = begin(Cpu(), g)
+        seen = run.view(views, view, *CUT, RayModel())
+        seen.backward(slope)
+        apart.append((seen.image, run.gradients()))
+    run, images = begin(Cpu(), g), []
+    for view, slope in enumerate(slopes):
+        seen = run.view(views, view, *CUT, RayModel())
+        images.append(seen.image)
+        seen.backward(slope)
+    for image, (expected, _) in zip(images, apart, strict=True):
+        np.testing.assert_array_equal(image, expected)  # the next view shares memory, but not the image
+    for both, one, other in zip(run.gradients(), apart[0][1], apart[1][1], strict=True):
+        np.testing.assert_allclose(both, one + other, atol=2e-6 * float(np.abs(both).max()))
+
+
+def test_a_box_leaves_positions_alone_where_asked(random_gaussians: Make, rng: np.random.Generator) -> None:
+    g, grid = random_gaussians(20, 8.0), Grid((6, 7, 8), 0.9)
+    slope, found = rng.normal(size=grid.shape).astype(np.float32), []
+    for means_too in (True, False):
+        run = begin(Cpu(), g)
+        run.box(grid, *CUT).backward(slope, means_too=means_too)
+        found.append(run.gradients())
+    assert found[0][0].any() and not found[1][0].any()
+    for with_means, without in zip(found[0][1:], found[1][1:], strict=True):
+        np.testing.assert_array_equal(with_means, without)
+
+
+def test_bounds_hold_after_an_update_and_none_is_none(rng: np.random.Generator) -> None:
+    p = [rng.normal(size=(40, width)).astype(np.float32) for width in (3, 3, 4, 1)]
+    slopes = [rng.normal(size=a.shape).astype(np.float32) for a in p]
+    free = [a.copy() for a in p]
+    for arrays, limits in ((p, (None, (-0.4, 0.6), None, None)), (free, (None,) * 4)):
+        first, second = ([np.zeros_like(a) for a in arrays] for _ in range(2))
+        Cpu().adam(arrays, slopes, first, second, (0.1,) * 4, 1, limits)
+    for k, (held, loose) in enumerate(zip(p, free, strict=True)):
+        np.testing.assert_array_equal(held, np.clip(loose, np.float32(-0.4), np.float32(0.6)) if k == 1 else loose)
+    assert float(free[1].min()) < -0.4 and float(free[1].max()) > 0.6
+
+
+def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert isinstance(backend_for("cpu"), Cpu)
+    for unknown in ("mps", "gpu", "CUDA", "cuda1", "cuda:", "cuda:one", "cuda:-1", "cuda:0,1", ""):
+        with pytest.raises(ValueError, match=rf"'{unknown}' was asked for.*'cpu' or on 'cuda'.*name one of these"):
+            backend_for(unknown)
+    for name in [name for name in sys.modules if name.startswith("recon.kernels.gpu")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "triton", None)  # as if it were not installed
+    for device in ("cuda", "cuda:1"):
+        with pytest.raises(ImportError, match=r"splatline\[gpu\]"):
+            backend_for(device)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a CUDA device")
+@pytest.mark.parametrize("device", ["cuda", "cuda:0", "cuda:1"])
+def test_a_cuda_device_that_is_not_there_is_said_by_name(device: str) -> None:
+    pytest.importorskip("triton")
+    from recon.kernels import gpu
+
+    if gpu.interpreted():
+        pytest.skip("the interpreter stands in for any device")
+    with pytest.raises(
+        RuntimeError, match=rf"device {device} was asked for, but torch .* sees no CUDA device.*on the cpu"
+    ):
+        backend_for(device)

@@ -1,0 +1,99 @@
+"""Polish: a small system by hand, nothing to add where nothing is missing, edges won, boxes inside the field."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.reconstruction import reconstruct
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.polish import polish
+from recon.splatting.splat import project, voxelize
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+VIEWS = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (8, 40))
+GRID = Grid.matching(VIEWS)
+
+
+def _blob(at: float = 0.0) -> Gaussians:
+    return Gaussians.from_physical(np.array([[at, 2.0, 0.0]]), np.full((1, 3), 3.0), np.array([0.5]), density_unit=0.5)
+
+
+def _box(grid: Grid = GRID) -> F32:
+    """A piece of matter with edges: what Gaussians do badly."""
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    return (0.3 * ((abs(x + 4) < 5) & (abs(y) < 8) & (abs(z) < 3))).astype(np.float32)
+
+
+def _of(g: Gaussians, grid: Grid = GRID) -> Volume:
+    return Volume(voxelize(g, grid).numpy(), grid)
+
+
+def test_a_model_that_explains_all_is_only_smoothed() -> None:
+    g = _blob()
+    volume = _of(g)
+    polished = polish(volume, g, project(g, VIEWS).numpy(), VIEWS, 3)
+    assert np.abs(polished.data - volume.data).max() < 0.02 * volume.data.max()
+
+
+def test_voxels_add_what_the_gaussians_lack() -> None:
+    g, missing = _blob(8.0), _box()
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)
+    truth = _of(g).data + missing
+    qualities = [psnr(truth, _of(g).data)]
+    qualities += [psnr(truth, polish(_of(g), g, data, VIEWS, sweeps).data) for sweeps in (1, 3, 9)]
+    assert all(later > before + 1 for before, later in pairwise(qualities))
+    assert qualities[-1] > 30
+
+
+def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
+    # A box without the blob: its views must not be spread over what is inside.
+    g = _blob(12.0)
+    small = Grid((8, 40, 18), 1.0, (0.0, 0.0, -8.0))
+    missing = _box(small)
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, small).forward(missing)
+    polished = polish(_of(g, small), g, data, VIEWS, 9)
+    assert psnr(missing + _of(g, small).data, polished.data) > 30
+
+
+def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
+    g = _blob(8.0)
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())
+    bad = np.zeros(data.shape, bool)
+    bad[:, 3:5, 7:9] = True
+    volumes = []
+    for value in (np.nan, np.inf):
+        volumes.append(polish(_of(g), g, np.where(bad, np.float32(value), data), VIEWS, 2).data)
+    np.testing.assert_array_equal(*volumes)
+    weights = (~bad).astype(np.float32)
+    weighed = polish(_of(g), g, np.where(bad, np.float32(1), data), VIEWS, 2, weights=weights).data
+    np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)
+
+
+def test_reconstruct_polishes_and_says_so() -> None:
+    data = Projector(VIEWS, GRID).forward(_box())
+    plain, polished = (reconstruct(data, VIEWS, steps=60, gaussians=300, polish=n) for n in (0, 5))
+    assert psnr(_box(), polished.volume.data) > psnr(_box(), plain.volume.data) + 0.5
+    assert (plain.settings["polish"], polished.settings["polish"]) == (0, 5)
+    # The model is the fit's, whatever voxels add.
+    assert plain.gaussians is not None and polished.gaussians is not None
+    np.testing.assert_array_equal(plain.gaussians.means, polished.gaussians.means)
+
+
+def test_what_cannot_be_is_refused() -> None:
+    data = Projector(VIEWS, GRID).forward(_box())
+    with pytest.raises(ValueError, match="polish must be 0 sweeps or more, got -1"):
+        reconstruct(data, VIEWS, steps=1, polish=-1)
+    with pytest.raises(ValueError, match="polish"):
+        reconstruct(data, VIEWS, method="fbp", polish=2)
+    leaning = Geometry.parallel(VIEWS.angles, VIEWS.detector_shape, tilt=0.1)
+    with pytest.raises(ValueError, match=r"polish .* rolled or tilted"):
+        reconstruct(data, leaning, steps=1, polish=2)

@@ -1,0 +1,202 @@
+"""The data of a fit: units, weights, noise, joined pixels, views that come later."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.base.geometry import Geometry
+from recon.base.ray_model import Truncation
+from recon.base.volume import Grid
+from recon.splatting import optimise as fit
+from recon.splatting.backend import Cpu
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.problem import coarser, extend, make_problem, noise_level
+from recon.splatting.settings import NAMES, FitSettings
+from recon.splatting.splat import project
+
+VIEWS = Geometry.parallel([0.0, 0.9, 2.0], (12, 18), 0.5)
+GRID = Grid.matching(VIEWS)
+
+
+@given(sigma=st.floats(1e-4, 10), seed=st.integers(0, 5))
+def test_the_noise_level_is_that_of_white_noise_on_smooth_views(sigma: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    col = np.linspace(-1, 1, 200)
+    smooth = sigma * 100 * np.sqrt(1 - 0.9 * col**2)
+    views = (smooth + rng.normal(0, sigma, (4, 40, 200))).astype(np.float32)
+    # 32000 second differences: the median's standard error is below one percent.
+    assert noise_level(views) == pytest.approx(sigma, rel=0.06)
+
+
+def test_images_times_scale_are_the_projections(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    problem = make_problem(data, VIEWS, GRID, 0.3, Cpu())
+    assert problem.half_field == pytest.approx(4.5)
+    np.testing.assert_allclose(problem.projections, data, rtol=1e-6)
+    later = extend(problem, data[:1], np.array([1.3]))
+    assert later.geometry.n_views == 4 and later.images[0] is problem.images[0]
+
+
+def test_line_integrals_below_zero_weigh_as_air_does(rng: np.random.Generator) -> None:
+    data = rng.uniform(0.2, 1.5, (3, 12, 18)).astype(np.float32)
+    data[0, ::3, ::4] = -3
+    likely, squares = (make_problem(data, VIEWS, GRID, 0.1, Cpu(), loss=k, ssim_weight=0) for k in ("poisson", "l2"))
+    slopes = []
+    for problem in (likely, squares):
+        image = problem.images[0] + np.float32(0.4)
+        slopes.append(np.array(problem.loss(image, problem.images[0], problem.target_maps[0])[1]))
+    np.testing.assert_allclose(slopes[0], np.exp(-np.maximum(data[0], 0)) * slopes[1], rtol=1e-4)
+
+
+def test_weights_follow_their_pixels(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    data[1, 2:4, 4:6] = np.nan
+    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    assert problem.weights[0] is None and problem.weights[1] is not None
+    expected = np.ones((12, 18))
+    expected[2:4, 4:6] = 0
+    np.testing.assert_array_equal(problem.weights[1], expected)
+    joined = coarser(problem, 2, "l1", 0.25)
+    assert joined.geometry.detector_shape == (6, 9) and joined.weights[1][1, 2] == 0
+    np.testing.assert_allclose(
+        joined.projections[0], data[0].reshape(6, 2, 9, 2).mean(axis=(1, 3)), rtol=1e-5
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("value", [1e7, -1e7, 1e12, 3e38, -3e38])
+@pytest.mark.parametrize("unit", [1e-6, 0.3, 1e6])
+def test_values_that_no_matter_explains_weigh_nothing_and_spread_nowhere(
+    rng: np.random.Generator, value: float, unit: float
+) -> None:
+    scale = 4.5 * unit  # half field (mm) times density unit
+    data = (scale * rng.random((3, 12, 18))).astype(np.float32)
+    spoilt, absent = data.copy(), data.copy()
+    at = np.s_[1, 3:5, 4:9]
+    spoilt[at] = np.clip(value * scale, -3e38, 3e38)
+    absent[at] = np.nan
+    wild, expected = (make_problem(d, VIEWS, GRID, unit, Cpu(), ssim_weight=0.25) for d in (spoilt, absent))
+    image = rng.random((12, 18)).astype(np.float32)
+    assert [w is None for w in wild.weights] == [True, False, True]
+    assert not wild.weights[1][at[1:]].any() and wild.weights[1].sum() == 12 * 18 - 10
+    for view in range(3):
+        # Not only is nothing NaN: it is the very problem in which nothing was measured there.
+        np.testing.assert_array_equal(wild.images[view], expected.images[view])
+        assert np.isfinite(wild.images[view]).all()
+        assert all(np.isfinite(part).all() for part in wild.target_maps[view])
+        loss, slope = wild.loss(image, wild.images[view], wild.target_maps[view], wild.weights[view])
+        assert np.isfinite(float(loss)) and np.isfinite(slope).all()
+        if view == 1:
+            assert not slope[at[1:]].any() and slope.any()
+        assert 0 < float(Cpu().misfit(image, wild.images[view], wild.weights[view])) < 10
+    assert np.isfinite(wild.projections).all()
+
+
+def test_what_is_large_but_can_be_squared_keeps_its_weight(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    data[0, 5, 5] = 0.99e6 * 4.5
+    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    assert problem.weights == (None, None, None)
+    loss, slope = problem.loss(problem.images[1], problem.images[0], problem.target_maps[0], None)
+    assert np.isfinite(float(loss)) and np.isfinite(slope).all()
+
+
+def test_a_fit_goes_on_beside_values_that_no_matter_explains(rng: np.random.Generator) -> None:
+    u = np.arange(18) - 8.5
+    data = np.broadcast_to(np.exp(-(u**2) / 8).astype(np.float32), (3, 12, 18)).copy()
+    start = Gaussians.from_physical(rng.normal(size=(20, 3)), np.ones(20), np.full(20, 0.1), density_unit=0.2)
+    ends = []
+    for value in (np.nan, 1e25):
+        data[2, 5, 6] = value
+        settings = FitSettings(policy=None, tv_size=6, coarse=2, coarse_until=0.5)
+        problem = fit.problem_of(data, VIEWS, GRID, 0.2, settings)
+        rough = coarser(problem, 2, "l1", 0.25)
+        state = fit.run(fit.init(start, 0), rough, settings, 4)
+        ends.append(fit.run(state, problem, settings, 4).parameters)
+    for name in NAMES:
+        assert np.isfinite(ends[1][name]).all()
+        np.testing.assert_array_equal(ends[0][name], ends[1][name])
+
+
+@given(seed=st.integers(0, 1000), share=st.floats(0, 0.9), factor=st.sampled_from([2, 3]))
+def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, factor: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = rng.uniform(0.5, 1.5, (3, 12, 18)).astype(np.float32)
+    weights = rng.uniform(0.1, 2, data.shape).astype(np.float32)
+    weights[rng.random(data.shape) < share] = 0
+    weights[:, 0, 0] = 1  # no view is blind
+    joined = coarser(make_problem(data, VIEWS, GRID, 1.0, Cpu(), weights=weights), factor, "l1", 0.25)
+    rows, cols = 12 // factor, 18 // factor
+    assert joined.projections.shape == (3, rows, cols)
+    for view, row, col in np.ndindex(3, rows, cols):
+        cell = np.s_[view, row * factor : (row + 1) * factor, col * factor : (col + 1) * factor]
+        p, w = data[cell].astype(np.float64), weights[cell].astype(np.float64)
+        kept = joined.weights[view]
+        assert (1.0 if kept is None else kept[row, col]) == pytest.approx(w.mean(), rel=1e-5)
+        if w.any():
+            assert joined.projections[view, row, col] == pytest.approx((w * p).sum() / w.sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("beam", ["parallel", "cone"])
+@pytest.mark.parametrize("factor", [2, 3, 4, 8])
+def test_the_sample_stays_in_place_behind_joined_pixels(beam: str, factor: int) -> None:
+    # 23 rows and 37 columns are a multiple of no factor, and the axis is in the middle of neither.
+    width, cut = 9.0, Truncation(9.0, 1e-12)  # of the Gaussians, in pixels
+    how = {"axis_col": 15.3, "axis_row": 9.6, "shifts": [[0, 0], [1.5, -0.7], [0, 0]]}
+    views = (
+        Geometry.parallel(VIEWS.angles, (23, 37), 0.5, **how)
+        if beam == "parallel" else Geometry.cone(VIEWS.angles, (23, 37), 1.0, 200.0, 400.0, **how)
+    )  # fmt: skip
+    means = np.array([[1.0, -2.0, 3.0], [-2.0, 1.0, -4.0], [3.0, 2.0, 1.0]])
+    model = Gaussians.from_physical(means, np.full((3, 3), 0.5 * width), np.full(3, 0.2))
+    fine = project(model, views, truncation=cut).numpy()
+    rough = coarser(make_problem(fine, views, Grid.matching(views), 0.2, Cpu()), factor, "l1", 0.25)
+    seen = project(model, rough.geometry, truncation=cut).numpy()
+    off = np.abs(seen - rough.projections).max() / fine.max()
+    # A mean over a pixel differs from the value in its middle by factor² / 24 times the second derivatives, of which
+    # there are two, each at most 1 / width². Half a pixel off would be 0.6 * 0.5 / width, for factor 2 five times that.
+    assert off < factor**2 / 12 / width**2 * 1.1
+
+
+def test_a_detector_too_small_to_be_joined_is_told_by_name() -> None:
+    one = Geometry.parallel(VIEWS.angles, (1, 18), 0.5)
+    problem = make_problem(np.ones((3, 1, 18), np.float32), one, Grid.matching(one), 1.0, Cpu())
+    with pytest.raises(ValueError, match=r"coarse=2 joins 2 x 2 pixels, and the detector has 1 x 18: .* 1 or less"):
+        coarser(problem, 2, "l1", 0.25)
+
+
+def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    same = {"shifts": [[1.0, 2.0]] * 3, "roll": 0.1, "tilt": 0.2}
+    leaning = Geometry.parallel(VIEWS.angles, (12, 18), 0.5, **same)  # type: ignore[arg-type]
+    later = extend(make_problem(data, leaning, GRID, 0.3, Cpu()), data[:1], np.array([1.3])).geometry
+    assert later.shifts.tolist() == [[1.0, 2.0]] * 4
+    assert later.roll.tolist() == [0.1] * 4 and later.tilt.tolist() == [0.2] * 4
+    shifted = Geometry.parallel(VIEWS.angles, (12, 18), 0.5, shifts=[[0, 0], [1, 0], [0, 0]])
+    with pytest.raises(ValueError, match="shifts differ from view to view"):
+        extend(make_problem(data, shifted, GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
+
+
+def test_joined_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    joined = coarser(problem, 3, "l1", 0.25)
+    np.testing.assert_allclose(joined.projections, data.reshape(3, 4, 3, 6, 3).mean(axis=(2, 4)), rtol=1e-5)
+    assert joined.weights == (None, None, None)
+
+
+def test_a_view_of_nothing_else_is_refused_with_the_range(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    data[1] = 1e8
+    with pytest.raises(ValueError, match=r"1 of 3 views.*within ±4\.5e\+06.*\[1\]"):
+        make_problem(data, VIEWS, GRID, 1.0, Cpu())
+
+
+def test_what_makes_no_problem_is_refused(rng: np.random.Generator) -> None:
+    data = rng.random((3, 12, 18)).astype(np.float32)
+    with pytest.raises(ValueError, match="shape"):
+        make_problem(data[:2], VIEWS, GRID, 1.0, Cpu())
+    with pytest.raises(ValueError, match="loss must be"):
+        make_problem(data, VIEWS, GRID, 1.0, Cpu(), loss="huber")  # type: ignore[arg-type]

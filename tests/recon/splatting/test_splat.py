@@ -1,0 +1,229 @@
+"""The CPU kernels against the float64 twin, the twin against closed forms and finite differences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel, Truncation
+from recon.base.volume import Grid
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import Active, Gradients, Room, project, render_view, voxelize
+from tests.recon.conftest import Make
+from tests.recon.helpers import as_leaves, gradients, in_double
+
+# No cut-off worth the name, so that kernel and twin sum the same terms.
+WHOLE = Truncation(sigmas=9.0, faint=1e-12)
+SHAPE = (24, 30)
+
+
+ANGLES = (0.0, 0.7, 2.5, -4.0)
+TURNED = {
+    "axis_row": 10.0,
+    "shifts": ((0.4, -1.3), (1.2, 0.7), (-2.0, 0.0), (0.0, 0.5)),
+    "roll": (0.2, -0.1, 0.0, 0.05),
+    "tilt": -0.3,
+}
+# Every way to a projection: a beam and what a Gaussian gives a ray of it.
+STRAIGHT = Geometry.parallel(ANGLES, SHAPE, 0.5, 13.3)
+LEANING = Geometry.parallel(ANGLES, SHAPE, 0.5, 13.3, **TURNED)
+CONE = Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, 13.3, **TURNED)
+PATHS = {
+    "straight": (STRAIGHT, RayModel()),
+    "leaning": (LEANING, RayModel()),
+    "cone": (CONE, RayModel()),
+    "cone, some exact": (CONE, RayModel(exact_above=0.035)),
+    "cone, all exact": (CONE, RayModel(exact_above=0.0)),
+    "straight, plain": (STRAIGHT, RayModel(rectified=False)),
+    "cone, plain": (CONE, RayModel(rectified=False)),
+}
+
+
+def geometry(angles: tuple[float, ...] = (0.0, 0.7, 2.5, -4.0)) -> Geometry:
+    return Geometry.parallel(angles, SHAPE, pixel_pitch=0.5, axis_col=13.3)
+
+
+def test_one_isotropic_gaussian_projects_to_the_closed_form() -> None:
+    # ∫ ρ exp(-r²/2σ²) dt = ρ σ √(2π) exp(-(u² + v²)/2σ²), the same from every side.
+    sigma, density, centre = 1.3, 0.8, np.array([1.2, -0.7, 0.9])
+    g = Gaussians.from_physical(centre[None], [sigma], [density])
+    views = geometry()
+    images = project(g, views, truncation=WHOLE).numpy()
+    u = (np.arange(SHAPE[1]) - views.axis_col) * views.pixel_pitch
+    v = (np.arange(SHAPE[0]) - (SHAPE[0] - 1) / 2) * views.pixel_pitch
+    for image, angle in zip(images, views.angles, strict=True):
+        du = u - (centre[0] * math.cos(angle) + centre[1] * math.sin(angle))
+        r2 = du[None, :] ** 2 + (v[:, None] - centre[2]) ** 2
+        expected = density * sigma * math.sqrt(2 * math.pi) * np.exp(-r2 / (2 * sigma**2))
+        np.testing.assert_allclose(image, expected, atol=2e-6 * expected.max() + 1e-6)
+
+
+@settings(deadline=None, max_examples=25)
+@given(angle=st.floats(-10, 10), tilt=st.floats(-1.5, 1.5), roll=st.floats(-3, 3), seed=st.integers(0, 10_000))
+def test_mass_is_the_same_from_every_side(angle: float, tilt: float, roll: float, seed: int) -> None:
+    # Σ pixels * pitch² = Σ ρ (2π)^(3/2) |S|: the zeroth Helgason-Ludwig moment.
+    rng = np.random.default_rng(seed)
+    scales = rng.uniform(0.8, 1.6, (6, 3))
+    g = Gaussians.from_physical(rng.uniform(-3, 3, (6, 3)), scales, rng.uniform(0.1, 1, 6), rng.normal(size=(6, 4)))
+    views = Geometry.parallel([angle], (64, 64), pixel_pitch=0.5, tilt=tilt, roll=roll)
+    mass = float(project(g, views, truncation=WHOLE).sum()) * 0.25
+    expected = float((g.densities.double() * g.scales.double().prod(1)).sum()) * (2 * math.pi) ** 1.5
+    assert mass == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_cpu_projection_and_gradients_equal_the_twins(
+    path: str, random_gaussians: Make, rng: np.random.Generator
+) -> None:
+    views, model = PATHS[path]
+    g, weights = random_gaussians(), torch.from_numpy(rng.normal(size=(4, *SHAPE)))
+    fast, twin = as_leaves(g), in_double(g)
+    found, expected = project(fast, views, truncation=WHOLE, model=model), project(twin, views, model=model)
+    # The image kernel's recurrence costs up to 2e-5 of a footprint's weight, and some dozen overlap.
+    assert float((found - expected).detach().abs().max()) < 1e-5 * float(expected.detach().max())
+    (found * weights.float()).sum().backward()
+    (expected * weights).sum().backward()
+    for name, gradient in gradients(twin).items():
+        off = (gradients(fast)[name] - gradient).abs().max()
+        assert float(off) < 2e-5 * float(gradient.abs().max()), name
+
+
+def test_the_choice_of_exact_rays_is_a_choice(random_gaussians: Make) -> None:
+    # Between none and all: the mixed case of the paths above has to have both kinds in every view.
+    views, model = PATHS["cone, some exact"]
+    a = random_gaussians().arrays()
+    active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], 0.7)
+    for view in range(views.n_views):
+        chosen = render_view(active, views, view, 1e-6, 3.5, model).exact.size
+        assert 5 < chosen < 35, chosen
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"exact_above": -0.1}, "relative error"), ({"exact_above": 0.01, "rectified": False}, "rectified")],
+)
+def test_a_ray_model_that_makes_no_sense_is_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RayModel(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("n_slices", "slice_pitch"), [(9, None), (11, 0.05), (11, 1.3)], ids=["cubes", "flat voxels", "tall voxels"]
+)
+def test_cpu_voxels_and_gradients_equal_the_twins(
+    random_gaussians: Make, rng: np.random.Generator, n_slices: int, slice_pitch: float | None
+) -> None:
+    g = random_gaussians()
+    grid = Grid((n_slices, 12, 20), 0.6, centre=(0.4, -0.8, 1.1), slice_pitch=slice_pitch)
+    weights = torch.from_numpy(rng.normal(size=grid.shape))
+    fast, twin = as_leaves(g), in_double(g)
+    a, b = voxelize(fast, grid, truncation=WHOLE), voxelize(twin, grid)
+    assert float((a - b).detach().abs().max()) < 3e-6 * float(b.detach().max())
+    (a * weights.float()).sum().backward()
+    (b * weights).sum().backward()
+    for name, expected in gradients(twin).items():
+        found = gradients(fast)[name]
+        assert float((found - expected).abs().max()) < 2e-5 * float(expected.abs().max()), name
+
+
+@pytest.mark.parametrize("truncation", [WHOLE, Truncation()], ids=["whole", "cut"])
+@pytest.mark.parametrize("path", PATHS)
+def test_projection_is_linear_in_density_and_its_adjoint_is_the_density_gradient(
+    path: str, truncation: Truncation, random_gaussians: Make, rng: np.random.Generator
+) -> None:
+    # <A ρ, y> = <ρ, Aᵀ y> with A the footprints and Aᵀ the first moment of the backward pass.
+    views, model = PATHS[path]
+    g = as_leaves(random_gaussians())
+    y = torch.from_numpy(rng.normal(size=(4, *SHAPE)).astype(np.float32))
+    image = project(g, views, truncation=truncation, model=model)
+    (image * y).sum().backward()
+    slope = g.density_unit * torch.sigmoid(g.raw_densities.detach())
+    back = gradients(g)["raw_densities"] / slope
+    left = float((image.detach().double() * y).sum())
+    right = float((g.densities.detach().double() * back).sum())
+    assert left == pytest.approx(right, rel=3e-5)
+
+
+def test_views_that_share_memory_give_what_views_of_their_own_give(
+    random_gaussians: Make, rng: np.random.Generator
+) -> None:
+    views, model = PATHS["cone, some exact"]
+    a = random_gaussians().arrays()
+    active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], 0.7)
+    room, y = Room.of(40, SHAPE), rng.normal(size=SHAPE).astype(np.float32)
+    for view in range(views.n_views):
+        found = []
+        for space in (room, None):
+            into, centres = Gradients.zeros(40), np.empty((40, 2), np.float32)
+            seen = render_view(active, views, view, 1e-6, 3.5, model, room=space)
+            seen.backward(y, into, centres)
+            found.append((seen.image, into.means, into.log_scales, into.rotations, into.densities, centres))
+        for shared, own in zip(*found, strict=True):
+            np.testing.assert_array_equal(shared, own)
+
+
+def test_a_sub_volume_is_the_cut_out_of_the_volume(random_gaussians: Make) -> None:
+    g = random_gaussians(80)
+    whole = Grid((16, 18, 20), 0.7)
+    z, y, x = whole.coordinates()
+    part = Grid((5, 6, 7), 0.7, centre=(float(z[3:8].mean()), float(y[4:10].mean()), float(x[9:16].mean())))
+    cut = voxelize(g, whole, truncation=WHOLE).numpy()[3:8, 4:10, 9:16]
+    np.testing.assert_allclose(voxelize(g, part, truncation=WHOLE).numpy(), cut, atol=1e-5 * float(cut.max()))
+
+
+def test_default_truncation_loses_little(random_gaussians: Make) -> None:
+    g = random_gaussians()
+    whole = project(g, geometry(), truncation=WHOLE)
+    cut = project(g, geometry())
+    # 3.5 σ leave exp(-6.1) = 0.2 % of a footprint's mass outside.
+    assert float(cut.sum() / whole.sum()) == pytest.approx(1, abs=0.004)
+    assert float((whole - cut).abs().max()) < 0.01 * float(whole.max())
+
+
+@pytest.mark.parametrize(("above", "seen"), [(1.5, True), (0.7, False)])
+def test_what_is_faint_is_left_out(above: float, seen: bool) -> None:
+    # A projection's limit is the fraction times the field times the density unit, a volume's times the unit alone.
+    cut, unit, sigma = Truncation(3.5, 1e-3), 0.7, 0.8
+    views = geometry()
+    peak = above * cut.faint * unit * SHAPE[1] * views.pixel_pitch
+    one = Gaussians.from_physical([[0.0, 0, 0]], [sigma], [peak / (sigma * math.sqrt(2 * math.pi))], density_unit=unit)
+    assert bool(project(one, views, truncation=cut).any()) == seen
+    one = Gaussians.from_physical([[0.0, 0, 0]], [sigma], [above * cut.faint * unit], density_unit=unit)
+    assert bool(voxelize(one, Grid((5, 5, 5), 0.5), truncation=cut).any()) == seen
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    exponent=st.floats(-3, 3),
+    aspect=st.floats(0, 3),
+    far=st.sampled_from([0.0, 1.0, 30.0, 1e4]),
+    length=st.sampled_from([0.0, 1e-30, 1e-6, 1.0, 1e6]),
+    path=st.sampled_from(sorted(PATHS)),
+)
+def test_extreme_gaussians_stay_finite(exponent: float, aspect: float, far: float, length: float, path: str) -> None:
+    base = 10.0**exponent
+    g = Gaussians(
+        torch.tensor([[far, -far, far / 2], [0.1, 0.2, 0.3]]),
+        torch.log(torch.tensor([[base, base * 10**aspect, base], [0.5, 0.5, 0.5]])),
+        torch.tensor([[length, 0.0, length, 0.0], [1.0, 0.2, 0.0, 0.0]]),
+        torch.tensor([-80.0, 0.5]),
+    )
+    leaves = as_leaves(g)
+    views, model = PATHS[path]
+    image = project(leaves, views, model=model)
+    assert torch.isfinite(image).all() and float(image.detach().min()) >= 0
+    image.sum().backward()
+    assert all(torch.isfinite(value).all() for value in gradients(leaves).values())
+    volume = voxelize(g, Grid((6, 7, 8)))
+    assert torch.isfinite(volume).all() and float(volume.min()) >= 0
+
+
+def test_the_cpu_kernel_refuses_doubles(random_gaussians: Make) -> None:
+    with pytest.raises(ValueError, match="float32"):
+        project(in_double(random_gaussians(2)), geometry(), kernel="cpu")

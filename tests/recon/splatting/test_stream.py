@@ -1,0 +1,221 @@
+"""StreamingFit: views that arrive one by one end in the same quality as all of them at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon import Geometry, Grid
+from recon.assess.metrics import psnr
+from recon.splatting import optimise as fit
+from recon.splatting.density_control import DensityPolicy
+from recon.splatting.initialise import default_count
+from recon.splatting.settings import FitSettings
+from recon.splatting.stream import StreamingFit
+from simulators.frame.detector import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+
+SHAPE, PITCH = (24, 36), 0.1
+ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
+VIEWS = Geometry.parallel(ANGLES, SHAPE, PITCH)
+GRID = Grid.matching(VIEWS)
+
+
+class StepClock:
+    """Time that passes only when it is looked at: a test takes the same number of steps on any machine."""
+
+    def __init__(self, tick: float = 0.01) -> None:
+        self.time, self.tick = 0.0, tick
+
+    def __call__(self) -> float:
+        self.time += self.tick
+        return self.time
+
+
+@pytest.fixture(scope="module")
+def phantom() -> Phantom:
+    return Phantom.of(
+        (
+            Cylinder(1.4, 1.8, 0.3),
+            Ellipsoid((0.3, 0.4, 0.3), 1.0, centre=(0.6, 0.1, 0.2)),
+            Ellipsoid((0.25, 0.25, 0.35), 1.2, centre=(-0.5, -0.4, -0.2)),
+            Ellipsoid((0.2, 0.3, 0.2), 0.8, centre=(-0.1, 0.7, 0.1)),
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def data(phantom: Phantom) -> np.ndarray:
+    detector = Detector.centred(SHAPE, PITCH)
+    return np.stack([phantom.line_integrals(a, detector) for a in ANGLES]).astype(np.float32)
+
+
+def _stream(data: np.ndarray, order: np.ndarray, seed: int = 0) -> StreamingFit:
+    model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=StepClock())
+    for view in order:
+        model.add_views(data[view : view + 1], ANGLES[view : view + 1])
+        model.advance(0.1)
+    return model
+
+
+def test_the_volume_grows_with_the_views_and_ends_well(data: np.ndarray, phantom: Phantom) -> None:
+    truth = phantom.attenuation(GRID)
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+    quality = []
+    for view in range(40):
+        model.add_views(data[view : view + 1], ANGLES[view : view + 1])
+        model.advance(0.1)
+        if view in (19, 39):
+            quality.append(psnr(truth, model.snapshot().data))
+    end = model.finish(6.0)
+    quality.append(psnr(truth, model.snapshot().data))
+    assert quality[0] < quality[1] < quality[2]
+    assert quality[2] > 27
+    assert end.n_views == 40 and end.residual < 0.05
+
+
+def test_the_same_seed_gives_the_same_volume(data: np.ndarray) -> None:
+    order = np.argsort((np.arange(40) * 0.618) % 1)
+    first, second = (_stream(data, order, seed=3).snapshot().data for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_it_waits_for_views_that_are_apart(data: np.ndarray) -> None:
+    model = StreamingFit(VIEWS, GRID, first_views=4, first_span=np.pi / 4, gaussians=500, now=StepClock())
+    model.add_views(data[:6], ANGLES[:6])  # six views over 22 degrees
+    assert not model.started and model.advance(0.1).n_gaussians == 0
+    assert not model.snapshot().data.any()
+    model.add_views(data[20:22], ANGLES[20:22])
+    assert model.advance(0.1).n_gaussians > 0 and model.started
+
+
+def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_end(
+    data: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[tuple[int | None, float]] = []
+    step = fit.step
+
+    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
+        taken.append((view, fraction))
+        return step(state, problem, settings, fraction, view)
+
+    monkeypatch.setattr(fit, "step", spy)
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=StepClock())
+    model.add_views(data, ANGLES)
+    model.advance(6.0)
+    newest = [view for view, _ in taken if view is not None]
+    assert len(taken) > 150 and 0.22 < len(newest) / len(taken) < 0.45
+    assert set(newest) == set(range(32, 40))  # the last fifth of forty
+    assert all(0 <= fraction <= 0.5 for _, fraction in taken)
+    taken.clear()
+    model.finish(3.0)
+    fractions = [fraction for _, fraction in taken]
+    assert fractions == sorted(fractions) and fractions[0] < 0.05 and fractions[-1] > 0.95
+    assert all(view is None for view, _ in taken)
+
+
+def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
+    greedy = FitSettings(policy=DensityPolicy(start=0, every=1, threshold=0, prune_below=0))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=500, settings=greedy, now=StepClock())
+    counts = []
+    for first, last in ((0, 16), (16, 24), (24, 36)):  # each half as many again
+        model.add_views(data[first:last], ANGLES[first:last])
+        counts.append(model.advance(0.3).n_gaussians)
+    assert counts == [550, 600, 650]
+    assert model.finish(0.3).n_gaussians == 750
+
+
+@pytest.mark.parametrize("offset", [-1e-5, 1e-5])
+def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
+    # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+    for view, angle in enumerate(np.linspace(0, 1, 10)):
+        noise = np.random.default_rng(view).normal(offset, 1e-5, (1, *SHAPE)).astype(np.float32)
+        model.add_views(noise, [angle])
+        model.advance(0.05)
+    assert model.started == (offset > 0)
+    model.add_views(data, ANGLES)
+    model.advance(0.1)
+    end = model.finish(6.0)
+    assert end.n_views == 50
+    assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 15
+
+
+def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> None:
+    model = StreamingFit(VIEWS, GRID, gaussians=500)
+    with pytest.raises(ValueError, match="shape"):
+        model.add_views(data[:2], ANGLES[:3])
+    bad = data[:1].copy()
+    bad[0, 3, 3] = np.nan
+    with pytest.raises(ValueError, match="nothing was added"):
+        model.add_views(bad, ANGLES[:1])
+    with pytest.raises(ValueError, match="nothing was added"):
+        model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])  # type: ignore[arg-type]
+    assert model.n_views == 0
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        StreamingFit(VIEWS, GRID, gaussians=0)
+    with pytest.raises(ValueError, match="no view"):
+        model.finish(0.1)
+
+
+def test_a_setting_that_would_do_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="coarse=2 begins a fit on joined pixels"):
+        StreamingFit(VIEWS, GRID, settings=FitSettings(coarse=2))
+
+
+def test_one_wild_pixel_does_not_spoil_what_has_come_or_comes(data: np.ndarray, phantom: Phantom) -> None:
+    truth, qualities = phantom.attenuation(GRID), []
+    for marred in (None, 3, 30):  # among the first views, and after the model has been placed
+        views = data.copy()
+        if marred is not None:
+            views[marred, 10, 17] = 1e30
+        model = _stream(views, np.argsort((np.arange(40) * 0.618) % 1))
+        with pytest.raises(ValueError, match="no value"):
+            model.add_views(np.full((1, *SHAPE), 1e30, np.float32), [0.1])
+        assert model.n_views == 40
+        model.finish(4.0)
+        qualities.append(psnr(truth, model.snapshot().data))
+    assert min(qualities) > qualities[0] - 1.0
+
+
+def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np.ndarray) -> None:
+    for name, own in (("shifts", [[0, 0], [3, 0]]), ("roll", [0, 0.1]), ("tilt", [0, 0.1])):
+        with pytest.raises(ValueError, match=f"{name} differ from view to view"):
+            StreamingFit(Geometry.parallel([0, 1], SHAPE, PITCH, **{name: own}), GRID)  # type: ignore[arg-type]
+    # An axis elsewhere and the same shift of all views are one thing.
+    told = Geometry.parallel([0.0], SHAPE, PITCH, axis_col=VIEWS.axis_col - 5, shifts=[[5, 0]])
+    found = []
+    for template in (VIEWS, told):
+        model = StreamingFit(template, GRID, gaussians=500, now=StepClock())
+        model.add_views(data[:20], ANGLES[:20])
+        model.advance(0.1)
+        model.add_views(data[20:], ANGLES[20:])
+        model.advance(0.3)
+        found.append(model.snapshot().data)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-3 * float(found[0].max()))
+
+
+def test_the_count_follows_the_grid() -> None:
+    assert default_count(Grid((4, 4, 4))) == 2000
+    assert default_count(Grid((100, 200, 200))) == pytest.approx(np.pi / 4 * 4e6 / 60, rel=0.01)
+    assert default_count(Grid((2048, 2048, 2048))) == 200_000
+
+
+def test_a_moved_axis_is_learnt_without_beginning_anew(data: np.ndarray, phantom: Phantom) -> None:
+    truth = phantom.attenuation(GRID)
+    off = Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=VIEWS.axis_col + 0.4)
+
+    def run(corrected: bool) -> float:
+        model = StreamingFit(off, GRID, 0, gaussians=1500, now=StepClock())
+        model.add_views(data, ANGLES)
+        model.advance(2.0)
+        before = model.progress().step
+        if corrected:
+            model.move_axis(VIEWS.axis_col)
+        assert model.finish(4.0).step > before > 0
+        return psnr(truth, model.snapshot().data)
+
+    assert run(corrected=True) > run(corrected=False) + 1

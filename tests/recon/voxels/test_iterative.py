@@ -1,0 +1,350 @@
+"""The iterative methods against explicit matrices, an independent least-squares solver and slow references."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.sparse.linalg import lsqr, svds
+
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.volume import Grid, Volume
+from recon.voxels.fbp import fbp
+from recon.voxels.iterative import (
+    AsdPocs,
+    Cgls,
+    FistaTv,
+    Method,
+    OsSirtTv,
+    Sart,
+    Settings,
+    Sirt,
+    default_settings,
+    solve,
+)
+from recon.voxels.projector import Projector
+from recon.voxels.solvers import density_unit, largest_eigenvalue
+from tests.recon.kernels.voxels_reference import system_matrix
+from tests.recon.voxels.tv_twin import differences, total_variation, transposed_differences
+
+METHODS: tuple[Method, ...] = ("sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
+CUBES = (1.0, 1.0, 1.0)
+
+
+def blocks(grid: Grid, scale: float = 1.0) -> NDArray[np.float32]:
+    """A piecewise constant object: a box in a box."""
+    nz, ny, nx = grid.shape
+    data = np.zeros(grid.shape, np.float32)
+    data[:, ny // 5 : -(ny // 5), nx // 4 : -(nx // 4)] = 0.4 * scale
+    data[nz // 4 : -(nz // 4) or None, ny // 3 : -(ny // 3), nx // 3 : nx // 2] = scale
+    return data
+
+
+def parallel_case(n_views: int = 7, noise: float = 0.0) -> tuple[Projector, NDArray[np.float32], NDArray[np.float32]]:
+    """Projector, truth and its projections, with white noise of a share of their largest value."""
+    geometry = Geometry.parallel(np.arange(n_views) * np.pi / n_views + 0.1, (6, 20), 0.5, 9.2)
+    projector = Projector(geometry, Grid((6, 18, 17), 0.5))
+    truth = blocks(projector.grid)
+    views = projector.forward(truth)
+    return projector, truth, views + _noise(views, noise)
+
+
+def cone_case() -> tuple[Projector, NDArray[np.float32], NDArray[np.float32]]:
+    geometry = Geometry.cone(np.arange(8) * np.pi / 4, (8, 22), 0.9, 30.0, 45.0)
+    projector = Projector(geometry, Grid((6, 15, 16), 0.6, slice_pitch=0.7))
+    truth = blocks(projector.grid)
+    return projector, truth, projector.forward(truth)
+
+
+def _noise(views: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+    white = np.random.default_rng(5).normal(size=views.shape)
+    return (share * views.max() * white).astype(np.float32)
+
+
+def residual(projector: Projector, volume: Volume, views: NDArray[np.float32]) -> float:
+    return float(np.linalg.norm(projector.forward(volume.data) - views) / np.linalg.norm(views))
+
+
+def error(volume: Volume, truth: NDArray[np.float32]) -> float:
+    return float(np.linalg.norm(volume.data - truth) / np.linalg.norm(truth))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("case", [parallel_case, cone_case])
+def test_every_method_explains_clean_data(method: Method, case) -> None:  # type: ignore[no-untyped-def]
+    projector, truth, views = case()
+    found = solve(method, projector, views)
+    assert found.grid == projector.grid
+    assert found.data.dtype == np.float32
+    assert found.data.flags.c_contiguous
+    assert (found.data >= 0).all()
+    if method == "cgls":  # what it clips at the end is missing in the residual
+        assert residual(projector, solve(method, projector, views, nonnegative=False), views) < 0.02
+    else:
+        assert residual(projector, found, views) < 0.05
+    assert error(found, truth) < 0.25
+
+
+def test_sirt_takes_the_step_of_its_formula() -> None:
+    projector, _, views = parallel_case()
+    matrix = system_matrix(projector.geometry, projector.grid)
+    rows, columns = matrix.sum(1), matrix.sum(0)
+    rows_inverse = np.where(rows > 1e-3 * rows.max(), 1 / np.maximum(rows, 1e-9), 0)
+    columns_inverse = np.where(columns > 1e-3 * columns.max(), 1 / np.maximum(columns, 1e-9), 0)
+    x = np.zeros(matrix.shape[1])
+    for _ in range(3):
+        x = np.maximum(x + 0.8 * columns_inverse * (matrix.T @ (rows_inverse * (views.ravel() - matrix @ x))), 0)
+    found = solve(Sirt(iterations=3, relaxation=0.8), projector, views)
+    np.testing.assert_allclose(found.data.ravel(), x, atol=2e-5)
+
+
+def test_sart_takes_one_view_after_the_other_in_random_order() -> None:
+    projector, _, views = parallel_case(n_views=5)
+    matrices = [system_matrix(projector.geometry.select([v]), projector.grid) for v in range(5)]
+    columns = np.max([m.sum(0) for m in matrices], axis=0)
+    columns_inverse = np.where(columns > 1e-3 * columns.max(), 1 / np.maximum(columns, 1e-9), 0)
+    rng = np.random.default_rng(3)
+    x = np.zeros(columns.size)
+    for sweep in range(2):
+        for v in rng.permutation(5):
+            rows = matrices[v].sum(1)
+            rows_inverse = np.where(rows > 1e-3 * rows.max(), 1 / np.maximum(rows, 1e-9), 0)
+            back = matrices[v].T @ (rows_inverse * (views[v].ravel() - matrices[v] @ x))
+            x = np.maximum(x + 0.9**sweep * columns_inverse * back, 0)
+    found = solve(Sart(iterations=2, decay=0.9), projector, views, seed=3)
+    np.testing.assert_allclose(found.data.ravel(), x, atol=2e-5)
+
+
+def test_sirt_has_the_truth_as_its_fixed_point_and_a_falling_residual() -> None:
+    projector, truth, views = parallel_case()
+    kept = solve("sirt", projector, views, iterations=5, start=Volume(truth, projector.grid))
+    np.testing.assert_allclose(kept.data, truth, atol=1e-5)
+    noisy = views + _noise(views, 0.05)
+    curve: list[float] = []
+    # In the norm that SIRT minimises (rays weighed by their lengths) without clipping; nearly so in the plain one.
+    solve("sirt", projector, noisy, iterations=40, nonnegative=False, on_iteration=lambda _, r: curve.append(r))
+    assert curve[0] == pytest.approx(1.0)
+    assert (np.diff(curve) < 1e-6).all()
+    assert curve[-1] < 0.15
+
+
+@pytest.mark.parametrize("weighed", [False, True])
+@pytest.mark.parametrize("steps", [1, 4, 6])
+def test_cgls_is_lsqr(steps: int, weighed: bool, rng: np.random.Generator) -> None:
+    """Both minimise the residual over the same Krylov space (Paige & Saunders 1982), until float32 loses conjugacy."""
+    projector, _, views = parallel_case(noise=0.02)
+    weight = rng.uniform(0.2, 3, views.shape).astype(np.float32) if weighed else None
+    root = np.sqrt(np.ones(views.size) if weight is None else weight.ravel().astype(np.float64))
+    matrix = system_matrix(projector.geometry, projector.grid).multiply(root[:, None]).tocsr()
+    expected = lsqr(matrix, root * views.ravel(), atol=0, btol=0, conlim=0, iter_lim=steps)[0]
+    curve: list[float] = []
+    found = solve(
+        Cgls(steps), projector, views, weight=weight, nonnegative=False, on_iteration=lambda _, r: curve.append(r)
+    )
+    np.testing.assert_allclose(found.data.ravel(), expected, atol=1e-4 * np.abs(expected).max())
+    misfit = np.linalg.norm(matrix @ expected - root * views.ravel()) / np.linalg.norm(root * views.ravel())
+    assert curve[-1] == pytest.approx(misfit, rel=1e-3)
+
+
+def test_the_step_bound_is_the_largest_eigenvalue_from_above() -> None:
+    for projector, _, _ in (parallel_case(), cone_case()):
+        matrix = system_matrix(projector.geometry, projector.grid)
+        exact = float(svds(matrix, k=1, return_singular_vectors=False, rng=0)[0] ** 2)
+        bound = largest_eigenvalue(projector, None)
+        assert exact * (1 - 1e-5) <= bound < 1.1 * exact
+
+
+def test_fista_reaches_the_minimum_of_a_slow_reference() -> None:
+    projector, _, views = parallel_case(n_views=5, noise=0.03)
+    matrix = system_matrix(projector.geometry, projector.grid)
+    step = 1 / float(svds(matrix, k=1, return_singular_vectors=False, rng=0)[0] ** 2)
+    settings = FistaTv(iterations=150, tv_weight=2e-3, tv_steps=10)
+    found = solve(settings, projector, views)
+    # The weight is in units that the first sweep fixes; read the same sweep.
+    first = solve(OsSirtTv(iterations=1, tv_weight=0.0), projector, views)
+    threshold = 2e-3 * density_unit(np.ascontiguousarray(first.data.transpose(1, 2, 0)))
+    # The problem is min ½|A x - p|² + μ TV(x) with μ = threshold / (step of the solver).
+    mu = threshold * largest_eigenvalue(projector, None)
+
+    def value(x: NDArray[np.float64]) -> float:
+        return 0.5 * float(((matrix @ x.ravel() - views.ravel()) ** 2).sum()) + mu * total_variation(x, CUBES)
+
+    x = np.zeros(projector.grid.shape)
+    dual = np.zeros((3, *x.shape))
+    t, y = 1.0, x
+    for _ in range(200):
+        z = y - step * (matrix.T @ (matrix @ y.ravel() - views.ravel())).reshape(x.shape)
+        for _ in range(8):
+            pull = np.maximum(z - mu * step * transposed_differences(dual, CUBES), 0)
+            dual += differences(pull, CUBES) / (12 * mu * step)
+            dual /= np.maximum(1, np.sqrt((dual**2).sum(0)))
+        new = np.maximum(z - mu * step * transposed_differences(dual, CUBES), 0)
+        after = (1 + math.sqrt(1 + 4 * t * t)) / 2
+        y, x, t = new + (t - 1) / after * (new - x), new, after
+    assert value(found.data.astype(np.float64)) == pytest.approx(value(x), rel=1e-3)
+
+
+def test_asd_pocs_has_less_variation_at_the_residual_of_sart() -> None:
+    projector, truth, views = parallel_case(n_views=6, noise=0.02)
+    plain = solve(Sart(iterations=12, decay=0.9999), projector, views)
+    smooth = solve(AsdPocs(iterations=12, alpha=0.02), projector, views)
+    variation = [total_variation(v.data.astype(np.float64), CUBES) for v in (plain, smooth)]
+    assert variation[1] < 0.9 * variation[0]
+    assert residual(projector, smooth, views) < 1.3 * residual(projector, plain, views)
+    assert error(smooth, truth) < error(plain, truth)
+
+
+@pytest.mark.parametrize("method", [FistaTv(tv_weight=2e-3), OsSirtTv(tv_weight=0.01)])
+def test_tv_suits_a_piecewise_constant_object(method: Settings) -> None:
+    projector, truth, views = parallel_case(n_views=7, noise=0.02)
+    sirt = error(solve("sirt", projector, views), truth)
+    assert error(solve(method, projector, views), truth) < 0.6 * sirt
+
+
+def test_momentum_saves_sweeps() -> None:
+    projector, truth, views = parallel_case(n_views=7, noise=0.02)
+    few = [solve(OsSirtTv(iterations=8, tv_weight=0.01, momentum=m), projector, views) for m in (False, True)]
+    many = solve(OsSirtTv(iterations=20, tv_weight=0.01), projector, views)
+    assert error(few[1], truth) < 0.9 * error(few[0], truth)
+    assert error(few[1], truth) < 1.1 * error(many, truth)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_unit_of_attenuation_does_not_matter(method: Method) -> None:
+    projector, _, views = parallel_case(noise=0.02)
+    one = solve(method, projector, views, iterations=4)
+    small = solve(method, projector, views * np.float32(2**-9), iterations=4)
+    np.testing.assert_allclose(small.data * 2**9, one.data, atol=2e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_rays_without_weight_do_not_count(method: Method) -> None:
+    """Whatever they hold, NaN too."""
+    projector, truth, views = parallel_case()
+    weight = np.ones_like(views)
+    weight[2, 3, 5:9] = weight[5, :, 11] = 0
+    spoiled = np.where(weight == 0, np.nan, views).astype(np.float32)
+    other = np.where(weight == 0, 70, views).astype(np.float32)
+    found = solve(method, projector, spoiled, weight=weight, iterations=8)
+    np.testing.assert_array_equal(found.data, solve(method, projector, other, weight=weight, iterations=8).data)
+    assert error(found, truth) < 0.45
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_progress_stop_and_start(method: Method) -> None:
+    projector, _, views = parallel_case()
+    told: list[tuple[int, float]] = []
+    three = solve(method, projector, views, iterations=3)
+    stopped = solve(
+        method, projector, views, iterations=50,
+        on_iteration=lambda k, r: told.append((k, r)), should_stop=lambda: len(told) == 3,
+    )  # fmt: skip
+    assert [k for k, _ in told] == [1, 2, 3]
+    assert all(0 < r <= 1.0 + 1e-6 for _, r in told)
+    np.testing.assert_array_equal(stopped.data, three.data)
+    before = three.data.copy()
+    further = solve(method, projector, views, iterations=3, start=three)
+    assert residual(projector, further, views) < residual(projector, three, views)
+    np.testing.assert_array_equal(three.data, before)
+
+
+@pytest.mark.parametrize("weighed", [False, True])
+def test_asd_pocs_without_a_goal_takes_one_from_the_direct_method(weighed: bool, rng: np.random.Generator) -> None:
+    projector, _, views = parallel_case(n_views=20)
+    given, weight, root = views, None, np.ones(views.shape)
+    if weighed:
+        weight = rng.uniform(0.01, 3, views.shape).astype(np.float32)
+        weight[:, 2, 4:8] = weight[4] = 0  # pixels that are not to be trusted, and a whole view
+        root = np.sqrt(weight.astype(np.float64))
+        given = np.where(weight == 0, np.nan, views).astype(np.float32)
+    seen = np.flatnonzero(np.arange(20) != 4) if weighed else np.arange(20)
+    filled, _ = masked(given[seen], None if weight is None else weight[seen])
+    direct = fbp(filled, projector.geometry.select(seen), projector.grid)
+    off = np.linalg.norm(root * (projector.forward(direct) - views)) / np.linalg.norm(root * views)
+    # These steps shrink wherever the residual is above the goal, which the iterations pass: a wrong one would tell.
+    how = AsdPocs(iterations=30, alpha=0.05, alpha_decay=0.5, ratio=0.0)
+    own, same, other = (
+        solve(method, projector, given, weight=weight).data
+        for method in (how, replace(how, goal=0.15 * off), replace(how, goal=0.3 * off))
+    )
+    np.testing.assert_array_equal(own, same)
+    assert not np.array_equal(own, other)
+
+
+def test_asd_pocs_takes_a_short_scan_of_a_cone() -> None:
+    whole, truth, _ = cone_case()
+    short = Projector(whole.geometry.at(np.linspace(0, np.deg2rad(210), 16)), whole.grid)
+    views = short.forward(truth)
+    found = solve("asd-pocs", short, views)
+    assert residual(short, found, views) < 0.05 and error(found, truth) < 0.25
+
+
+def test_misuse_is_named() -> None:
+    projector, truth, views = parallel_case()
+    with pytest.raises(ValueError, match=r"unknown method 'art'.*fista-tv"):
+        solve("art", projector, views)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"projections .* \(7, 6, 19\).* \(7, 6, 20\)"):
+        solve("sirt", projector, views[..., 1:])
+    with pytest.raises(ValueError, match="at least one iteration"):
+        solve("sirt", projector, views, iterations=0)
+    with pytest.raises(ValueError, match="zero everywhere"):
+        solve("sirt", projector, np.zeros_like(views))
+    with pytest.raises(ValueError, match="not all zero"):
+        solve("sirt", projector, views, weight=np.zeros_like(views))
+    with pytest.raises(ValueError, match="starting volume"):
+        solve("sirt", projector, views, start=Volume(truth[:3].copy(), Grid((3, 18, 17), 0.5)))
+    views[0, 0, :2] = np.nan, np.inf
+    with pytest.raises(ValueError, match=r"2 of 840 .*not finite.*weight 0"):
+        solve("sirt", projector, views)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("weight", "pitch"), [(1e-40, 1.0), (1e-20, 1.0), (1e20, 1.0), (3e38, 1.0), (1.0, 1e8), (1.0, 1e-12), (1e20, 1e-12)]
+)
+def test_units_do_not_matter(method: Method, weight: float, pitch: float) -> None:
+    """Lengths, weights: only their ratios count, however far float32's squares would be out of range."""
+    projector, _, views = parallel_case(noise=0.02)
+    plain = solve(method, projector, views, iterations=4).data
+    geometry, grid = projector.geometry, projector.grid
+    there = Projector(replace(geometry, pixel_pitch=0.5 * pitch), Grid(grid.shape, 0.5 * pitch))
+    found = solve(method, there, views, iterations=4, weight=np.full(views.shape, weight, np.float32)).data
+    np.testing.assert_allclose(found.astype(np.float64) * pitch, plain, atol=3e-4)
+
+
+@given(method=st.sampled_from(METHODS), weight=st.floats(-20, 20), pitch=st.floats(-12, 8), size=st.floats(-20, 20))
+@settings(max_examples=40, deadline=None)
+def test_powers_of_ten_of_every_unit_leave_the_volume_as_it_is(
+    method: Method, weight: float, pitch: float, size: float
+) -> None:
+    projector, _, views = cone_case()
+    plain = solve(method, projector, views, iterations=3).data
+    g, box, edge, density = projector.geometry, projector.grid, 10.0**pitch, 10.0 ** (size - pitch)
+    there = Projector(
+        replace(g, pixel_pitch=g.pixel_pitch * edge, sod=g.sod * edge, sdd=g.sdd * edge),
+        Grid(box.shape, box.voxel_size * edge, slice_pitch=box.spacing[0] * edge),
+    )
+    weights = np.full(views.shape, 10.0**weight, np.float32)
+    found = solve(method, there, (views * 10.0**size).astype(np.float32), iterations=3, weight=weights).data
+    np.testing.assert_allclose(found / density, plain, atol=1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_names_have_settings(method: Method) -> None:
+    settings: Settings = default_settings(method)
+    projector, _, views = parallel_case()
+    named = solve(method, projector, views, iterations=2)
+    np.testing.assert_array_equal(named.data, solve(settings, projector, views, iterations=2).data)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_box_that_no_ray_meets_stays_empty(method: Method) -> None:
+    projector, _, views = parallel_case()
+    aside = Projector(projector.geometry, Grid((4, 5, 6), 0.5, (90.0, 0.0, 0.0)))
+    assert not solve(method, aside, views, iterations=2).data.any()

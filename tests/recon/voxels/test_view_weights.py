@@ -1,0 +1,156 @@
+"""Weights of views and rays: all cover what was measured, the two rays of a line share its weight."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.fbp import fbp
+from recon.voxels.view_weights import angular_weights, circle_weights, ray_weights
+from tests.recon.voxels.test_fbp import disc_views, half_turn
+
+
+def full_turn(n: int) -> np.ndarray:
+    return np.arange(n) * 2 * np.pi / n
+
+
+@given(n=st.integers(2, 40), cols=st.integers(1, 30), twice=st.integers(-40, 100), seed=st.integers(0, 99))
+def test_every_line_has_its_weight_once(n: int, cols: int, twice: int, seed: int) -> None:
+    # The axis falls on a column or between two, so that each ray's mirror image is a ray of the detector or none.
+    angles = np.random.default_rng(seed).permutation(full_turn(2 * n)) + 0.3
+    geometry = Geometry.parallel(angles, (1, cols), axis_col=twice / 2)
+    weights, (before, after) = ray_weights(geometry)
+    assert weights.shape == (2 * n, cols) and weights.min() >= 0
+    assert before == min(max(0, cols - 1 - twice), 2 * cols) and after == min(max(0, twice - cols + 1), 2 * cols)
+    for view, angle in enumerate(angles):
+        off = np.abs(np.mod(angles - angle - np.pi / 2, 2 * np.pi) - np.pi / 2)
+        opposite = weights[int(off.argmin())]
+        for col in range(cols):
+            again = twice - col
+            other = opposite[again] if 0 <= again < cols else 0
+            assert weights[view, col] + other == pytest.approx(np.pi / n)
+
+
+@pytest.mark.parametrize("span", [np.pi, 1.3 * np.pi])
+def test_columns_are_alike_where_no_full_turn_is(span: float) -> None:
+    angles = np.linspace(0, span, 60, endpoint=False)
+    weights, zeros = ray_weights(Geometry.parallel(angles, (1, 40), axis_col=7.0))
+    assert zeros == (0, 0)
+    np.testing.assert_array_equal(weights, np.repeat(angular_weights(angles)[:, None], 40, 1))
+
+
+@pytest.mark.parametrize("n", [8, 9, 360])
+def test_an_axis_in_the_middle_leaves_all_columns_alike(n: int) -> None:
+    weights, zeros = ray_weights(Geometry.parallel(full_turn(n), (1, 40)))
+    assert zeros == (0, 0)
+    np.testing.assert_allclose(weights, np.pi / n, rtol=1e-12)
+
+
+@pytest.mark.parametrize("axis_col", [6.0, 20.4, 31.7, 55.0, 90.0])
+@pytest.mark.parametrize("n", [360, 361])
+def test_a_full_turn_off_the_middle_shows_the_disc_as_a_wide_detector_does(axis_col: float, n: int) -> None:
+    # A disc that no view sees whole where the axis is far off; the reference sees all of it in half a turn.
+    there, wide = Geometry.parallel(full_turn(n), (1, 97), axis_col=axis_col), Grid((1, 150, 150))
+    radius, centre = 0.75 * max(axis_col, 96 - axis_col), (6.0, -9.0)
+    radius -= np.hypot(*centre)
+    all_of_it = Geometry.parallel(np.arange(360) * np.pi / 360, (1, 251))
+    expected = fbp(disc_views(all_of_it, radius, centre), all_of_it, wide, "hann")[0]
+    found = fbp(disc_views(there, radius, centre), there, wide, "hann")[0]
+    _, y, x = wide.coordinates()
+    away = np.hypot(x - centre[0], y[:, None] - centre[1])
+    inside, edge = away < radius - 2, np.abs(away - radius) < 3
+    assert found[inside].mean() == pytest.approx(1, abs=0.003)
+    seen = np.hypot(x, y[:, None]) < max(axis_col, 96 - axis_col)
+    assert np.abs(found - expected)[~edge & seen].max() < 0.02
+
+
+def test_views_that_are_moved_to_either_side_make_one_wide_detector() -> None:
+    # Every second pair of opposite views stands off to the other side: the columns that lack a partner differ.
+    angles = full_turn(360)
+    shifts = np.stack((np.where(np.arange(360) % 180 % 2 == 0, 18.0, -18.0), np.zeros(360)), 1)
+    geometry = Geometry.parallel(angles, (1, 81), shifts=shifts)
+    views = np.zeros((360, 1, 81), np.float32)
+    for view, (angle, shift) in enumerate(zip(angles, shifts[:, 0], strict=True)):
+        views[view] = disc_views(Geometry.parallel([angle], (1, 81), axis_col=40 + shift), 40, (3.0, 5.0))[0]
+    grid = Grid((1, 100, 100))
+    found = fbp(views, geometry, grid)[0]
+    _, y, x = grid.coordinates()
+    assert found[np.hypot(x - 3, y[:, None] - 5) < 37].mean() == pytest.approx(1, abs=0.005)
+
+
+@given(st.lists(st.floats(-20, 20, allow_nan=False), min_size=1, max_size=40))
+def test_weights_cover_the_measured_angle(angles: list[float]) -> None:
+    weights = angular_weights(angles)
+    assert weights.shape == (len(angles),)
+    assert (weights >= 0).all()
+    assert 0 < weights.sum() <= np.pi * (1 + 1e-12)
+
+
+@given(st.integers(2, 60), st.floats(-7, 7), st.integers(0, 2**31))
+@settings(max_examples=30)
+def test_equal_steps_in_any_order_weigh_the_same(n: int, start: float, seed: int) -> None:
+    angles = start + half_turn(n) + np.pi * np.random.default_rng(seed).integers(-2, 3, n)
+    np.testing.assert_allclose(angular_weights(angles), np.pi / n, rtol=1e-9)
+    np.testing.assert_allclose(angular_weights(np.random.default_rng(seed).permutation(angles)), np.pi / n, rtol=1e-9)
+
+
+def test_views_half_a_turn_apart_share_their_weight() -> None:
+    closed = np.linspace(0, np.pi, 91)  # holds both 0 and 180 degrees
+    weights = angular_weights(closed)
+    np.testing.assert_allclose(weights[1:-1], np.pi / 90, rtol=1e-9)
+    np.testing.assert_allclose(weights[[0, -1]], np.pi / 180, rtol=1e-9)
+    np.testing.assert_allclose(angular_weights(np.linspace(0, 2 * np.pi, 180, endpoint=False)), np.pi / 180, rtol=1e-9)
+    np.testing.assert_allclose(angular_weights([0.3, 0.3 + np.pi, 0.3 + 2 * np.pi]), np.pi / 3, rtol=1e-9)
+
+
+def test_uneven_steps_weigh_by_their_cells() -> None:
+    # Cells on the circle of length π: neighbours 0 | 1 | 1.5 and back to π.
+    np.testing.assert_allclose(angular_weights([0, 1.5, 1]), [(np.pi - 1.5 + 1) / 2, (0.5 + np.pi - 1.5) / 2, 0.75])
+
+
+def test_a_missing_wedge_does_not_load_the_views_beside_it() -> None:
+    sector = np.deg2rad(np.arange(30, 150, 2.0))
+    np.testing.assert_allclose(angular_weights(sector), np.deg2rad(2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [20, 45, 400])
+def test_random_angles_cover_the_half_circle(n: int) -> None:
+    # Their widest gap is chance, not a missing wedge: no density may be lost.
+    sums = [angular_weights(np.random.default_rng(seed).uniform(-np.pi, np.pi, n)).sum() for seed in range(40)]
+    assert np.isclose(sums, np.pi).mean() > 0.85
+
+
+@pytest.mark.parametrize(("span", "n"), [(3, 3), (4, 4), (30, 8), (90, 45), (120, 20), (150, 600), (170, 170)])
+def test_a_real_wedge_is_missed_however_dense_the_views(span: float, n: int) -> None:
+    angles = np.deg2rad(np.arange(n) * span / n)
+    np.testing.assert_allclose(angular_weights(angles), np.deg2rad(span / n), rtol=1e-9)
+
+
+@pytest.mark.parametrize("angles", [[], [0.0, np.nan]])
+def test_weights_of_no_angle_are_refused(angles: list[float]) -> None:
+    with pytest.raises(ValueError, match="at least one angle"):
+        angular_weights(angles)
+
+
+@given(st.integers(8, 200), st.floats(-7, 7), st.integers(0, 2**31))
+@settings(max_examples=30)
+def test_equal_steps_of_a_circle_weigh_the_same(n: int, start: float, seed: int) -> None:
+    angles = start + np.random.default_rng(seed).permutation(full_turn(n))
+    np.testing.assert_allclose(circle_weights(angles), 2 * np.pi / n, rtol=1e-9)
+
+
+def test_uneven_steps_of_a_circle_weigh_by_their_cells_and_sum_to_a_turn(rng: np.random.Generator) -> None:
+    np.testing.assert_allclose(circle_weights([0, 2, 1, 3.5, 5]), [1.1415926536, 1.25, 1.0, 1.5, 1.3915926536])
+    np.testing.assert_allclose(circle_weights(rng.uniform(0, 50, 300)).sum(), 2 * np.pi)
+    closed = np.linspace(0, 2 * np.pi, 121)  # first and last view are the same
+    np.testing.assert_allclose(circle_weights(closed)[[0, -1]], np.pi / 120, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("span", "n"), [(180, 90), (200, 25), (270, 100), (300, 40)])
+def test_a_short_scan_is_refused(span: float, n: int) -> None:
+    with pytest.raises(ValueError, match=r"gap of .* degrees.*short scan"):
+        circle_weights(np.deg2rad(np.linspace(0, span, n)))

@@ -1,0 +1,39 @@
+"""Sight: an instrument's camera in the middle of its sensor sees what a scan of the scene alone sees."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
+from drivers.protocols import CameraSettings, TriggerSource
+from simulators.devices.sight import Exposed, Sight
+from simulators.scenes.shots import Scan
+from tests.simulators import shots
+
+
+@pytest.mark.parametrize("binning", [1, 2, 4])
+@pytest.mark.parametrize("readout", LINE_TIME)
+def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: int) -> None:
+    scene = replace(shots.scene("photon_noise"), axis_offset_px=3.4)
+    asked = replace(scene.detector, shape=(64, 96), binning=binning, readout=readout)
+    scan = Scan.of(replace(scene, detector=asked), seed=7)
+    of = scan.frame(25).shot
+    settings = CameraSettings(asked.exposure_s, TriggerSource.EXTERNAL, scan.roi, binning, readout)
+    sight = Sight(scan.scene, settings, asked.pixel_size_um * 1e-3, 7, of.angle_at, connected=scan.start)
+    frame = Exposed(3, of.frame, of.time, of.angle, of.time + 1.0, True, True, of.view)
+    seen, expected = asdict(sight.shot(frame)), asdict(of)
+    for name, value in expected["detector"].items():
+        assert seen["detector"][name] == pytest.approx(value, rel=1e-12), name
+    assert seen.pop("row_period") == pytest.approx(expected.pop("row_period"), rel=1e-12)
+    assert {**seen, "detector": None} == {**expected, "detector": None}
+
+
+def test_without_a_roi_it_is_the_whole_sensor() -> None:
+    sight = Sight(shots.scene(), CameraSettings(0.01, TriggerSource.INTERNAL), 4.6e-3, 1, shots.never, 0.0)
+    assert sight.roi == (0, 0, *SENSOR_SHAPE)
+    assert sight.detector.shape == SENSOR_SHAPE
+    assert (sight.detector.axis_row, sight.detector.axis_col) == tuple((np.array(SENSOR_SHAPE) - 1) / 2)

@@ -1,0 +1,198 @@
+"""Chords against closed forms, and against a search along each ray that knows no more than where a solid is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.base.geometry import Geometry
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.samples.bodies.chords import columns
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Octahedron, Tube
+from tests.simulators.bodies import SOLIDS, chords, rays
+
+SODS = [math.inf, 1.2, 300.0]
+small, near = st.floats(-0.4, 0.4), st.floats(-0.05, 0.05)
+
+
+def _agrees(name: str, pose: Pose, detector: Detector) -> None:
+    """To 1e-9 mm where the source is within a metre: rounding alone."""
+    solid = SOLIDS[name]
+    expected = chords(solid, *rays(pose, detector), far=1.0)
+    got = Phantom.of([solid]).line_integrals(pose, detector)
+    assert (expected > 0).sum() > 10
+    np.testing.assert_allclose(got, solid.attenuation * expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("sod", SODS)
+@pytest.mark.parametrize("name", SOLIDS)
+@settings(max_examples=4, deadline=None)
+@given(angle=st.floats(-7.0, 7.0), tilt=st.tuples(small, small) | st.none(), shift=st.tuples(near, near, near))
+def test_chords_are_what_a_search_finds_whatever_the_pose(
+    name: str, sod: float, angle: float, tilt: tuple[float, float] | None, shift: tuple[float, float, float]
+) -> None:
+    pose = Pose.turned(angle, 6).shifted_by(shift)
+    _agrees(name, pose if tilt is None else pose.tilted_by(tilt), Detector((6, 24), 0.05, 11.3, 2.7, sod))
+
+
+@pytest.mark.parametrize("sod", SODS)
+@pytest.mark.parametrize("name", SOLIDS)
+def test_each_row_may_have_a_pose_of_its_own(name: str, sod: float) -> None:
+    """Both against the search and, to the bit, against frames in which all rows have the pose of one."""
+    rng = np.random.default_rng(5)
+    detector = Detector((9, 30), 0.04, axis_col=14.3, axis_row=3.7, sod=sod)
+    poses = [Pose.turned(rng.uniform(0, 6, 9), 9)]
+    poses.append(poses[0].shifted_by(rng.uniform(-0.05, 0.05, (9, 3))))
+    poses.append(poses[1].tilted_by(rng.uniform(-0.3, 0.3, (9, 2))))
+    phantom = Phantom.of([SOLIDS[name]])
+    for pose in poses:
+        _agrees(name, pose, detector)
+        frame = phantom.line_integrals(pose, detector)
+        for j in range(9):
+            one = [
+                None if a is None else np.repeat(a[j : j + 1], 9, axis=0) for a in (pose.angle, pose.shift, pose.tilt)
+            ]
+            np.testing.assert_array_equal(phantom.line_integrals(Pose(*one), detector)[j], frame[j])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("lean", [(math.pi / 2, 0.0), (0.0, math.pi / 2), (-math.pi / 2, 0.0), (0.0, 1e-13)])
+@pytest.mark.parametrize("angle", [0.0, math.pi / 2])
+def test_rays_along_an_axis_or_a_face(name: str, lean: tuple[float, float], angle: float) -> None:
+    for sod in SODS:
+        _agrees(name, Pose.turned(angle, 9).tilted_by(lean), Detector((9, 31), 0.037, 14.3, 3.7, sod))
+
+
+@pytest.mark.parametrize("sod", [0.8, 30.0, 1e5])
+def test_a_ball_in_a_cone(sod: float) -> None:
+    """2 √(r² - d²), d the distance of the middle from the ray; the source is at -sod along the beam."""
+    middle, radius, angle = np.array([0.1, 0.2, -0.05]), 0.3, 0.6
+    detector = Detector((40, 50), 0.02, 23.7, 20.1, sod)
+    c, s = math.cos(angle), math.sin(angle)
+    seen = np.array([middle[0] * c + middle[1] * s, middle[1] * c - middle[0] * s, middle[2]])
+    v, u = np.meshgrid(detector.v(), detector.u(), indexing="ij")
+    ray = np.stack([u, np.full_like(u, sod), v], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    distance = np.linalg.norm(np.cross(np.add(seen, (0, sod, 0)), ray), axis=-1)
+    expected = 2 * np.sqrt(np.clip(radius**2 - distance**2, 0, None))
+    got = Phantom.of([Ellipsoid((radius,) * 3, 1.0, tuple(middle.tolist()))]).line_integrals(angle, detector)
+    # The closed form loses digits with the distance; its square is good to 1e-15 sod².
+    np.testing.assert_allclose(got**2, expected**2, atol=max(1e-13, 1e-15 * sod**2))
+    assert (expected > 0).sum() > 300
+
+
+def test_a_cylinder_in_a_cone() -> None:
+    """In the plane of the source: 2 √(r² - s²) with s the ray's distance from the axis; out of it, longer by the ray's
+    slope, and cut short by the ends."""
+    sod, radius, height = 5.0, 0.4, 0.8
+    detector = Detector((31, 41), 0.03, 20.0, 15.0, sod)
+    got = Phantom.of([Cylinder(radius, height, 1.0)]).line_integrals(1.1, detector)
+    u, v = detector.u()[None, :], detector.v()[:, None]
+    lateral = u * sod / np.hypot(u, sod)
+    half = np.sqrt(np.clip(radius**2 - lateral**2, 0, None))
+    slope = v / np.hypot(u, sod)  # rise a mm along the plane
+    foot = sod**2 / np.hypot(u, sod)  # mm from the source to the middle of the chord, in the plane
+    with np.errstate(divide="ignore"):
+        bound = np.where(v == 0, np.inf, height / 2 / np.abs(slope))
+    inside = np.minimum(foot + half, bound) - np.minimum(foot - half, bound)
+    np.testing.assert_allclose(got, inside * np.hypot(1, slope), atol=1e-12)
+    assert ((bound < foot + half) & (bound > foot - half) & (half > 0)).any()
+
+
+@pytest.mark.parametrize("sod", [2.0, 1e4])
+def test_a_box_and_an_octahedron_in_a_cone(sod: float) -> None:
+    """The middle ray goes from face to face and from tip to tip; beside it, similar triangles."""
+    detector = Detector((1, 101), 0.004, 50.0, 0.0, sod)
+    u = detector.u()
+    box = Phantom.of([Box((0.3, 0.5, 0.4), 1.0)]).line_integrals(0.0, detector)[0]
+    through = np.abs(u) * (sod + 0.25) / sod < 0.15  # leaves by the far face
+    np.testing.assert_allclose(box[through], 0.5 * np.hypot(1, u / sod)[through], rtol=1e-11)
+    a, c = 0.3, 0.5  # |u|/a + |b|/c <= 1, and b = sod (t - 1), u = u t: two straight lines in t
+    octahedron = Phantom.of([Octahedron((a, c, 0.2), 1.0)]).line_integrals(0.0, detector)[0]
+    leave = (1 + sod / c) / (np.abs(u) / a + sod / c)
+    enter = (1 - sod / c) / (np.abs(u) / a - sod / c)
+    expected = np.clip(leave - enter, 0, None) * np.hypot(u, sod)
+    np.testing.assert_allclose(octahedron, expected, atol=1e-15 * sod + 1e-12)
+    assert octahedron[50] == pytest.approx(2 * c)
+
+
+def test_a_leaning_cylinder_and_a_box_on_edge() -> None:
+    """Tilted about u, a middle ray crosses the wall over 2 r / cos; tilted by a right angle it runs from end to end."""
+    detector = Detector.centred((1, 1), 0.01)
+    cylinder = Phantom.of([Cylinder(0.2, 1.0, 1.0)])
+    for tilt in (0.0, 0.3, -0.7, 1.2):
+        seen = cylinder.line_integrals(Pose.turned(0.4, 1).tilted_by((tilt, 0.0)), detector)[0, 0]
+        assert seen == pytest.approx(min(0.4 / math.cos(tilt), 1.0 / abs(math.sin(tilt)) if tilt else 9))
+    box = Phantom.of([Box((0.3, 0.3, 0.3), 1.0)])
+    assert box.line_integrals(math.pi / 4, detector)[0, 0] == pytest.approx(0.3 * math.sqrt(2))
+    corner = Pose.turned(math.pi / 4, 1).tilted_by((math.atan(math.sqrt(0.5)), 0.0))
+    assert box.line_integrals(corner, detector)[0, 0] == pytest.approx(0.3 * math.sqrt(3))
+
+
+@pytest.mark.parametrize("thin", [1e-3, 1e-6, 1e-9])
+def test_a_needle_across_the_frame(thin: float) -> None:
+    """A ray that meets it halfway to its tip has √(1 - 1/4) of the thickness in the middle; it lies along u = v."""
+    needle = Ellipsoid((1.0, thin, thin), 1.0, quaternion=(math.cos(math.pi / 8), 0, -math.sin(math.pi / 8), 0))
+    detector = Detector((1, 2), math.sqrt(0.125), -1.0, -1.0)
+    seen = Phantom.of([needle]).line_integrals(0.0, detector)[0]
+    # A ray is as far off as a length is rounded, and that is 1e-7 of the thinnest.
+    np.testing.assert_allclose(seen, [thin * math.sqrt(3), 0.0], rtol=1e-12 + (2e-16 / thin) ** 2)
+
+
+def test_where_a_shadow_is_no_number_there_is_none() -> None:
+    """Before, first and last column were whole numbers far outside of the frame."""
+    assert columns(np.arange(5.0), 1.0, 1.0, 2.0) == (1, 3)
+    for low, high in ((math.nan, 2.0), (1.0, math.nan), (2.0, 1.0)):
+        assert columns(np.arange(5.0), 1.0, low, high) == (0, 0)
+    assert columns(np.arange(5.0), 1.0, -math.inf, math.inf) == (0, 5)
+
+
+def test_a_far_source_is_a_parallel_beam() -> None:
+    phantom = Phantom.of(list(SOLIDS.values()))
+    parallel = phantom.line_integrals(0.7, Detector((40, 50), 0.02, 24.3, 19.2))
+    errors = [
+        np.abs(phantom.line_integrals(0.7, Detector((40, 50), 0.02, 24.3, 19.2, sod)) - parallel).mean()
+        for sod in (1e3, 1e4, 1e5)
+    ]
+    assert errors[0] < 2e-3
+    np.testing.assert_allclose(np.array(errors[1:]) / errors[:-1], 0.1, rtol=0.3)
+
+
+def test_convention_is_the_geometry_s() -> None:
+    """Columns grow with u = x cos θ + y sin θ, rows with z; pixel centres as recon.base.geometry counts them."""
+    geometry = Geometry.parallel([0.0], (40, 50), pixel_pitch=0.02, axis_col=21.5)
+    detector = Detector(geometry.detector_shape, geometry.pixel_pitch, geometry.axis_col, axis_row=19.5)
+    ball = Phantom.of([Ellipsoid((0.1, 0.1, 0.1), 1.0, (0.2, 0.1, 0.16))])
+    rows, cols = np.mgrid[:40, :50]
+    for angle in (0.0, 0.5, math.pi / 2, math.pi, 4.0):
+        view = ball.line_integrals(angle, detector)
+        u = 0.2 * math.cos(angle) + 0.1 * math.sin(angle)
+        assert (view * cols).sum() / view.sum() == pytest.approx(21.5 + u / 0.02, abs=0.05)
+        assert (view * rows).sum() / view.sum() == pytest.approx(19.5 + 0.16 / 0.02, abs=0.05)
+
+
+def test_attenuations_add_up_and_may_be_negative() -> None:
+    outer, hole = Cylinder(0.3, 0.4, 2.0), Cylinder(0.2, 0.4, -2.0)
+    for sod in SODS:
+        detector = Detector.centred((20, 40), 0.02, sod)
+        both = Phantom.of([outer, hole]).line_integrals(0.3, detector)
+        tube = Phantom.of([Tube(0.3, 0.2, 0.4, 2.0)]).line_integrals(0.3, detector)
+        np.testing.assert_allclose(both, tube, atol=1e-15)
+        each = [Phantom.of([solid]).line_integrals(0.3, detector) for solid in SOLIDS.values()]
+        all_at_once = Phantom.of(list(SOLIDS.values())).line_integrals(0.3, detector)
+        np.testing.assert_allclose(all_at_once, np.sum(each, axis=0), atol=1e-13)
+
+
+def test_solids_partly_or_wholly_outside_the_frame() -> None:
+    far = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (5.0, 0.0, 0.0)), Box((0.1, 0.1, 0.1), 1.0, (0.0, 0.0, -5.0))]
+    assert not Phantom.of(far).line_integrals(0.0, Detector.centred((8, 8), 0.02)).any()
+    assert not Phantom.of(far).line_integrals(0.0, Detector.centred((8, 8), 0.02, sod=7.0)).any()
+    wide = Phantom.of([Cylinder(3.0, 9.0, 1.0)])
+    assert wide.line_integrals(1.0, Detector.centred((2, 3), 0.02))[0, 1] == pytest.approx(6.0)
+    assert not Phantom.of([]).line_integrals(0.0, Detector.centred((2, 3), 0.02)).any()

@@ -1,0 +1,190 @@
+"""Scene: Beer-Lambert exactly where nothing is named, the order of physics, and wrong scenes refused."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from simulators.effects.catalogue import CATALOGUE, load_effect
+from simulators.effects.chain import Chain
+from simulators.frame import sensor
+from simulators.frame.detector import Detector
+from simulators.frame.domain import Domain
+from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Shot
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import load_scene
+from tests.simulators import shots
+
+SCENES = Path(__file__).parents[3] / "configs" / "scenes"
+CONVERSION = sensor.CONVERSION["standard"]
+
+
+def test_without_effects_a_frame_is_exactly_beer_lambert() -> None:
+    scene, shot = shots.scene(), shots.shot()
+    expected = np.rint(4e5 * 0.01 / CONVERSION * np.exp(-shots.depth(scene, 0.4)))
+    np.testing.assert_array_equal(shots.frame(scene, shot), expected.astype(np.uint16))
+    assert (shots.frame(scene, sample=False) == round(4000 / CONVERSION)).all()
+    assert not shots.frame(scene, beam=False).any()
+    # Chords of a centred cylinder of radius r: 2 √(r² - u²).
+    u = shot.detector.u()
+    chord = 2 * np.sqrt(np.clip(0.3**2 - u**2, 0, None))
+    np.testing.assert_array_equal(shots.frame(scene, shot)[8], np.rint(4000 / CONVERSION * np.exp(-2 * chord)))
+
+
+def test_a_scene_pays_only_for_what_it_names() -> None:
+    """Where no motion is named nobody asks for the stage (_never), and no step is taken that is not named."""
+    steps: list[str] = []
+
+    def watch(step: str) -> AbstractContextManager[None]:
+        steps.append(step)
+        return nullcontext()
+
+    expose(
+        shots.scene({"kind": "beam_profile", "sigma": [1, 1]}, {"kind": "ring_current", "lifetime": 9.0}),
+        shots.shot(),
+        watch,
+    )
+    assert [step for step in steps if step in CATALOGUE] == ["beam_profile", "ring_current"]
+
+
+def test_the_same_seed_makes_the_same_frame_again() -> None:
+    scene = load_scene(yaml.safe_load((SCENES / "battery.yaml").read_text(encoding="utf-8")))
+    frames = [shots.frame(scene, shots.shot(frame=k)) for k in (3, 4, 3)]
+    np.testing.assert_array_equal(frames[0], frames[2])
+    assert (frames[0] != frames[1]).mean() > 0.9
+
+
+def test_binned_pixels_collect_the_light_of_all_they_sum() -> None:
+    flat = shots.frame(shots.scene(flux=4e4), shots.shot(binning=2), sample=False)
+    assert (flat == round(1600 / CONVERSION)).all()
+
+
+def test_too_much_light_saturates() -> None:
+    assert (shots.frame(shots.scene("offset", flux=1e6), sample=False) == 65535).all()
+
+
+@pytest.mark.parametrize("name", ["battery", "plain"])
+def test_scenes_that_come_with_the_package_load(name: str) -> None:
+    scene = load_scene(yaml.safe_load((SCENES / f"{name}.yaml").read_text(encoding="utf-8")))
+    detector = Detector.centred((144, 160), 4.6e-3)
+    views = np.stack([scene.sample.line_integrals(angle, detector) for angle in np.linspace(0, np.pi, 8)])
+    assert 1.0 < views.max() < 3.0
+    assert not views[:, :, [0, -1]].any()  # air on both sides
+    assert not views[:, [0, -1]].any()
+    assert bool(scene.chain.effects) == (name == "battery")
+    flat = shots.frame(scene, shots.shot(exposure=0.05), sample=False)
+    assert flat.max() < 65535 or name == "battery"  # a zinger may saturate
+    assert np.median(flat) < 60_000
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_of_the_catalogue_is_what_it_says(name: str) -> None:
+    effect = load_effect(name)
+    assert (effect.name, effect.domain) == (name, CATALOGUE[name].domain)
+    assert effect.__module__ == f"simulators.effects.{name}"
+
+
+def _with(**changes: Any) -> dict[str, Any]:
+    return {"phantom": shots.PHANTOM, "beam": {"photons_per_s": 1e5}} | changes
+
+
+@pytest.mark.parametrize(
+    ("mapping", "words"),
+    [
+        ({}, "scene: key 'phantom' is missing; needed: phantom, beam"),
+        (
+            _with(colour="red"),
+            "scene: key 'colour' is unknown; legal: phantom, beam, axis_offset_px, effects",
+        ),
+        (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s, sod, sdd"),
+        (_with(beam={"photons_per_s": -1}), "scene.beam: photons_per_s must be >= 0, got -1.0"),
+        (_with(beam={"photons_per_s": "many"}), "scene.beam.photons_per_s must be a finite number, got 'many'"),
+        (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd, energy_kev"),
+        (_with(axis_offset_px=True), "scene.axis_offset_px must be a finite number, got True"),
+        (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
+        (_with(phantom={"kind": "battery"}), "scene.phantom (battery): key 'field_of_view' is missing"),
+        (
+            _with(phantom={"kind": "battery", "field_of_view": [1, 1], "n_particles": 1.5}),
+            "n_particles must be a whole number, got 1.5",
+        ),
+        (
+            _with(phantom={"kind": "battery", "field_of_view": [1]}),
+            "field_of_view must be a list of 2 numbers, got [1]",
+        ),
+        (
+            _with(phantom={"kind": "battery", "field_of_view": [1, 1], "fill": 0.9}),
+            "scene.phantom (battery): only",
+        ),
+        (_with(phantom={"kind": "solids"}), "scene.phantom (solids): key 'solids' is missing"),
+        (_with(phantom={"kind": "solids", "solids": {"a": 1}}), "scene.phantom (solids): solids must be a list"),
+        (
+            _with(phantom={"kind": "solids", "solids": [{"kind": "cone"}]}),
+            "scene.phantom (solids).solids[0]: kind 'cone' is unknown; legal: cylinder, tube, ellipsoid",
+        ),
+        (
+            _with(phantom={"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 0], "attenuation": 1}]}),
+            "scene.phantom (solids).solids[0] (box): box: edges must be positive",
+        ),
+        (_with(effects="offset"), "scene: effects must be a list, got 'offset'"),
+        (_with(effects=["fog"]), "scene.effects[0]: kind 'fog' is unknown; legal: motion_blur, rolling_shutter, "),
+        (_with(effects=[7]), "scene.effects[0]: kind 7 is unknown"),
+        (
+            _with(effects=["photon_noise", {"kind": "zingers", "rat": 1}]),
+            "scene.effects[1] (zingers): key 'rat' is unknown; legal: rate, charge",
+        ),
+        (_with(effects=["zingers"]), "scene.effects[0] (zingers): key 'rate' is missing"),
+        (
+            _with(effects=["offset", "photon_noise"]),
+            "effect 'photon_noise' acts on photons and cannot follow 'offset', which acts on counts; "
+            "the order is motion, optical depth, photons, electrons, counts",
+        ),
+        (_with(effects=["read_noise", "rolling_shutter"]), "'rolling_shutter' acts on motion and cannot follow"),
+        (_with(effects=["offset", "offset"]), "effect 'offset' is named twice"),
+        (
+            _with(effects=["photon_noise", {"kind": "ring_current", "lifetime": 9}]),
+            "effect 'ring_current' must come before 'photon_noise', which ends the photons",
+        ),
+    ],
+)
+def test_a_wrong_scene_is_refused_in_a_sentence(mapping: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        load_scene(mapping)
+    assert words in str(caught.value)
+
+
+def test_numbers_that_yaml_takes_for_text_are_numbers() -> None:
+    scene = load_scene(yaml.safe_load("{phantom: {kind: solids, solids: []}, beam: {photons_per_s: 1.0e5}}"))
+    assert scene.beam.photons_per_s == 1e5
+    assert scene.axis_offset_px == 0.0
+
+
+def test_each_domain_is_seen_in_the_order_of_physics() -> None:
+    """An effect for each image domain that writes down what it was given: depth, photons, electrons, counts."""
+    seen: dict[Domain, NDArray[np.float64]] = {}
+
+    class Witness:
+        final: ClassVar[bool] = False
+
+        def __init__(self, domain: Domain) -> None:
+            self.name, self.domain = f"witness of {domain.name}", domain  # type: ignore[misc]
+
+        def apply(self, image: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
+            seen[self.domain] = image
+            return image + 1.0
+
+    chain = Chain.of([Witness(domain) for domain in list(Domain)[1:]])
+    frame = shots.frame(replace(shots.scene(), chain=chain))
+    depth = shots.depth(shots.scene(), 0.4)
+    np.testing.assert_array_equal(seen[Domain.OPTICAL_DEPTH], depth)
+    np.testing.assert_allclose(seen[Domain.PHOTONS], 4000 * np.exp(-depth - 1))
+    np.testing.assert_allclose(seen[Domain.ELECTRONS], 4000 * np.exp(-depth - 1) + 1)
+    np.testing.assert_allclose(seen[Domain.COUNTS], (4000 * np.exp(-depth - 1) + 2) / CONVERSION)
+    np.testing.assert_array_equal(frame, np.rint(seen[Domain.COUNTS] + 1))

@@ -1,0 +1,236 @@
+"""Simulated Zaber triggers: edges at the counts and times of closed forms, and the rules of enabling and firing."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simulators.wires.zaber.triggers import Triggers
+from tests.simulators.zaber_host import SPEED, TURN, Wire
+
+PULSE = "io set do 1 1 schedule 1 0"
+
+
+@pytest.fixture
+def wire() -> Wire:
+    return Wire()
+
+
+def set_up(wire: Wire, condition: str, action: str = PULSE, number: int = 1, enable: str = "enable") -> None:
+    wire.do(f"trigger {number} when {condition}", f"trigger {number} action a {action}", f"trigger {number} {enable}")
+
+
+# distances
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_distance_trigger_fires_each_distance_from_where_it_was_enabled(wire: Wire, sign: int) -> None:
+    wire.run(f"move abs {sign * 130}")
+    set_up(wire, "1 dist 500")
+    wire.run(f"move abs {sign * 2630}")
+    assert wire.counts() == [sign * count for count in (630, 1130, 1630, 2130, 2630)]
+
+
+@given(st.integers(1, 4000), st.integers(-500, 500))
+def test_pulse_times_are_those_of_the_closed_form(distance: int, start: int) -> None:
+    wire = Wire()
+    wire.run(f"move abs {start}")
+    set_up(wire, f"1 dist {distance}", enable="enable 40", action="io set do 1 1 schedule 0.001 0")
+    begun = wire.clock.now()
+    wire.run("move rel 100000")
+    ramp = SPEED / wire.acceleration
+    way = 0.5 * SPEED * ramp
+    for k, pulse in enumerate(wire.pulses(), 1):
+        gone = k * distance
+        left = 100_000 - gone
+        if gone < way:
+            expected = math.sqrt(2 * gone / wire.acceleration)
+        elif left >= way:
+            expected = ramp + (gone - way) / SPEED
+        else:
+            expected = 100_000 / SPEED + ramp - math.sqrt(2 * left / wire.acceleration)
+        assert pulse.time - begun == pytest.approx(expected, abs=1e-9)
+        assert pulse.angle == pytest.approx((start + gone) * 2 * math.pi / TURN)
+    assert len(wire.pulses()) == min(40, 100_000 // distance)
+
+
+def test_toggling_gives_a_rising_edge_each_second_time(wire: Wire) -> None:
+    set_up(wire, "1 dist 500", "io set do 1 t")
+    wire.run("move abs 3000")
+    assert wire.counts() == [500, 1500, 2500]
+
+
+def test_a_distance_is_counted_both_ways_from_the_last_fire(wire: Wire) -> None:
+    set_up(wire, "1 dist 500")
+    wire.run("move abs 700")
+    wire.run("move abs -100")
+    wire.run("move abs 20")
+    assert wire.counts() == [500, 0]
+
+
+def test_a_count_disables_it_and_is_told(wire: Wire) -> None:
+    set_up(wire, "1 dist 500", enable="enable 3")
+    assert wire.data("trigger show") == "3 d d d d d"
+    wire.do("move abs 9000")
+    wire.clock.sleep(0.22)
+    assert wire.data("trigger show") == "1 d d d d d"
+    wire.clock.sleep(60.0)
+    assert wire.data("trigger show") == "d d d d d d"
+    assert wire.counts() == [500, 1000, 1500]
+
+
+def test_without_a_count_it_goes_on_until_disabled(wire: Wire) -> None:
+    set_up(wire, "1 dist 500")
+    wire.run("move abs 1200")
+    assert wire.data("trigger show") == "e d d d d d"
+    wire.run("trigger 1 disable", "move abs 5000")
+    assert wire.counts() == [500, 1000]
+
+
+def test_a_stop_takes_away_what_was_foretold(wire: Wire) -> None:
+    set_up(wire, "1 dist 500")
+    wire.do("move abs 90000")
+    wire.clock.sleep(1.0)
+    wire.do("estop")
+    here = int(wire.data("get pos", axis=1))
+    wire.clock.sleep(60.0)
+    assert wire.counts() == list(range(500, here + 1, 500))
+    wire.run("move abs 90000")
+    assert wire.counts() == list(range(500, 90_001, 500))
+
+
+def test_firmware_may_fire_where_a_distance_trigger_is_enabled() -> None:
+    wire = Wire(fires_when_enabled=True)
+    set_up(wire, "1 dist 500", enable="enable 2")
+    wire.run("move abs 3000")
+    assert wire.counts() == [0, 500]
+
+
+# comparisons
+
+
+@pytest.mark.parametrize(
+    ("condition", "edges"),
+    [
+        ("1 pos >= 300", [300]),
+        ("1 pos > 300", [301]),
+        ("1 pos == 300", [300, 300]),
+        ("1 pos <= 300", [0, 300]),
+        ("1 pos < 300", [0, 299]),
+        ("1 pos != 0", [1, -1]),
+        ("1 encoder.pos <= -200", [-200]),
+        ("1 abs pos >= 200", [200, -200]),
+        ("1 abs pos < 200", [0, 199, -199]),
+    ],
+)
+def test_a_comparison_fires_when_it_turns_true(wire: Wire, condition: str, edges: list[int]) -> None:
+    """From 0 to 1000, to -1000 and back to 0."""
+    set_up(wire, condition, "io set do 1 1 schedule 0.001 0")
+    wire.run("move abs 1000")
+    wire.run("move abs -1000")
+    wire.run("move abs 0")
+    assert wire.counts() == edges
+
+
+def test_a_comparison_that_turns_true_enables_another_trigger_there(wire: Wire) -> None:
+    """The first pulse and what gives the rest, at one position, wherever the stage stood before."""
+    wire.run("move abs -777")
+    wire.do("trigger 2 when 1 dist 250", f"trigger 2 action a {PULSE}", "trigger 1 action b trigger 2 enable 4")
+    set_up(wire, "1 pos >= 1000", enable="enable 1")
+    wire.run("move abs 9000")
+    assert wire.counts() == [1000, 1250, 1500, 1750, 2000]
+
+
+def test_latency_delays_all_pulses_of_a_chain_by_the_same_angle() -> None:
+    wire = Wire(latency=0.01)
+    wire.do("trigger 2 when 1 dist 500", f"trigger 2 action a {PULSE}", "trigger 1 action b trigger 2 enable 3")
+    set_up(wire, "1 pos >= 5000", enable="enable 1")
+    wire.run("move abs 30000")
+    late = [count - at for count, at in zip(wire.counts(), (5000, 5500, 6000, 6500), strict=True)]
+    assert late == [100, 200, 200, 200]
+
+
+def test_triggers_that_set_each_other_off_come_to_an_end(wire: Wire) -> None:
+    wire.do("trigger 1 when 1 pos >= 10", "trigger 2 when 1 pos >= 10")
+    wire.do("trigger 1 action a trigger 2 enable 1", "trigger 2 action a trigger 1 enable 1", "trigger 1 enable 1")
+    wire.run("move abs 1000")
+    assert wire.data("get pos", axis=1) == "1000"
+
+
+# outputs, time, inputs, settings
+
+
+def test_a_scheduled_value_comes_after_its_time_and_a_new_one_cancels_it(wire: Wire) -> None:
+    wire.do("io set do 1 1 schedule 20 0")
+    wire.clock.sleep(0.019)
+    assert wire.data("io get do 1") == "1"
+    wire.clock.sleep(0.002)
+    assert wire.data("io get do") == "0 0 0 0"
+    wire.do("io set do 1 1 schedule 20 0", "io set do 1 1")
+    wire.clock.sleep(1.0)
+    assert wire.data("io get do 1") == "1"
+    assert [round(pulse.time, 6) for pulse in wire.pulses()] == [0.0, 0.021]
+
+
+def test_pulses_wider_than_their_distance_in_time_merge(wire: Wire) -> None:
+    set_up(wire, "1 dist 500", "io set do 1 1 schedule 60 0")
+    wire.run("move abs 90000")
+    assert len(wire.pulses()) < 90
+
+
+def test_another_output_is_not_cabled_and_an_inverted_one_pulses_downwards() -> None:
+    wire = Wire(active_high=False)
+    assert wire.data("io get do 1") == "1"
+    set_up(wire, "1 dist 500", "io set do 1 0 schedule 1 1")
+    set_up(wire, "1 dist 100", "io set do 2 t", number=2)
+    wire.run("move abs 1200")
+    assert wire.counts() == [500, 1000]
+
+
+def test_lost_pulses_are_missing_and_no_others() -> None:
+    wire = Wire(lost={1, 4})
+    set_up(wire, "1 dist 500")
+    wire.run("move abs 2000")
+    wire.run("move abs 4000")
+    assert wire.counts() == [500, 1500, 2000, 3000, 3500, 4000]
+
+
+def test_a_periodic_trigger_gives_equal_times(wire: Wire) -> None:
+    set_up(wire, "time 250", enable="enable 5")
+    wire.clock.sleep(2.0)
+    wire.tell("/1")
+    periods = [later.time - earlier.time for earlier, later in itertools.pairwise(wire.pulses())]
+    assert periods == pytest.approx([0.25] * 4)
+
+
+def test_an_input_fires_when_it_turns_true(wire: Wire) -> None:
+    set_up(wire, "io di 2 == 1", "io set do 3 t")
+    for value in (1, 1, 0, 1):
+        wire.box.device.triggers.set_input(1, value)
+    wire.tell("/1")
+    assert [edge.value for edge in wire.box.device.triggers.edges] == [1, 0]
+
+
+def test_an_action_changes_a_setting(wire: Wire) -> None:
+    set_up(wire, "1 pos >= 100", "1 maxspeed = 100")
+    wire.run("move abs 200")
+    assert wire.data("get maxspeed", axis=1) == "100"
+
+
+def test_what_is_foretold_is_what_happens() -> None:
+    """The copy that looks ahead leaves the triggers as they are."""
+    wire = Wire()
+    set_up(wire, "1 dist 300", "io set do 1 t", enable="enable 7")
+    wire.do("move abs 5000")
+    triggers: Triggers = wire.box.device.triggers
+    foretold = triggers.foretold(60.0)
+    assert triggers.edges == []
+    for _ in range(100):
+        wire.clock.sleep(0.013)
+        wire.tell("/1")
+    assert triggers.edges == foretold
+    assert len(foretold) == 7

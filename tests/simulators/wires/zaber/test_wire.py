@@ -1,0 +1,317 @@
+"""Simulated Zaber on its wire: packets by published test vectors, settings, motion against closed forms."""
+
+from __future__ import annotations
+
+import math
+import string
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simulators.devices.clock import VirtualClock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.zaber.packets import Command, Malformed, PacketReader, frame, lrc
+from simulators.wires.zaber.wire import Fault, ZaberController
+from tests.drivers.zaber_vectors import VECTORS
+from tests.simulators.zaber_host import SPEED, TURN, Wire
+
+
+@pytest.fixture
+def wire() -> Wire:
+    return Wire()
+
+
+# packets
+
+
+@pytest.mark.parametrize("packet", VECTORS)
+def test_checksums_are_the_published_ones(packet: str) -> None:
+    body, _, checksum = packet[1:].partition(":")
+    assert lrc(body.encode()) == checksum
+    assert frame(packet[0] + body, checksum=True) == packet.encode() + b"\r\n"
+
+
+@given(st.binary())
+def test_the_bytes_and_their_checksum_sum_to_zero(body: bytes) -> None:
+    assert (sum(body) + int(lrc(body), 16)) % 256 == 0
+
+
+@pytest.mark.parametrize(
+    ("packet", "command"),
+    [
+        (b"/", Command(0, 0, "", ())),
+        (b"/1", Command(1, 0, "", ())),
+        (b"/2 1:7D", Command(2, 1, "", ())),
+        (b"/0 0 5:2B", Command(0, 0, "5", ())),
+        (b"/get maxspeed:49", Command(0, 0, "", ("get", "maxspeed"))),
+        (b"/1 1 19 move abs 1000:E6", Command(1, 1, "19", ("move", "abs", "1000"))),
+        (b"/1 0 -- get pos", Command(1, 0, "--", ("get", "pos"))),
+        (b"/1 2 3 4 5", Command(1, 2, "3", ("4", "5"))),
+    ],
+)
+@pytest.mark.parametrize("end", [b"\n", b"\r", b"\r\n"])
+def test_numbers_at_the_start_are_address_axis_and_id(packet: bytes, command: Command, end: bytes) -> None:
+    assert PacketReader().feed(packet + end) == [command]
+
+
+def test_a_command_in_two_packets_is_one() -> None:
+    first = rb"/1 tools echo aaaaaaaaaa bbbbbbbbbb ccccccccc dddddddddd eeeeeeeeee\:D0"
+    second = b"/1 cont 1 ffffffffff gggggggggg hhhhhhhhhh iiiiiiiiii jjjjjjjjj:24"
+    reader = PacketReader()
+    assert reader.feed(first + b"\n") == []
+    (command,) = reader.feed(second + b"\n")
+    assert isinstance(command, Command)
+    assert [word[0] for word in command.words[2:]] == list("abcdefghij")
+
+
+@pytest.mark.parametrize("packet", [b"/1 cont 1 x", b"/1 a\\\n/1 cont 2 x"])
+def test_a_part_that_does_not_follow_is_refused(packet: bytes) -> None:
+    (found,) = PacketReader().feed(packet + b"\n")
+    assert isinstance(found, Malformed)
+    assert found.reason == "BADSPLIT"
+
+
+@pytest.mark.parametrize(
+    "packet", [b"/1:00", b"/1:C", b"/1:", b"x/1", b"/1 \xff", b"1 home", b"@01 1 OK", b"/1 " + b"w " * 40]
+)
+def test_a_packet_that_is_damaged_gets_no_answer_and_the_next_one_does(wire: Wire, packet: bytes) -> None:
+    wire.box.receive(packet + b"\n")
+    assert wire.box.transmit() == b""
+    assert wire.ask("/1 1") == "@01 1 OK IDLE -- 0"
+
+
+def test_words_and_ids_out_of_bounds_are_refused(wire: Wire) -> None:
+    assert wire.ask("/1 0 7 " + "w" * 51) == "@01 0 7 RJ IDLE -- LONGWORD"
+    assert wire.ask("/1 0 100 home") == "@01 0 RJ IDLE -- BADMESSAGEID"
+
+
+@given(st.lists(st.integers(1, 9), max_size=12))
+def test_bytes_may_come_in_pieces_of_any_size(sizes: list[int]) -> None:
+    wire, data = Wire(), b"/1 1 1\n/1 0 2 get version\r\n/1 1 3 get pos\r"
+    for size in sizes:
+        wire.box.receive(data[:size])
+        data = data[size:]
+    wire.box.receive(data)
+    assert wire.box.transmit() == b"@01 1 1 OK IDLE -- 0\r\n@01 0 2 OK IDLE -- 7.38\r\n@01 1 3 OK IDLE -- 0\r\n"
+
+
+@given(
+    st.lists(st.binary(max_size=200) | st.text(string.printable, max_size=90).map(lambda text: b"/1 " + text.encode()))
+)
+def test_whatever_comes_the_device_lives_and_answers_the_next_command(chunks: list[bytes]) -> None:
+    wire = Wire()
+    for chunk in chunks:
+        wire.box.receive(chunk)
+        wire.box.receive(b"\n")
+    wire.box.transmit()
+    wire.clock.sleep(1e6)
+    wire.tell("/1 0 set comm.alert 0", "/1 0 set comm.checksum 0")
+    wire.box.transmit()
+    assert wire.ask("/1 0 55 get version") == "@01 0 55 OK IDLE -- 7.38"
+
+
+VOCABULARY = """
+    trigger 1 2 3 6 7 when action a b io set do di dist pos >= <= == != 100 2000 -50 encoder abs time enable disable
+    print schedule 0 t none move rel vel stop estop home show get maxspeed = += driver warnings clear cont echo tools
+"""
+WORDS = st.sampled_from(VOCABULARY.split())
+
+
+@given(st.lists(st.lists(WORDS, max_size=9), max_size=30))
+def test_any_sequence_of_its_own_words_leaves_it_answering(commands: list[list[str]]) -> None:
+    wire = Wire()
+    for words in commands:
+        wire.tell("/1 0 " + " ".join(words), "/1 1 " + " ".join(words))
+        wire.clock.sleep(0.2)
+    assert wire.ask("/1 0 55 get version").startswith("@01 0 55 OK ")
+
+
+def test_another_devices_packets_are_not_answered_and_everybodys_are(wire: Wire) -> None:
+    assert wire.tell("/2 1 get pos") == ""
+    assert wire.ask("/0 0 get comm.address") == "@01 0 OK IDLE -- 1"
+    assert wire.ask("/1 2 get pos") == "@01 2 RJ IDLE -- BADAXIS"
+
+
+def test_checksums_come_once_they_are_asked_for(wire: Wire) -> None:
+    assert wire.ask("/1 0 set comm.checksum 1") == "@01 0 OK IDLE -- 0:8D"
+    assert wire.ask("/1 0 bad") == "@01 0 RJ IDLE -- BADCOMMAND:F5"
+
+
+def test_info_lines_follow_their_reply_and_an_empty_command_ends_them(wire: Wire) -> None:
+    wire.do("trigger 1 when 1 dist 100", "trigger 1 action a io set do 1 t", "trigger 1 enable 5")
+    assert wire.tell("/1 0 7 trigger 1 print", "/1 0 7").split("\r\n") == [
+        "@01 0 7 OK IDLE -- 0",
+        "#01 0 7 when 1 dist 100",
+        "#01 0 7 action a io set do 1 t",
+        "#01 0 7 action b none",
+        "#01 0 7 enable 5",
+        "@01 0 7 OK IDLE -- 0",
+        "",
+    ]
+
+
+def test_an_alert_comes_when_a_move_ends_and_only_if_wanted(wire: Wire) -> None:
+    wire.run("move abs 1000")
+    assert wire.tell() == ""
+    wire.do("set comm.alert 1", "move abs 0")
+    assert wire.tell() == ""
+    wire.clock.sleep(60.0)
+    assert wire.tell() == "!01 1 IDLE --\r\n"
+    assert wire.tell() == ""
+
+
+# settings
+
+
+def test_identity_and_settings(wire: Wire) -> None:
+    told = {"device.id": "50952", "system.serial": "123456", "version": "7.38", "trigger.numactions": "2"}
+    assert {setting: wire.data(f"get {setting}") for setting in told} == told
+    assert wire.data("get limit.cycle.dist", axis=1) == str(TURN)
+    assert wire.ask("/1 0 get deviceid") == "@01 0 RJ IDLE -- BADCOMMAND"
+    assert Wire(identity="deviceid").data("get deviceid") == "50952"
+
+
+@pytest.mark.parametrize(
+    ("packet", "reason"),
+    [
+        ("/1 1 set maxspeed 0", "BADDATA"),
+        ("/1 1 set maxspeed fast", "BADDATA"),
+        ("/1 1 set pos 5", "BADCOMMAND"),
+        ("/1 1 get version", "DEVICEONLY"),
+        ("/1 1 move abs 2000000001", "BADDATA"),
+        ("/1 1 move abs", "BADCOMMAND"),
+        ("/1 0 trigger 7 enable", "BADDATA"),
+        ("/1 0 trigger 1 enable", "BADDATA"),
+        ("/1 0 trigger 1 when 1 dist 0", "BADDATA"),
+        ("/1 0 trigger 1 action a fly", "BADDATA"),
+        ("/1 0 io set do 5 1", "BADCOMMAND"),
+    ],
+)
+def test_what_it_cannot_do_is_rejected_with_the_reason(wire: Wire, packet: str, reason: str) -> None:
+    assert wire.ask(packet).endswith(f"RJ IDLE -- {reason}")
+
+
+# motion
+
+
+def test_a_move_takes_distance_over_speed_plus_speed_over_acceleration(wire: Wire) -> None:
+    assert wire.ask("/1 1 move abs 30000") == "@01 1 OK BUSY -- 0"
+    seconds = 30_000 / SPEED + SPEED / wire.acceleration
+    wire.clock.sleep(seconds - 1e-6)
+    assert wire.ask("/1 1").endswith("BUSY -- 0")
+    wire.clock.sleep(2e-6)
+    assert wire.ask("/1 1").endswith("IDLE -- 0")
+    assert wire.data("get pos", axis=1) == "30000"
+
+
+def test_the_true_angle_follows_the_closed_form(wire: Wire) -> None:
+    wire.do("move abs 30000")
+    at = 0.5 * SPEED / wire.acceleration
+    assert wire.line.angle_at(at) == pytest.approx(0.5 * wire.acceleration * at**2 * 2 * math.pi / TURN)
+    at = 1.5
+    ramp = SPEED / wire.acceleration
+    assert wire.line.angle_at(at) == pytest.approx(SPEED * (at - ramp / 2) * 2 * math.pi / TURN)
+
+
+def test_relative_moves_ends_of_travel_and_speeds() -> None:
+    wire = Wire(low=-3000, high=5000)
+    for move, position in (("rel 700", 700), ("rel -900", -200), ("max", 5000), ("min", -3000), ("vel 800", 5000)):
+        wire.run(f"move {move}")
+        assert wire.data("get pos", axis=1) == str(position)
+    assert wire.ask("/1 1 move abs 5001").endswith("RJ IDLE -- BADDATA")
+
+
+def test_a_move_under_way_is_not_changed(wire: Wire) -> None:
+    wire.do("move abs 30000")
+    assert wire.ask("/1 1 move abs 0").endswith("RJ BUSY -- STATUSBUSY")
+    assert wire.ask("/1 1 home").endswith("RJ BUSY -- STATUSBUSY")
+
+
+def test_a_stop_takes_v_squared_over_twice_a_and_an_emergency_stop_nothing(wire: Wire) -> None:
+    wire.do("move abs 300000")
+    wire.clock.sleep(2.0)
+    before = int(wire.data("get pos", axis=1))
+    assert wire.ask("/1 1 stop").endswith("OK BUSY NI 0")
+    wire.clock.sleep(SPEED / wire.acceleration + 1e-3)
+    assert wire.ask("/1 1").endswith("IDLE NI 0")
+    assert int(wire.data("get pos", axis=1)) - before == pytest.approx(SPEED**2 / (2 * wire.acceleration), abs=2)
+    wire.do("warnings clear", "move abs 300000")
+    wire.clock.sleep(2.0)
+    before = int(wire.data("get pos", axis=1))
+    wire.do("estop")
+    assert wire.ask("/1 1").endswith("IDLE NI 0")
+    assert int(wire.data("get pos", axis=1)) == before
+
+
+def test_homing_clears_the_flag_at_its_end() -> None:
+    wire = Wire(homed=False)
+    assert wire.ask("/1 1") == "@01 1 OK IDLE WR 0"
+    wire.run("move abs 5000")
+    wire.do("home")
+    assert wire.ask("/1 1") == "@01 1 OK BUSY WR 0"
+    wire.clock.sleep(60.0)
+    assert wire.ask("/1 1 get pos") == "@01 1 OK IDLE -- 0"
+
+
+def test_stall_and_limit_switch_end_a_move_with_their_flags() -> None:
+    wire = Wire(stall_at=4000, switch_at=-4000)
+    wire.run("move abs 9000")
+    assert wire.ask("/1 1 get pos") == "@01 1 OK IDLE FS 4000"
+    assert wire.data("warnings clear") == "01 FS"
+    wire.run("move abs -9000")
+    assert wire.data("warnings") == "02 FE WL"
+    assert wire.ask("/1 1 get pos") == "@01 1 OK IDLE FE -4000"
+
+
+def test_a_disabled_driver_does_not_move(wire: Wire) -> None:
+    wire.do("driver disable")
+    assert wire.ask("/1 1 move abs 5").endswith("RJ IDLE FO DRIVERDISABLED")
+    wire.do("driver enable")
+    wire.run("move abs 5")
+    assert wire.data("get pos", axis=1) == "5"
+
+
+# faults on the line
+
+
+def test_faults_befall_the_replies_that_they_are_set_for() -> None:
+    wire = Wire(faults=dict(enumerate(Fault, 3)))
+    wire.tell("/1 0 set comm.checksum 1")
+    replies = {fault: wire.tell("/1 1 7 get pos") for fault in Fault}
+    assert replies == {
+        Fault.SILENT: "",
+        Fault.WRONG_CHECKSUM: "@81 1 7 OK IDLE -- 0:35\r\n",
+        Fault.TRUNCATED: "@01 1 7 OK I",
+        Fault.NOISE: "\\xfe\x00@01 1 7 OK IDLE -- 0:35\r\n",
+        Fault.ALERT: "!01 1 IDLE --:96\r\n@01 1 7 OK IDLE -- 0:35\r\n",
+        Fault.OTHER_ID: "@01 1 42 OK IDLE -- 0:06\r\n",
+        Fault.AGAIN: "@01 1 7 RJ IDLE -- AGAIN:03\r\n",
+    }
+
+
+def test_an_echoing_line_sends_the_command_back_first() -> None:
+    assert Wire(echo=True).tell("/1 1 get pos").endswith("/1 1 get pos\n@01 1 OK IDLE -- 0\r\n")
+
+
+class Passing(VirtualClock):
+    """A clock on which a millisecond passes at every look."""
+
+    def now(self) -> float:
+        self.sleep(1e-3)
+        return super().now()
+
+
+def test_a_reply_that_says_idle_never_shows_a_place_on_the_way() -> None:
+    """However the end of the move falls between the looks at the clock that a reply takes."""
+    for late in range(40):
+        clock = Passing(start=0.0)
+        box = ZaberController(clock, TriggerLine(clock), counts_per_turn=TURN)
+        box.receive(b"/1 1 move abs 1000\n")
+        clock.sleep(late * 0.25e-3)
+        reply = "BUSY"
+        while "BUSY" in reply:
+            box.transmit()
+            box.receive(b"/1 1 get pos\n")
+            reply = box.transmit().decode()
+        assert reply.split()[4:] == ["--", "1000"], late
