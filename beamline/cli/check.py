@@ -10,7 +10,7 @@ from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.told import told_as_json
 from beamline.config.load import load
 from beamline.core.events import Event
-from beamline.scan.dry_run import dry_run, refuse_violations
+from beamline.scan.preflight import dry_run, refuse_violations
 from drivers.clock import SystemClock
 
 

@@ -18,8 +18,8 @@ from beamline.config.load import Config, load
 from beamline.core.events import Event, Sink
 from beamline.core.stop import StopRequest
 from beamline.instrument.operator import ask_operator
-from beamline.scan.dry_run import dry_run, refuse_violations
 from beamline.scan.live_process import LiveCommand, follow_command
+from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
 from drivers.clock import SystemClock

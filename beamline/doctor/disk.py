@@ -15,7 +15,7 @@ import numpy as np
 from beamline.core.text import size
 from beamline.doctor.check import Check, Verdict
 from beamline.doctor.needs import Needs
-from beamline.scan.dry_run import free_bytes
+from beamline.scan.preflight import free_bytes
 from drivers.clock import Clock
 
 SECONDS, MOST = 3.0, 4 << 30

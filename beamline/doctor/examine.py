@@ -17,7 +17,7 @@ from beamline.doctor.memory import memory
 from beamline.doctor.needs import Needs, needs, ring_bytes
 from beamline.doctor.ports import port, ports
 from beamline.instrument.beam_monitors import make_beam_monitor
-from beamline.scan.dry_run import DryRun, dry_run
+from beamline.scan.preflight import DryRun, dry_run
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.serial.ports import SerialPort, serial_ports

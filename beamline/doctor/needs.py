@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from beamline.plan.limits import ROOM
 from beamline.plan.plan import Timeline
-from beamline.scan.dry_run import DryRun
+from beamline.scan.preflight import DryRun
 from beamline.scan.recorder import WAITING_BYTES, WAITING_FRAMES
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from beamline.monitor.preview import light, thinned
 from drivers.frame import Frame, FrameKind
 
@@ -43,7 +43,7 @@ class State:
     flat: Profile | None = None
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: the largest fraction of light that a preview row has lost. A row's light is its median over columns."""
     if frame.kind is FrameKind.PROJECTION:
         profile, flag = _look(state.projection, state.limits, frame.index, digest, context)
@@ -55,7 +55,7 @@ def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> 
 
 
 def _look(
-    profile: Profile | None, limits: Limits, view: int, digest: FrameDigest, context: Context
+    profile: Profile | None, limits: Limits, view: int, digest: FrameDigest, context: ScanContext
 ) -> tuple[Profile, Flag | None]:
     blocks = light(digest.preview, context, thinned(digest.preview, rows=False))
     rows = np.log(np.maximum(np.median(blocks, axis=1), 0.5).astype(np.float64))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from beamline.monitor.preview import edge_light, light, more_light
 from drivers.frame import Frame, FrameKind
 
@@ -40,7 +40,7 @@ class State:
     scatter: float = 0.0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: fraction of the light that is gone (negative: too much)."""
     if frame.kind is FrameKind.FLAT and context.flat is not None:
         full = float(light(context.flat, context).mean()) * more_light(context, frame.exposure)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from beamline.monitor.preview import thinned
 from drivers.frame import Frame, FrameKind
 
@@ -34,7 +34,7 @@ class State:
     flat: float | None = None
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: dark over flat where the shutter seems open, else counts of drift.
 
     The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.

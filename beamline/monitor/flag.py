@@ -1,4 +1,4 @@
-"""Flag: what a check says about a frame, and Context: what all checks may know about the scan."""
+"""Flag: what a check says about a frame, and ScanContext: what all checks may know about the scan."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Flag:
 
 
 @dataclass(frozen=True, eq=False)
-class Context:
+class ScanContext:
     """What does not depend on the frame, and the references seen so far.
 
     Attributes:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from beamline.monitor.preview import edges, thinned, transmission
 from drivers.frame import Frame, FrameKind
 
@@ -41,7 +41,7 @@ class State:
     running: int = 0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: relative change of the mean line integral. Silent where the sample is cut off by the detector's edge."""
     if frame.kind is not FrameKind.PROJECTION:
         return state, None

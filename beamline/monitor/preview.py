@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.flag import Context
+from beamline.monitor.flag import ScanContext
 
 EDGE_FRACTION = 16  # an edge strip is a sixteenth of the columns
 ENOUGH = 128  # blocks per side that tell a check what it needs; a large preview is thinned to about so many
@@ -21,18 +21,18 @@ def thinned(preview: NDArray[np.float32], rows: bool = True) -> Region:
     return slice(None, None, step_rows if rows else 1), slice(None, None, step_cols)
 
 
-def light(preview: NDArray[np.float32], context: Context, region: Region = WHOLE) -> NDArray[np.float32]:
+def light(preview: NDArray[np.float32], context: ScanContext, region: Region = WHOLE) -> NDArray[np.float32]:
     """Counts above the dark [preview row, preview col] in a region; the raw counts where no dark was seen."""
     return preview[region] if context.dark is None else preview[region] - context.dark[region]
 
 
-def more_light(context: Context, exposure: float) -> float:
+def more_light(context: ScanContext, exposure: float) -> float:
     """How many times the flats' light a frame of `exposure` s would get without a sample: flats may have their own."""
     return exposure / context.flat_exposure
 
 
 def transmission(
-    preview: NDArray[np.float32], context: Context, exposure: float, region: Region = WHOLE
+    preview: NDArray[np.float32], context: ScanContext, exposure: float, region: Region = WHOLE
 ) -> NDArray[np.float32] | None:
     """Light over the flats' light, or None before any flat. Blocks where the flat has no light are NaN."""
     if context.flat is None:
@@ -47,7 +47,7 @@ def edges(image: NDArray[np.float32]) -> tuple[float, float]:
     return float(image[:, left].mean()), float(image[:, right].mean())
 
 
-def edge_light(preview: NDArray[np.float32], context: Context) -> tuple[float, float]:
+def edge_light(preview: NDArray[np.float32], context: ScanContext) -> tuple[float, float]:
     """Mean light of the strips at the left and right edge."""
     left, right = (float(light(preview, context, (slice(None), strip)).mean()) for strip in _strips(preview.shape[1]))
     return left, right

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
 NAME = "saturation"
@@ -28,7 +28,7 @@ class State:
     hot: float = 0.0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: fraction of saturated pixels beyond those that are saturated in the darks."""
     if frame.kind is FrameKind.DARK:
         return replace(state, hot=max(state.hot, digest.saturated_fraction)), None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame
 
 NAME = "stuck"
@@ -25,7 +25,7 @@ class State:
     repeats: int = 0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: repetitions in a row. Frames of one single grey (a simulated dark without noise) say nothing."""
     if digest.checksum != state.checksum or digest.variance == 0:
         return replace(state, checksum=digest.checksum, repeats=0), None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
 NAME = "timing"
@@ -27,7 +27,7 @@ class State:
     time: float = 0.0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: Context) -> tuple[State, Flag | None]:
+def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
     """Score: triggers that have no frame, or else periods by which the frame came too late (negative: too early)."""
     if frame.kind is not FrameKind.PROJECTION or context.period is None:
         return state, None

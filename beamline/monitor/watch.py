@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.monitor import bands, beam, dark, mass, saturation, stuck, timing
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
 CHECKS: tuple[ModuleType, ...] = (beam, saturation, stuck, bands, timing, mass, dark)
@@ -22,16 +22,16 @@ ALARM_SHIFT = 16  # bit i: check i flagged the frame; bit 16 + i: and it was an 
 
 
 @dataclass(frozen=True, eq=False)
-class Watch:
+class Monitor:
     """What the monitor knows: the scan, each check's state, and how many references its means are made of."""
 
-    context: Context
+    context: ScanContext
     states: tuple[Any, ...]
     counted: int = 0
     kind: FrameKind = FrameKind.INVALID
 
 
-def start(context: Context, thresholds: Mapping[str, Mapping[str, float]] | None = None) -> Watch:
+def start(context: ScanContext, thresholds: Mapping[str, Mapping[str, float]] | None = None) -> Monitor:
     """A fresh watch. `thresholds` gives, per check, the limits that differ from its defaults.
 
     Raises:
@@ -41,10 +41,10 @@ def start(context: Context, thresholds: Mapping[str, Mapping[str, float]] | None
     for name in thresholds:
         if name not in NAMES:
             raise ConfigError(f"monitor.thresholds names a check {name!r}; legal: {', '.join(NAMES)}")
-    return Watch(context, tuple(module.State(limits=_limits(module, thresholds)) for module in CHECKS))
+    return Monitor(context, tuple(module.State(limits=_limits(module, thresholds)) for module in CHECKS))
 
 
-def watch(before: Watch, frame: Frame, digest: FrameDigest) -> tuple[Watch, tuple[Flag, ...]]:
+def watch(before: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, tuple[Flag, ...]]:
     """Look at a frame: the watch with it, and what the checks found. O(pixels of the preview)."""
     flags: list[Flag] = []
     states: list[Any] = []
@@ -75,7 +75,7 @@ def _limits(module: ModuleType, thresholds: Mapping[str, Mapping[str, float]]) -
     return module.Limits(**given)
 
 
-def _remember(before: Watch, frame: Frame, digest: FrameDigest) -> Watch:
+def _remember(before: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     """Mean previews of the latest group of darks and of flats."""
     counted = before.counted + 1 if frame.kind is before.kind else 1
     context = before.context

@@ -1,29 +1,119 @@
-"""Prepare: a configuration and connected devices become a scan that may start, or a refusal before anything moves."""
+"""Preflight: check a scan before anything moves, without devices (dry run) or with connected ones."""
 
 from __future__ import annotations
 
 import json
 import math
+import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, plan_of, resolved_yaml
+from beamline.core.errors import ConfigError
+from beamline.instrument import connect
 from beamline.instrument.connect import Bench, camera_settings
 from beamline.monitor import watch as monitor
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Context
+from beamline.monitor.flag import ScanContext
 from beamline.plan.plan import Mode, ScanPlan, Timeline
+from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import work_out
-from beamline.scan.dry_run import free_bytes, refuse_violations
 from beamline.storage.writers.nxtomo import ScanInfo
-from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
+from drivers.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class DryRun:
+    """A scan as it would be: plan, timeline, what the devices can do, and the room on the disk in bytes."""
+
+    plan: ScanPlan
+    timeline: Timeline
+    stage: StageLimits
+    camera: CameraTiming
+    free_bytes: int
+
+    def lines(self) -> list[str]:
+        """For a human; the violations come last."""
+        return describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
+
+    def data(self) -> Mapping[str, Any]:
+        """For a program: the numbers behind the lines, in s, rad, bytes and pixels."""
+        worked = self.timeline
+        views = worked.views
+        return {
+            "remarks": worked.remarks,
+            "duration": worked.duration,
+            "n_frames": worked.n_frames,
+            "total_bytes": worked.total_bytes,
+            "free_bytes": self.free_bytes,
+            "step_counts": worked.step_counts,
+            "step": worked.step,
+            "speed": views.speed,
+            "taxi": views.taxi,
+            "blur_px": worked.blur_px,
+            "skew_px": worked.skew_px,
+            "min_period": self.camera.min_period,
+            "blocks": [
+                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": b.first_row, "n": b.n} for b in worked.blocks
+            ],
+        }
+
+
+def dry_run(settings: Config) -> DryRun:
+    """Work a configuration out.
+
+    Raises:
+        ConfigError: angles, a scene, monitor thresholds or device settings that cannot be. Broken limits are no error
+            here: they are the timeline's violations.
+    """
+    plan = plan_of(settings)
+    stage, camera, to_counts = connect.describe(settings)
+    monitor.start(ScanContext(2**camera.bits - 1, math.prod(camera.shape)), settings.monitor.thresholds)
+    free = free_bytes(Path(settings.storage.folder))
+    worked = work_out(
+        plan,
+        stage,
+        to_counts,
+        camera,
+        axis_col=settings.optics.axis_col,
+        preview_bin=settings.storage.preview_bin,
+        free_bytes=free,
+    )
+    return DryRun(plan, worked, stage, camera, free)
+
+
+def refuse_violations(worked: Timeline) -> None:
+    """Raises ConfigError with every broken limit, where there is one."""
+    broken = worked.violations
+    if len(broken) == 1:
+        raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
+    if broken:
+        raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
+
+
+def free_bytes(folder: Path) -> int:
+    """Room on the disk that holds `folder`, or will hold it once it is made.
+
+    Raises:
+        ConfigError: a file stands in the way, or there is no such disk.
+    """
+    folder = folder.absolute()
+    there = next((place for place in (folder, *folder.parents) if place.exists()), None)
+    if there is None or not there.is_dir():
+        problem = "no such disk" if there is None else f"a file at {there}"
+        raise ConfigError(
+            f"runs cannot go to {folder}: there is {problem}. Choose another folder; nothing was started."
+        )
+    return shutil.disk_usage(there).free
+
+
+@dataclass(frozen=True, eq=False)
+class ReadyScan:
     """A scan that may start.
 
     Attributes:
@@ -37,11 +127,11 @@ class Prepared:
     timeline: Timeline
     settings: CameraSettings
     timing: CameraTiming
-    watch: monitor.Watch
+    watch: monitor.Monitor
     info: ScanInfo
 
 
-def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
+def preflight(config: Config, bench: Bench, runs: Path) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
@@ -73,13 +163,13 @@ def prepare(config: Config, bench: Bench, runs: Path) -> Prepared:
     digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, preview_bin)
     if bench.simulated is not None:
         bench.simulated.rehearse()
-    return Prepared(plan, timeline, settings, timing, watch, _info(config, bench, plan, timeline))
+    return ReadyScan(plan, timeline, settings, timing, watch, _info(config, bench, plan, timeline))
 
 
-def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> Context:
+def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> ScanContext:
     views = timeline.views
     starts = np.cumsum([0, *(train.n for train in views.trains)])[:-1]
-    return Context(
+    return ScanContext(
         saturation=2**timing.bits - 1,
         pixels=math.prod(timing.shape),
         period=views.period if plan.mode is Mode.FLY else None,

@@ -55,7 +55,7 @@ class Recorder:
     def __init__(
         self,
         writer: Writer,
-        watch: monitor.Watch,
+        watch: monitor.Monitor,
         timeline: Timeline,
         *,
         preview_bin: int,

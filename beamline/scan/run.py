@@ -22,7 +22,7 @@ from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction
-from beamline.scan.preflight import Prepared, prepare
+from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
@@ -111,7 +111,7 @@ def run_scan(
     runs = runs or Path(config.storage.folder)
     with ExitStack() as connected:
         bench = bench or connected.enter_context(connect(config, ask=ask, heed=lambda: _heed(stop)))
-        prepared = prepare(config, bench, runs)
+        ready = preflight(config, bench, runs)
         _heed(stop)
         folder = create_run_folder(runs, config.sample.name, SystemClock().now())
         with ExitStack() as stack:
@@ -124,7 +124,7 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], bench.clock))
-            run = _Run(config, bench, prepared, folder, stop, emit, began)
+            run = _Run(config, bench, ready, folder, stop, emit, began)
             return run.go(live, release=connected.close)
 
 
@@ -138,7 +138,7 @@ def _heed(stop: StopRequest) -> None:
 class _Run:
     config: Config
     bench: Bench
-    prepared: Prepared
+    ready: ReadyScan
     folder: Path
     stop: StopRequest
     emit: Emit
@@ -238,8 +238,8 @@ class _Run:
         storage = self.config.storage
         return NXtomoWriter(
             path,
-            self.prepared.info,
-            self.prepared.timing.shape,
+            self.ready.info,
+            self.ready.timing.shape,
             clock=self.bench.clock,
             preview_bin=storage.preview_bin,
             flush_every=storage.flush_every,
@@ -248,8 +248,8 @@ class _Run:
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         return Recorder(
             writer,
-            self.prepared.watch,
-            self.prepared.timeline,
+            self.ready.watch,
+            self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             emit=self.emit,
             stop=self.stop,
@@ -257,11 +257,9 @@ class _Run:
         )
 
     def _acquisition(self) -> Acquisition:
-        prepared, bench = self.prepared, self.bench
-        settle = prepared.plan.settle
-        return Acquisition(
-            bench.devices, prepared.timeline, prepared.settings, settle, bench.clock, self.stop, self.emit
-        )
+        ready, bench = self.ready, self.bench
+        settle = ready.plan.settle
+        return Acquisition(bench.devices, ready.timeline, ready.settings, settle, bench.clock, self.stop, self.emit)
 
     def _beam_log(self) -> BeamLog:
         chosen = self.config.devices.beam_monitor
@@ -270,7 +268,7 @@ class _Run:
         return BeamLog(self.bench.beam_monitor, chosen.period_s, self.emit)
 
     def _facts(self, path: Path) -> Mapping[str, Any]:
-        timeline = self.prepared.timeline
+        timeline = self.ready.timeline
         return {
             "folder": self.folder,
             "path": path,

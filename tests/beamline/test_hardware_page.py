@@ -14,7 +14,7 @@ from beamline.cli.main import main
 from beamline.config.devices import DcamOrca, StageOutputShutter
 from beamline.config.load import config_folder, load
 from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, ZaberStageConfig
-from beamline.scan.dry_run import dry_run
+from beamline.scan.preflight import dry_run
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 DEVICES: dict[str, tuple[type[BaseModel], ...]] = {

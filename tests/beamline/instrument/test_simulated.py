@@ -11,7 +11,7 @@ from beamline.config.models import Config
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
 from beamline.plan.timeline import block_seconds
-from beamline.scan.dry_run import dry_run
+from beamline.scan.preflight import dry_run
 from drivers.clock import SystemClock
 from drivers.protocols import TriggerSource
 from recon.base.geometry import Geometry

@@ -17,7 +17,7 @@ from beamline.core.stop import StopRequest
 from beamline.projections.prepare import prepare
 from beamline.projections.selection import Selection
 from beamline.scan import run as module
-from beamline.scan.dry_run import dry_run
+from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
 from beamline.simulate.labels import read_labels
 from beamline.storage.readers.open import open_scan

@@ -11,7 +11,7 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
 from beamline.instrument.stages import output_of
-from beamline.scan.dry_run import dry_run
+from beamline.scan.preflight import dry_run
 from drivers.errors import DeviceRefused
 from tests.beamline.ball_scan import COMMON, STAGES, small
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor import watch as scan
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Context, Flag
+from beamline.monitor.flag import Flag, ScanContext
 from drivers.frame import Frame, FrameKind
 
 ROWS, COLS = 64, 96
@@ -79,7 +79,7 @@ class Bench:
         self, frames: Iterable[Frame], period: float | None = PERIOD, **thresholds: dict[str, float]
     ) -> list[Flag]:
         """All flags of a fresh monitor that sees `frames`."""
-        state = scan.start(Context(saturation=SATURATION, pixels=ROWS * COLS, period=period), thresholds)
+        state = scan.start(ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period), thresholds)
         flags: list[Flag] = []
         for frame in frames:
             state, found = scan.watch(state, frame, digest(frame.counts, SATURATION, 4))

@@ -10,7 +10,7 @@ import pytest
 
 from beamline.monitor import dark
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
 
@@ -51,7 +51,7 @@ def small_darks(n: int, rng: np.random.Generator) -> list[Frame]:
 def flags_of(frames: list[Frame], preview_bin: int) -> list[Flag]:
     state, found = dark.State(), []
     for frame in frames:
-        state, flag = dark.check(state, frame, digest(frame.counts, 65535, preview_bin), Context(65535, 32 * 48))
+        state, flag = dark.check(state, frame, digest(frame.counts, 65535, preview_bin), ScanContext(65535, 32 * 48))
         found += [] if flag is None else [flag]
     return found
 

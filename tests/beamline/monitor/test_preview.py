@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.monitor.flag import Context
+from beamline.monitor.flag import ScanContext
 from beamline.monitor.preview import ENOUGH, edge_light, edges, light, thinned, transmission
 
 
@@ -24,7 +24,7 @@ def test_light_and_transmission(rng: np.random.Generator) -> None:
     dark, flat = rng.uniform(90, 110, (6, 32)).astype(np.float32), rng.uniform(900, 1100, (6, 32)).astype(np.float32)
     truth = rng.uniform(0.1, 1, (6, 32)).astype(np.float32)
     preview = dark + truth * (flat - dark)
-    context = Context(65535, 1000, dark=dark, flat=flat, flat_exposure=0.1)
+    context = ScanContext(65535, 1000, dark=dark, flat=flat, flat_exposure=0.1)
     found, longer = transmission(preview, context, 0.1), transmission(preview, context, 0.3)
     assert found is not None
     assert longer is not None
@@ -32,12 +32,12 @@ def test_light_and_transmission(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(longer, truth / 3, rtol=1e-4)
     assert edge_light(preview, context) == pytest.approx(edges(light(preview, context)))
     assert edges(truth) == pytest.approx((truth[:, :2].mean(), truth[:, -2:].mean()))
-    assert transmission(preview, Context(65535, 1000), 0.1) is None
+    assert transmission(preview, ScanContext(65535, 1000), 0.1) is None
 
 
 def test_a_block_without_light_in_the_flat_has_no_transmission() -> None:
     ones = np.ones((2, 2), np.float32)
-    context = Context(65535, 1000, dark=ones, flat=np.array([[1, 5], [0, 5]], np.float32), flat_exposure=0.1)
+    context = ScanContext(65535, 1000, dark=ones, flat=np.array([[1, 5], [0, 5]], np.float32), flat_exposure=0.1)
     found = transmission(3 * ones, context, 0.1)
     assert found is not None
     np.testing.assert_array_equal(found, [[np.nan, 0.5], [np.nan, 0.5]])

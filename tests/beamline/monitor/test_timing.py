@@ -9,7 +9,7 @@ import pytest
 
 from beamline.monitor import watch as scan
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 
 PERIOD = 0.1  # as the bench makes them
 
@@ -45,7 +45,7 @@ def test_the_return_between_two_passes_is_no_finding(bench: Any) -> None:
     frames = [replace(f, time=f.time + 30 * (f.trigger >= 4)) for f in bench.views(8)]
     flags = []
     for starts in (frozenset({0}), frozenset({0, 4})):
-        state, found = scan.start(Context(65535, 64 * 96, PERIOD, starts)), 0
+        state, found = scan.start(ScanContext(65535, 64 * 96, PERIOD, starts)), 0
         for frame in frames:
             state, new = scan.watch(state, frame, digest(frame.counts, 65535, 4))
             found += len(only(new))

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from beamline.core.errors import ConfigError
 from beamline.monitor import watch as scan
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Context, Flag, Level
+from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
-CONTEXT = Context(saturation=65535, pixels=100)
+CONTEXT = ScanContext(saturation=65535, pixels=100)
 
 
 def test_a_clean_scan_raises_no_flag(bench: Any) -> None:

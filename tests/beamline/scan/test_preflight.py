@@ -12,7 +12,7 @@ import pytest
 from beamline.config import load as config
 from beamline.config.models import Config
 from beamline.core.errors import ConfigError
-from beamline.scan.dry_run import dry_run, free_bytes, refuse_violations
+from beamline.scan.preflight import dry_run, free_bytes, refuse_violations
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -55,7 +55,7 @@ def test_thresholds_are_checked_before_the_scan() -> None:
 
 def test_instrument_loads_no_simulator_and_a_dry_run_no_vendor_library() -> None:
     code = (
-        "import sys; from beamline.config import load as config; from beamline.scan.dry_run import dry_run;"
+        "import sys; from beamline.config import load as config; from beamline.scan.preflight import dry_run;"
         "d = dry_run(config.load(config.config_folder() / 'instrument.yaml', (), {})); assert d.lines();"
         "bad = [m for m in sys.modules if m.startswith(('simulators', 'drivers.dcam', 'torch'))]; assert not bad, bad"
     )
