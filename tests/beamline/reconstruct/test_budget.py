@@ -99,6 +99,7 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
     assert len(warned) == 1
 
 
+@pytest.mark.slow
 def test_the_shortest_fit_is_said_to_be_late_too(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     warned: list[str] = []

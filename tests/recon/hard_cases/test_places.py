@@ -71,6 +71,7 @@ def test_far_outside_and_large_enough_to_be_seen(far: float) -> None:
     assert found.worst < gradient_bound(far, 0.3 * far), found.gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [None, EXACT], ids=["affine", "exact"])
 def test_near_the_source_of_a_cone_a_gaussian_is_large_and_right(model: RayModel | None) -> None:
     # The source is at y = -10: from a tenth of the distance on, magnified up to twenty times.

@@ -103,6 +103,7 @@ def _compile_all() -> None:
             assert len(compiled.asm["cubin"]) > 0, name
 
 
+@pytest.mark.slow
 def test_triton_is_loaded_when_asked_for_and_compiles_every_kernel_for_cuda() -> None:
     if find_spec("triton") is None:
         pytest.skip("the GPU kernels need triton (extra gpu, Linux)")
