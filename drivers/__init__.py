@@ -1,0 +1,1 @@
+"""Devices: their Protocols, and drivers for real ones."""

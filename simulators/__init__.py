@@ -1,0 +1,1 @@
+"""Simulated devices, and the physics of the frames that they deliver."""

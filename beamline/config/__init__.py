@@ -1,0 +1,1 @@
+"""Configuration: YAML, environment and overrides become one frozen model, or errors with file and line."""

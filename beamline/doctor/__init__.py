@@ -1,0 +1,1 @@
+"""Doctor: what this computer has (camera link, ports, disk, memory) against what a scan needs."""

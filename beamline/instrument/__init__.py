@@ -1,0 +1,1 @@
+"""Instrument: a configuration becomes connected devices, real or simulated."""

@@ -1,0 +1,1 @@
+"""Projections: frames of a scan become line integrals."""

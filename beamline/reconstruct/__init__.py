@@ -1,0 +1,1 @@
+"""Reconstruct: a finished or a growing scan file becomes a volume file with its report."""

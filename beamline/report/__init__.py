@@ -1,0 +1,1 @@
+"""Reports: self-contained HTML pages, pictures, and the record of a fit."""

@@ -1,0 +1,1 @@
+"""Scan: one scan from preflight to the closed file."""

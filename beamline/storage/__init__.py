@@ -1,0 +1,1 @@
+"""Storage: readers, writers and rules of scan, volume and checkpoint files."""

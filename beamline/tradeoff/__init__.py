@@ -1,0 +1,1 @@
+"""Trade-off: many reconstructions of one scan, and what quality costs in time and memory."""

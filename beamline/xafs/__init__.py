@@ -1,0 +1,1 @@
+"""X-ray absorption: edge, white line, and the energy of the highest contrast."""

@@ -1,0 +1,1 @@
+"""Beam monitors: read over a serial line or from a web page."""

@@ -1,0 +1,1 @@
+"""Hamamatsu cameras over the DCAM-API."""

@@ -1,0 +1,1 @@
+"""Rotation stages: one folder a controller."""

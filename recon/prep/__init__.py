@@ -1,0 +1,1 @@
+"""Before a reconstruction: counts to line integrals, and the rotation axis."""

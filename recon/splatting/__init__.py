@@ -1,0 +1,1 @@
+"""R²-Gaussian: a volume as a sum of Gaussians, fitted to the views."""

@@ -1,0 +1,1 @@
+"""Reconstruction on voxels: filtered back-projection and iterative methods."""

@@ -1,0 +1,1 @@
+"""Simulated devices: camera, shutter, motor, trigger line, clock."""

@@ -1,0 +1,1 @@
+"""Values of one frame: pose, detector, sensor, and the conditions it is exposed under."""

@@ -1,0 +1,1 @@
+"""Scenes: sample, light and effects together, exposed into frames."""

@@ -1,0 +1,1 @@
+"""Readers: scans of any format behind one Protocol."""

@@ -1,0 +1,1 @@
+"""Writers: scan files, reconstruction files, checkpoints."""

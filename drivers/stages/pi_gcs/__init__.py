@@ -1,0 +1,1 @@
+"""PI controllers that speak GCS 2.0 (C-863 class)."""

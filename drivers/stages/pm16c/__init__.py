@@ -1,0 +1,1 @@
+"""Tsuji PM16C-04XD pulse-motor controller."""

@@ -1,0 +1,1 @@
+"""Zaber rotary stages (ASCII protocol)."""

@@ -1,0 +1,1 @@
+"""Bodies: solids whose chords are exact."""

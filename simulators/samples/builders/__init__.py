@@ -1,0 +1,1 @@
+"""Builders: batteries, cathodes, foams and resolution patterns out of bodies."""

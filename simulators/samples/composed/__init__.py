@@ -1,0 +1,1 @@
+"""Composed samples: bodies with their materials, as a scene names them."""

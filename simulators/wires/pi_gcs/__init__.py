@@ -1,0 +1,1 @@
+"""Simulated PI controller, GCS 2.0."""

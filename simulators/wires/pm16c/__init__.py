@@ -1,0 +1,1 @@
+"""Simulated Tsuji PM16C-04XD."""
