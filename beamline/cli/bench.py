@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.told import told_as_json
+from beamline.cli.json_output import json_events
 from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
 from drivers.clock import SystemClock
@@ -38,7 +38,7 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
     Nothing is written. Run it on an idle machine; ratios within one run mean more than times.
     """
     clock = SystemClock()
-    with told_as_json(as_json) as sinks:
+    with json_events(as_json) as sinks:
 
         def tell(kind: str, data: dict[str, Any], text: str) -> None:
             for sink in sinks:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from beamline.cli.config import OVERRIDE_HELP
-from beamline.cli.told import told_as_json
+from beamline.cli.json_output import json_events
 from beamline.config.load import load
 from beamline.core.events import Event
 from beamline.scan.preflight import dry_run, refuse_violations
@@ -24,7 +24,7 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     Prints the timeline, speed, taxi, angular step in counts, motion blur and rolling-shutter skew in pixels, duration,
     bytes and free disk. Exit code 2 where the configuration is wrong or a limit is violated.
     """
-    with told_as_json(as_json) as sinks:
+    with json_events(as_json) as sinks:
         worked = dry_run(load(file, overrides))
         if not as_json:
             click.echo("\n".join(worked.lines()))

@@ -9,11 +9,11 @@ from pathlib import Path
 import click
 
 from beamline.cli.demo_run import run_demo
+from beamline.cli.json_output import json_events
 from beamline.cli.narrate import results
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan import stop_signals
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import told_as_json
 from beamline.config.load import config_folder, load
 from beamline.core.events import Event
 from beamline.core.stop import StopRequest
@@ -29,7 +29,7 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
     What runs is configs/demo.yaml; everything is kept in a folder of its own (UTC time and sample).
     """
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
-    with told_as_json(as_json) as sinks:
+    with json_events(as_json) as sinks:
         config = load(config_folder() / "demo.yaml", overrides)
         stop = StopRequest()
         last: list[Event] = []

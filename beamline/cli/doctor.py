@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from beamline.cli.config import OVERRIDE_HELP
-from beamline.cli.told import terminated_like_interrupted, told_as_json
+from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.config.load import load
 from beamline.core.events import Event
 from beamline.doctor.check import Check, Verdict
@@ -45,7 +45,7 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
     if file is None and overrides:
         raise click.UsageError("--set belongs to a CONFIG.")
     clock, checks = SystemClock(), list[Check]()
-    with terminated_like_interrupted(), told_as_json(as_json) as sinks:
+    with terminated_like_interrupted(), json_events(as_json) as sinks:
         config = None if file is None else load(file, overrides)
         if not as_json:
             click.echo("Measuring the disk takes a few seconds.", err=True)

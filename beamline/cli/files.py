@@ -10,10 +10,10 @@ from typing import Any
 
 import click
 
+from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.numbers import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing
@@ -32,7 +32,7 @@ _SAY_EVERY = 0.2  # s between words on how far an ingest is
 @click.option("--json", "as_json", is_flag=True, help="One event on stdout.")
 def info(file: Path, as_json: bool, **said: Any) -> None:
     """Say what the scan in FILE holds; nothing is guessed."""
-    with told_as_json(as_json) as sinks:
+    with json_events(as_json) as sinks:
         facts = dict(describe(file, **said))
         for sink in sinks:
             sink(Event("done", SystemClock().now(), facts))
@@ -68,7 +68,7 @@ def _text(value: Any) -> str:
 def validate(file: Path, as_json: bool, **said: Any) -> None:
     """Check the scan in FILE against the rules that readers rely on. Errors give exit code 5, warnings do not."""
     now = SystemClock().now()
-    with told_as_json(as_json) as sinks:
+    with json_events(as_json) as sinks:
         findings = findings_of(file, **said)
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for sink in sinks:
@@ -113,7 +113,7 @@ def ingest(
     """
     clock = SystemClock()
     began = clock.now()
-    with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         refuse_existing(output)
         done = ingest_scan(
             source,

@@ -9,8 +9,8 @@ from pathlib import Path
 import click
 
 from beamline.cli.config import OVERRIDE_HELP
+from beamline.cli.json_output import terminated_like_interrupted
 from beamline.cli.numbers import POSITIVE
-from beamline.cli.told import terminated_like_interrupted
 from beamline.config.load import load
 from beamline.core.errors import INTERRUPTED
 from beamline.instrument.connect import stage_alone

@@ -12,12 +12,12 @@ from typing import Any, get_args
 
 import click
 
+from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
 from beamline.cli.method_options import SETTINGS, method_options, refuse_contradictions
 from beamline.cli.narrate import results
 from beamline.cli.numbers import NOT_NEGATIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
 from beamline.core.errors import QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.reconstruct.checkpoints import Keeper
@@ -124,9 +124,9 @@ def recon(
     )
     clock = SystemClock()
     last: list[Event] = []
-    with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         sink = fan_out(last.append, *(json_sinks or [terminal]))
-        metrics = (follow_scan if follow else run)(options, sink, clock, stoppable=EndOfFit())
+        metrics = (follow_scan if follow else run)(options, sink, clock, stop_scope=StopOnSignal())
     if not as_json:
         click.echo(results(last[-1].data))
     if last[-1].data.get("ended_early"):

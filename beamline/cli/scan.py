@@ -12,8 +12,8 @@ from types import FrameType
 import click
 
 from beamline.cli.config import OVERRIDE_HELP
+from beamline.cli.json_output import json_events
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import told_as_json
 from beamline.config.load import Config, load
 from beamline.core.events import Event, Sink
 from beamline.core.stop import StopRequest
@@ -41,7 +41,7 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     Exit code: 0 done, 2 configuration or a violated limit, 3 device, 4 stopped, 5 frames missing or disk, 130
     interrupted before anything was acquired, or aborted.
     """
-    with told_as_json(as_json) as json_sinks:
+    with json_events(as_json) as json_sinks:
         config = load(file, overrides)
         if dry:
             _dry_run(config, json_sinks)

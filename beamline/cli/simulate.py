@@ -11,8 +11,8 @@ from typing import Any
 
 import click
 
+from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import EndOfFit, terminated_like_interrupted, told_as_json
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import named_on_failure, refuse_existing, whole_file
@@ -74,7 +74,7 @@ def simulate(
     Exit code: 0 done, 2 a wrong scene, 4 stopped, 5 disk, 130 interrupted.
     """
     clock = SystemClock()
-    with terminated_like_interrupted(), told_as_json(as_json) as sinks, shown(scene):
+    with terminated_like_interrupted(), json_events(as_json) as sinks, shown(scene):
         if not (explains or out or truth or picture):
             raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
         if truth_bin and not truth:
@@ -163,7 +163,7 @@ def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[s
 
 
 def _scan(scene: SceneFile, scan: Scan, out: Path, tell: _Teller, sink: Sink) -> Simulated:
-    ending = EndOfFit("Ending after this frame; once more ends at once.")
+    ending = StopOnSignal("Ending after this frame; once more ends at once.")
     with ending() as stopped, Terminal(sys.stderr) as terminal:
         written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
     tell("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")

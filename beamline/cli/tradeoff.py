@@ -9,14 +9,14 @@ from typing import Any, get_args
 
 import click
 
+from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.numbers import POSITIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import terminated_like_interrupted, told_as_json
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
 from beamline.tradeoff.report import text
-from beamline.tradeoff.run import TradeoffOptions, run
+from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from drivers.clock import SystemClock
 from recon.reconstruction import Method
 
@@ -89,8 +89,8 @@ def tradeoff(
         seed=seed,
         command=shlex.join(["beamline", *sys.argv[1:]]),
     )
-    with terminated_like_interrupted(), told_as_json(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
-        table = run(options, fan_out(*(json_sinks or [terminal])), SystemClock())
+    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        table = run_tradeoff(options, fan_out(*(json_sinks or [terminal])), SystemClock())
     if not as_json:
         click.echo(text(table))
     if table.stopped:

@@ -13,11 +13,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.cli.json_output import json_events
 from beamline.cli.numbers import POSITIVE, SEED, FiniteRange
 from beamline.cli.scan import stop_signals
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal
-from beamline.cli.told import told_as_json
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.stop import StopRequest
@@ -107,7 +107,7 @@ def xafs(
     is_scene = Path(source).suffix.lower() in _SCENES
     _refuse_foreign(click.get_current_context(), _OF_FILES if is_scene else _OF_SCENES)
     clock, stop = SystemClock(), StopRequest()
-    with told_as_json(as_json) as sinks, ExitStack() as opened:
+    with json_events(as_json) as sinks, ExitStack() as opened:
         refuse_existing_results(target)
         opened.enter_context(stop_signals(stop))
         series: Series | Curve

@@ -88,11 +88,11 @@ class Warnings:
 
     def __init__(self, sink: Sink, clock: Clock) -> None:
         self._sink, self._clock = sink, clock
-        self.said: list[str] = []
+        self.messages: list[str] = []
 
     def __call__(self, text: str) -> None:
-        if text not in self.said:
-            self.said.append(text)
+        if text not in self.messages:
+            self.messages.append(text)
             self._sink(Event("warning", self._clock.now(), {"message": text}))
 
 

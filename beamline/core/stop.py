@@ -1,4 +1,4 @@
-"""StopRequest: the operator's (or an alarm's) wish to end a scan, set from any thread or signal handler."""
+"""Requests to end work early: a scan's StopRequest, and the stop scope of a reconstruction."""
 
 from __future__ import annotations
 
@@ -7,30 +7,35 @@ from contextlib import AbstractContextManager, contextmanager
 
 from beamline.core.errors import INTERRUPTED, ScanStopped
 
-Stoppable = Callable[[], AbstractContextManager[Callable[[], bool]]]
-"""Makes the context in which work may be ended early with what it has; within it, ask whether somebody wants that."""
+StopScope = Callable[[], AbstractContextManager[Callable[[], bool]]]
+"""Opens a context for work that can end early with a partial result. The context gives a function that returns True
+once a stop was requested."""
 
 
 @contextmanager
 def never_stopped() -> Iterator[Callable[[], bool]]:
-    """For work that nobody ends early."""
+    """The stop scope of work that nothing ends early."""
     yield lambda: False
 
 
-class Heeded:
-    """Whether work shall end early, asked on its behalf; remembers that it was told so."""
+class StopLatch:
+    """Calls `stop_requested` until it returns True, and stays True from then on.
 
-    def __init__(self, stopped: Callable[[], bool]) -> None:
-        self._stopped = stopped
-        self.told = False
+    Attributes:
+        stopped: a call has returned True.
+    """
+
+    def __init__(self, stop_requested: Callable[[], bool]) -> None:
+        self._stop_requested = stop_requested
+        self.stopped = False
 
     def __call__(self) -> bool:
-        self.told = self.told or self._stopped()
-        return self.told
+        self.stopped = self.stopped or self._stop_requested()
+        return self.stopped
 
     def cut(self, done: int, planned: int) -> bool:
-        """Whether that left work undone: `planned` steps or iterations; 0 where there was another plan."""
-        return self.told and not 0 < planned <= done
+        """Whether the stop left some of the `planned` steps or iterations undone; 0 where none were planned."""
+        return self.stopped and not 0 < planned <= done
 
 
 class ScanAborted(ScanStopped):

@@ -11,7 +11,7 @@ from typing import Any
 import recon
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.stop import Heeded, Stoppable, never_stopped
+from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import keep_back, with_held_out
 from beamline.projections.prepare import Prepared, prepare
 from beamline.reconstruct.budget import within
@@ -32,10 +32,10 @@ from recon.splatting.settings import FitSettings
 from recon.warm_up import warm_up
 
 
-def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = never_stopped) -> dict[str, float]:
+def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope = never_stopped) -> dict[str, float]:
     """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
 
-    A fit that is stopped within `stoppable` delivers what it has, marked `ended_early`.
+    A fit that is stopped within `stop_scope` delivers what it has, marked `ended_early`.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -66,15 +66,15 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stoppable: Stoppable = 
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
-    with stoppable() as stopped:
-        work = _Work(options, prepared, sink, clock, Heeded(stopped), warn)
+    with stop_scope() as stopped:
+        work = _Work(options, prepared, sink, clock, StopLatch(stopped), warn)
         if options.budget is not None:
             made, prepared, factor = _spend(work, options.budget)
             selection = replace(selection, binning=selection.binning * factor)
         else:
             made = _fit(work) if options.method == "r2" else _by_voxels(work)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
-    context = Context(facts, selection, options.command, options.seed, warn.said, started)
+    context = Context(facts, selection, options.command, options.seed, warn.messages, started)
     return deliver(made, prepared, truth, options.target, context, sink, clock)
 
 
@@ -108,7 +108,7 @@ class _Work:
     prepared: Prepared
     sink: Sink
     clock: Clock
-    heeded: Heeded
+    stop_latch: StopLatch
     warn: Warnings
 
     @property
@@ -154,11 +154,11 @@ def _by_voxels(work: _Work) -> Made:
             iterations=options.iterations,
             tv_weight=options.tv_weight,
             on_progress=work.listener(),
-            should_stop=work.heeded,
+            should_stop=work.stop_latch,
             now=work.clock.now,
         )
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    return work.made(result, work.heeded.cut(reached, planned))
+    return work.made(result, work.stop_latch.cut(reached, planned))
 
 
 def _fit(work: _Work) -> Made:
@@ -197,7 +197,7 @@ def _fit(work: _Work) -> Made:
             device=options.device,
             polish=polish,
             on_progress=work.listener(options.seconds),
-            should_stop=work.heeded,
+            should_stop=work.stop_latch,
             on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, work.warn),
             now=work.clock.now,
         )
@@ -211,7 +211,7 @@ def _fit(work: _Work) -> Made:
         work.warn(f"The fit started from {begun} Gaussians, not from {options.gaussians}: there is no matter for more.")
     told = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     # Sweeps come after the last step, and end early as well.
-    early = work.heeded.told if polish else work.heeded.cut(result.history[-1].step, steps or 0)
+    early = work.stop_latch.stopped if polish else work.stop_latch.cut(result.history[-1].step, steps or 0)
     resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
     return work.made(told, early, said, **resumed)
 
@@ -222,7 +222,7 @@ def _spend(work: _Work, budget: float) -> tuple[Made, Prepared, int]:
     with work.refused():
         done = within(
             budget, work.prepared, work.options.seed, work.options.filter, work.clock.now, work.listener(budget),
-            work.heeded, work.warn,
+            work.stop_latch, work.warn,
         )  # fmt: skip
-    made = work.made(done.result, work.heeded.told, done.said(budget), **done.settings(budget))
+    made = work.made(done.result, work.stop_latch.stopped, done.said(budget), **done.settings(budget))
     return replace(made, seconds=done.seconds, method=done.choice.method), done.prepared, done.choice.binning

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.stop import Stoppable, never_stopped
+from beamline.core.stop import StopScope, never_stopped
 from beamline.projections.prepare import prepare
 from beamline.reconstruct.growing import Growing
 from beamline.reconstruct.measure import fit_truth, read_truth
@@ -42,7 +42,7 @@ def follow(
     sink: Sink,
     clock: Clock,
     rhythm: Rhythm | None = None,
-    stoppable: Stoppable = never_stopped,
+    stop_scope: StopScope = never_stopped,
 ) -> dict[str, float]:
     """Reconstruct a scan while it runs (or one that has ended). Returns the metrics; the event `done` says the rest.
 
@@ -71,14 +71,14 @@ def follow(
     with _open(options, sink, clock, rhythm) as source:
         growing = Growing(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
-        with stoppable() as stopped:
+        with stop_scope() as stopped:
             made = growing.finish(options.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
         # All flats are there now; the geometry stays the one that the volume has grown in.
         prepared = prepare(source, replace(options.selection, axis_col=growing.axis_col), warn)
         prepared = replace(prepared, axis=growing.axis)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
-    context = Context(facts, options.selection, options.command, options.seed, warn.said, started)
+    context = Context(facts, options.selection, options.command, options.seed, warn.messages, started)
     metrics = deliver(made, prepared, truth, options.target, context, sink, clock)
     growing.snapshot_path.unlink(missing_ok=True)
     return metrics

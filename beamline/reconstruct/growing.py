@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.stop import Heeded
+from beamline.core.stop import StopLatch
 from beamline.projections.correction import Corrector
 from beamline.projections.prepare import correction_blockers, locate_axis, refuse, stated_axis
 from beamline.projections.selection import check_axis, cone_of, geometry_of
@@ -191,7 +191,7 @@ class Growing:
             )
         )
 
-        last, heeded = self._clock.now(), Heeded(stopped)
+        last, stop_latch = self._clock.now(), StopLatch(stopped)
 
         def listen(progress: Progress) -> bool:
             nonlocal last
@@ -199,7 +199,7 @@ class Growing:
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return heeded()
+            return stop_latch()
 
         try:
             self._say(self._fit.finish(seconds, listen))
@@ -210,7 +210,7 @@ class Growing:
             **asdict(self._fit.settings),
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
-            **({"ended_early": True} if heeded.told else {}),
+            **({"ended_early": True} if stop_latch.stopped else {}),
         }
         return Made(volume, "r2", self._clock.now() - self._begin, self._history, settings, self._options.filter)
 

@@ -60,7 +60,9 @@ class TradeoffOptions:
     command: str = ""
 
 
-def run(options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> Table:
+def run_tradeoff(
+    options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic
+) -> Table:
     """Make all trials, and leave table, pictures and page in the folder. The event `done` says where.
 
     The table in the folder is complete after every trial, so that whatever ends this leaves what was measured. Where

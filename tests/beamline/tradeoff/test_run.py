@@ -20,7 +20,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.options import SourceOptions
 from beamline.tradeoff import run as tradeoff
 from beamline.tradeoff.report import text
-from beamline.tradeoff.run import TradeoffOptions, run
+from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from beamline.tradeoff.trials import Outcome, Trial
 from drivers.clock import SystemClock
 from recon.base.geometry import Geometry
@@ -76,7 +76,7 @@ def _rows(folder: Path) -> list[dict[str, str]]:
 
 def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) -> None:
     events: list[Event] = []
-    table = run(_options(tmp_path), events.append, SystemClock())
+    table = run_tradeoff(_options(tmp_path), events.append, SystemClock())
     assert _left(tmp_path / "out") == TABLES | FIGURES | {"curves.png"}
     record = json.loads((tmp_path / "out" / "tradeoff.json").read_text(encoding="utf-8"))
     rows = _rows(tmp_path / "out")
@@ -99,7 +99,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
 
 
 def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path: Path, made_up: object) -> None:
-    table = run(_options(tmp_path), lambda e: None, SystemClock())
+    table = run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
     said = text(table)
     best = {table.compared[i].trial.label for i in table.front("seconds")}
     marked = {line[2:].split("  ")[0] for line in said.splitlines() if line.startswith("* ")}
@@ -113,10 +113,13 @@ def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> N
     np.save(tmp_path / "truth.npy", SCAN.truth(grid))
     seen: list[Trial] = []
     made_up(lambda trial, *rest: seen.append(trial) or _made_up(trial))  # type: ignore[operator, func-returns-value]
-    table = run(_options(tmp_path, truth=str(tmp_path / "truth.npy")), lambda e: None, SystemClock())
+    table = run_tradeoff(_options(tmp_path, truth=str(tmp_path / "truth.npy")), lambda e: None, SystemClock())
     assert table.by == "psnr"
     assert max(trial.views for trial in seen) == 30
-    assert run(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock()).outcomes[0].trial.views == 27
+    assert (
+        run_tradeoff(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock()).outcomes[0].trial.views
+        == 27
+    )
 
 
 def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> None:
@@ -130,7 +133,7 @@ def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> N
 
     made_up(interrupted)
     events: list[Event] = []
-    table = run(_options(tmp_path), events.append, SystemClock())
+    table = run_tradeoff(_options(tmp_path), events.append, SystemClock())
     assert table.stopped and table.n_done == 3
     rows = _rows(tmp_path / "out")
     assert [row["status"] for row in rows] == ["done"] * 3 + ["interrupted"] + ["not run"] * (len(rows) - 4)
@@ -150,7 +153,7 @@ def test_ctrl_c_before_the_first_trial_is_done_leaves_nothing(
     monkeypatch.setattr(tradeoff, where, interrupted)
     events: list[Event] = []
     with pytest.raises(KeyboardInterrupt):
-        run(_options(tmp_path), events.append, SystemClock())
+        run_tradeoff(_options(tmp_path), events.append, SystemClock())
     assert _left(tmp_path) == {"scan.h5"}
     assert events[-1].event != "done"
 
@@ -167,9 +170,9 @@ def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
     with monkeypatch.context() as full:
         full.setattr(*where, _full)
         with pytest.raises(DataError, match=rf"{name} could not be written \(No space left on device\)"):
-            run(options, lambda e: None, SystemClock())
+            run_tradeoff(options, lambda e: None, SystemClock())
     assert _left(tmp_path) == {"scan.h5"}
-    assert run(options, lambda e: None, SystemClock()).n_done
+    assert run_tradeoff(options, lambda e: None, SystemClock()).n_done
 
 
 def test_a_disk_that_is_full_later_keeps_the_trials_written(
@@ -182,7 +185,7 @@ def test_a_disk_that_is_full_later_keeps_the_trials_written(
 
     made_up(filling)
     with pytest.raises(DataError, match=r"tradeoff\.json could not be written"):
-        run(_options(tmp_path), lambda e: None, SystemClock())
+        run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
     assert [row["status"] for row in _rows(tmp_path / "out")][:2] == ["done", "done"]
     assert _left(tmp_path / "out") == {"tradeoff.json", "tradeoff.csv"}
 
@@ -194,7 +197,7 @@ def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_
 
     made_up(short)
     events: list[Event] = []
-    table = run(_options(tmp_path), events.append, SystemClock())
+    table = run_tradeoff(_options(tmp_path), events.append, SystemClock())
     told = next(e.data for e in events if e.event == "trial")
     first = table.outcomes[0]
     assert (told["steps"], told["views"], told["loss"], told["gaussians"]) == (
@@ -220,7 +223,7 @@ def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any)
         return _made_up(trial)
 
     made_up(timed)
-    table = run(_options(tmp_path, max_seconds=60.0), lambda e: None, SystemClock(), lambda: float(next(time)))
+    table = run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, SystemClock(), lambda: float(next(time)))
     assert 0 < table.n_done < len(table.outcomes)
     assert all(0 < left <= 60 for left in limits) and limits == sorted(limits, reverse=True)
 
@@ -230,11 +233,11 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
         return Outcome(trial, "failed", message="no room") if trial.method == "fbp" else _made_up(trial)
 
     made_up(failing)
-    table = run(_options(tmp_path), lambda e: None, SystemClock())
+    table = run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
     assert "failed: no room" in text(table)
     assert "failed: no room" in (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
     made_up(lambda trial, *_: Outcome(trial, "failed", message="no room"))
-    table = run(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock())
+    table = run_tradeoff(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock())
     assert "No trial has both" in text(table)
     assert _left(tmp_path / "b") == TABLES
 
@@ -252,7 +255,7 @@ def test_what_cannot_be_done_leaves_nothing(
     tmp_path: Path, changes: dict[str, Any], error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
-        run(_options(tmp_path, **changes), lambda e: None, SystemClock())
+        run_tradeoff(_options(tmp_path, **changes), lambda e: None, SystemClock())
     assert _left(tmp_path) == {"scan.h5"}
 
 
@@ -260,4 +263,4 @@ def test_two_views_leave_none_to_judge_by(tmp_path: Path) -> None:
     few = TwoCylinders(angles=np.radians([0.0, 90.0]), shape=(4, 40))
     write_exchange(tmp_path / "scan.h5", few)
     with pytest.raises(ConfigError, match="--truth"):
-        run(_options(tmp_path), lambda e: None, SystemClock())
+        run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())

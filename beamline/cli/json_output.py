@@ -17,7 +17,7 @@ from drivers.clock import SystemClock
 
 
 @contextmanager
-def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
+def json_events(wanted: bool) -> Iterator[list[Sink]]:
     """The sinks for stdout, none where JSON is not wanted. What ends the block early becomes the event `failed`."""
     if not wanted:
         yield []
@@ -40,7 +40,7 @@ def told_as_json(wanted: bool) -> Iterator[list[Sink]]:
         raise
 
 
-class EndOfFit:
+class StopOnSignal:
     """Ctrl-C, SIGTERM or SIGHUP during the work: the first asks for what there is so far, the second for nothing.
 
     Args:
