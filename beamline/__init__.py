@@ -1,1 +1,1 @@
-"""The instrument and everything around it: configuration, scans, files, monitoring, reconstruction, reports, commands."""
+"""The instrument and what surrounds it: configuration, scans, files, monitoring, reconstruction, reports, commands."""
