@@ -52,11 +52,13 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         if event.event != "done":  # of the scan; the demonstration goes on
             outside(event)
 
-    with connect(config) as bench:
-        if bench.truth is None:
+    with connect(config) as instrument:
+        if instrument.truth is None:
             raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
-        truth = bench.truth
-        result = run_scan(config, runs, [keeper, all_but_done], stop, live=follow_command(config), bench=bench)
+        truth = instrument.truth
+        result = run_scan(
+            config, runs, [keeper, all_but_done], stop, live=follow_command(config), instrument=instrument
+        )
     folder = result.path.parent
     if result.recon is None:
         raise DataError(f"The live reconstruction made no volume; {folder / RECON_LOG} says why. The scan is unhurt.")

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Bench:
+class Instrument:
     """Connected devices and what goes with them; leaving a `with` block closes them.
 
     Attributes:
@@ -70,7 +70,7 @@ class Bench:
 
 def connect(
     config: Config, clock: Clock | None = None, ask: Ask | None = None, heed: Callable[[], None] = lambda: None
-) -> Bench:
+) -> Instrument:
     """Open every device that the configuration names. Nothing moves.
 
     Args:
@@ -93,7 +93,7 @@ def connect(
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        return Bench(devices, clock, simulated, opened.pop_all().close, monitor)
+        return Instrument(devices, clock, simulated, opened.pop_all().close, monitor)
 
 
 @contextmanager
@@ -104,8 +104,8 @@ def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[Rotation
         DeviceError: it does not answer.
     """
     if config.simulation is not None:
-        with connect(config, clock) as bench:
-            yield bench.devices.stage
+        with connect(config, clock) as instrument:
+            yield instrument.devices.stage
         return
     with closing(make_stage(config.devices.stage, config.devices.stage.port, clock or SystemClock())) as stage:
         yield stage

@@ -76,7 +76,7 @@ def simulated_devices(
             f"devices.stage.{key}: the simulated {settings.kind} controller has no such digital output; set 1 for a "
             "simulation. Nothing was started."
         ) from error
-    # A name of its own for every bench: two in one process must not share a controller.
+    # A name of its own for every connection: two in one process must not share a controller.
     stage = make_stage(settings, register(f"{settings.kind}-{uuid4().hex}", wire), clock)
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()

@@ -16,7 +16,7 @@ from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, plan_of, resolved_yaml
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect
-from beamline.instrument.connect import Bench, camera_settings
+from beamline.instrument.connect import Instrument, camera_settings
 from beamline.monitor import watch as monitor
 from beamline.monitor.digest import digest
 from beamline.monitor.flag import ScanContext
@@ -131,7 +131,7 @@ class ReadyScan:
     info: ScanInfo
 
 
-def preflight(config: Config, bench: Bench, runs: Path) -> ReadyScan:
+def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
@@ -142,7 +142,7 @@ def preflight(config: Config, bench: Bench, runs: Path) -> ReadyScan:
             be exposed with the camera's settings.
         DeviceRefused: the camera does not take its settings.
     """
-    stage, camera = bench.devices.stage, bench.devices.camera
+    stage, camera = instrument.devices.stage, instrument.devices.camera
     plan = plan_of(config)
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, free = camera.timing, free_bytes(runs)
@@ -161,9 +161,9 @@ def preflight(config: Config, bench: Bench, runs: Path) -> ReadyScan:
     watch = monitor.start(_context(plan, timeline, timing), config.monitor.thresholds)
     # The first call compiles, which must not happen while frames are coming.
     digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, preview_bin)
-    if bench.simulated is not None:
-        bench.simulated.rehearse()
-    return ReadyScan(plan, timeline, settings, timing, watch, _info(config, bench, plan, timeline))
+    if instrument.simulated is not None:
+        instrument.simulated.rehearse()
+    return ReadyScan(plan, timeline, settings, timing, watch, _info(config, instrument, plan, timeline))
 
 
 def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> ScanContext:
@@ -177,12 +177,12 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> ScanCo
     )
 
 
-def _info(config: Config, bench: Bench, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
-    optics, devices, monitor = config.optics, bench.devices, config.devices.beam_monitor
+def _info(config: Config, instrument: Instrument, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
+    optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
-    if bench.simulated is not None and bench.simulated.cone is not None:
+    if instrument.simulated is not None and instrument.simulated.cone is not None:
         # The scene's cone, in the words of NXtomo: the pixel is that on the detector.
-        source_distance, sdd = bench.simulated.cone
+        source_distance, sdd = instrument.simulated.cone
         pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     asked = {
         "scheme": plan.scheme,

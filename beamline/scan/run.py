@@ -17,7 +17,7 @@ from beamline.core.errors import DataError, ScanStopped, exit_code, in_words
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.narration import UserLog
 from beamline.core.stop import ScanAborted, StopRequest
-from beamline.instrument.connect import Bench, connect
+from beamline.instrument.connect import Instrument, connect
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
 from beamline.scan.ledger import LedgerError
@@ -87,7 +87,7 @@ def run_scan(
     stop: StopRequest | None = None,
     *,
     live: LiveCommand | None = None,
-    bench: Bench | None = None,
+    instrument: Instrument | None = None,
     ask: Ask | None = None,
 ) -> RunResult:
     """Run the scan that `config` describes.
@@ -97,7 +97,7 @@ def run_scan(
         sinks: besides events.jsonl and user.log in the run's folder.
         stop: to end it from another thread or a signal handler.
         live: makes the command line of a live reconstruction; None: none.
-        bench: connected devices, left open at the end; None: those that `config` names, opened and closed here.
+        instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
         ask: puts a request to the operator, where the shutter or the sample is moved by hand.
 
     Raises:
@@ -110,8 +110,8 @@ def run_scan(
     stop = stop or StopRequest()
     runs = runs or Path(config.storage.folder)
     with ExitStack() as connected:
-        bench = bench or connected.enter_context(connect(config, ask=ask, heed=lambda: _heed(stop)))
-        ready = preflight(config, bench, runs)
+        instrument = instrument or connected.enter_context(connect(config, ask=ask, heed=lambda: _heed(stop)))
+        ready = preflight(config, instrument, runs)
         _heed(stop)
         folder = create_run_folder(runs, config.sample.name, SystemClock().now())
         with ExitStack() as stack:
@@ -123,8 +123,8 @@ def run_scan(
                 raise DataError(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
-            emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], bench.clock))
-            run = _Run(config, bench, ready, folder, stop, emit, began)
+            emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
+            run = _Run(config, instrument, ready, folder, stop, emit, began)
             return run.go(live, release=connected.close)
 
 
@@ -137,7 +137,7 @@ def _heed(stop: StopRequest) -> None:
 @dataclass(frozen=True, eq=False)
 class _Run:
     config: Config
-    bench: Bench
+    instrument: Instrument
     ready: ReadyScan
     folder: Path
     stop: StopRequest
@@ -186,7 +186,7 @@ class _Run:
         # A write that does not return holds HDF5's lock: to close the file would be to wait for it.
         unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
         error = self._graver(error, unfinished)
-        if self.bench.simulated is not None and not recorder.hangs:
+        if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed
             error = self._graver(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
         for remark in writer.remarks:
@@ -213,8 +213,8 @@ class _Run:
         # Closing the iterator is what makes the instrument safe when the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
-                if self.bench.simulated is not None:
-                    labels.add(frame.index, self.bench.simulated.labels(frame.time))
+                if self.instrument.simulated is not None:
+                    labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
 
     def _give_up(self, unfinished: bool) -> Callable[[], bool]:
@@ -240,7 +240,7 @@ class _Run:
             path,
             self.ready.info,
             self.ready.timing.shape,
-            clock=self.bench.clock,
+            clock=self.instrument.clock,
             preview_bin=storage.preview_bin,
             flush_every=storage.flush_every,
         )
@@ -257,15 +257,17 @@ class _Run:
         )
 
     def _acquisition(self) -> Acquisition:
-        ready, bench = self.ready, self.bench
+        ready, instrument = self.ready, self.instrument
         settle = ready.plan.settle
-        return Acquisition(bench.devices, ready.timeline, ready.settings, settle, bench.clock, self.stop, self.emit)
+        return Acquisition(
+            instrument.devices, ready.timeline, ready.settings, settle, instrument.clock, self.stop, self.emit
+        )
 
     def _beam_log(self) -> BeamLog:
         chosen = self.config.devices.beam_monitor
         if isinstance(chosen, NoBeamMonitor):
             return BeamLog(None, math.inf, self.emit)
-        return BeamLog(self.bench.beam_monitor, chosen.period_s, self.emit)
+        return BeamLog(self.instrument.beam_monitor, chosen.period_s, self.emit)
 
     def _facts(self, path: Path) -> Mapping[str, Any]:
         timeline = self.ready.timeline

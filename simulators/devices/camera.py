@@ -18,8 +18,8 @@ from drivers import orca_quest
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
+from simulators.devices.camera_view import CameraView, Exposed
 from simulators.devices.shutter import BeamGate, SimulatedSampleMover
-from simulators.devices.sight import Exposed, Sight
 from simulators.devices.trigger_line import TriggerLine
 from simulators.effects.chain import Label
 from simulators.frame.detector import Detector
@@ -91,7 +91,7 @@ class SimulatedOrcaQuest:
     @property
     def detector(self) -> Detector:
         """Where the pixels of the present frames are, in mm from the rotation axis: the truth that alignment seeks."""
-        return self._sight().detector
+        return self._camera_view().detector
 
     def labels_at(self, time: float) -> tuple[Label, ...]:
         """The anomalies in the frame, taken already, that was exposed at `time` (s since the Unix epoch)."""
@@ -104,7 +104,7 @@ class SimulatedOrcaQuest:
             CannotExposeError: the scene cannot be exposed so; the message says what would help.
         """
         now = self._clock.now()
-        expose(self._scene, self._sight().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
+        expose(self._scene, self._camera_view().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Apply and read back; the exposure is rounded to 10 ns. Raises DeviceRefused: nothing has changed."""
@@ -183,7 +183,7 @@ class SimulatedOrcaQuest:
             self._ring.clear()
 
     def describe(self) -> dict[str, str | int | float]:
-        row0, col0, rows, cols = self._sight().roi
+        row0, col0, rows, cols = self._camera_view().roi
         return {
             "model": "C15550-20UP (simulated)",
             "exposure": self._settings.exposure,
@@ -206,8 +206,8 @@ class SimulatedOrcaQuest:
         self.disarm()
         self._gone = self._gone or "was closed"
 
-    def _sight(self) -> Sight:
-        return Sight(self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected)
+    def _camera_view(self) -> CameraView:
+        return CameraView(self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected)
 
     def _answer(self, armed: bool = False) -> None:
         """Raises DeviceError where the camera is gone (once its last frame is taken) or not armed though it must be."""
@@ -270,7 +270,7 @@ class SimulatedOrcaQuest:
             )
 
     def _render(self, frame: Exposed) -> CameraFrame:
-        shot = self._sight().shot(frame)
+        shot = self._camera_view().shot(frame)
         try:
             counts = expose(self._scene, shot)
         except CannotExposeError as error:

@@ -12,7 +12,7 @@ from beamline.plan.plan import Timeline
 from beamline.scan.acquisition import Acquisition
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, TriggerSource
-from tests.beamline.fakes import COUNT, HOME, Instrument, seen
+from tests.beamline.fakes import COUNT, HOME, FakeInstrument, seen
 
 SETTLE = 0.05
 
@@ -20,16 +20,16 @@ SETTLE = 0.05
 class Run:
     """A scan run to its end, whatever that is."""
 
-    def __init__(self, bench: Instrument, timeline: Timeline, stop: StopRequest | None = None) -> None:
+    def __init__(self, instrument: FakeInstrument, timeline: Timeline, stop: StopRequest | None = None) -> None:
         self.events: list[tuple[str, Mapping[str, Any]]] = []
         self.frames: list[Frame] = []
         self.error: BaseException | None = None
         self.scan = Acquisition(
-            bench.devices,
+            instrument.devices,
             timeline,
             CameraSettings(1.0, TriggerSource.INTERNAL),
             SETTLE,
-            bench.clock,
+            instrument.clock,
             stop or StopRequest(),
             lambda event, data: self.events.append((event, data)),
         )
@@ -56,11 +56,11 @@ def assert_true_angles(run: Run) -> None:
             assert frame.angle == pytest.approx(count * COUNT, abs=COUNT / 2)
 
 
-def assert_safe(bench: Instrument, home: bool = True) -> None:
-    assert not bench.is_open
-    assert not bench.camera.armed
-    assert not bench.stage.moving()
-    assert (bench.stage.train, bench.stage.pulses) == (None, [])  # disarmed
+def assert_safe(instrument: FakeInstrument, home: bool = True) -> None:
+    assert not instrument.is_open
+    assert not instrument.camera.armed
+    assert not instrument.stage.moving()
+    assert (instrument.stage.train, instrument.stage.pulses) == (None, [])  # disarmed
     if home:
-        assert bench.stage.position() == pytest.approx(HOME * COUNT)
-        assert bench.is_in
+        assert instrument.stage.position() == pytest.approx(HOME * COUNT)
+        assert instrument.is_in

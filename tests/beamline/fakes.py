@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.instrument.connect import Bench
+from beamline.instrument.connect import Instrument
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.timeline import work_out
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
@@ -55,7 +55,7 @@ class Faults:
     stall_at: int | None = None  # count
 
 
-class Instrument:
+class FakeInstrument:
     """Stage, camera, shutter and sample mover in one; `devices` is how acquisition sees it.
 
     Pixels hold the level of light and noise; in row 0, on top of the level, digits of the stage's count at the
@@ -72,8 +72,8 @@ class Instrument:
         self.stage, self.camera = Stage(self), Camera(self)
         self.devices = Devices(self.stage, self.camera, Shutter(self), Sample(self))
 
-    def bench(self) -> Bench:
-        return Bench(self.devices, self.clock, None, lambda: self.log.append("close"))
+    def connected(self) -> Instrument:
+        return Instrument(self.devices, self.clock, None, lambda: self.log.append("close"))
 
     def timeline(
         self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
@@ -94,9 +94,9 @@ class Stage:
         COUNTS_PER_TURN, math.radians(60), math.radians(200), math.radians(-90), math.radians(270), True
     )
 
-    def __init__(self, bench: Instrument) -> None:
-        self.bench = bench
-        self.move = TrapezoidMove(bench.clock.now(), HOME, HOME, ())
+    def __init__(self, instrument: FakeInstrument) -> None:
+        self.instrument = instrument
+        self.move = TrapezoidMove(instrument.clock.now(), HOME, HOME, ())
         self.target = HOME
         self.train: TriggerTrain | None = None
         self.pulses: list[tuple[float, int]] = []
@@ -111,17 +111,17 @@ class Stage:
         return self.move.position(time)
 
     def position(self) -> float:
-        return self.count(self.bench.clock.now()) * COUNT
+        return self.count(self.instrument.clock.now()) * COUNT
 
     def start_move(self, angle: float, speed: float) -> None:
         assert not self.moving()
-        now = self.bench.clock.now()
-        self.bench.log.append(f"move {self.to_counts(angle)}")
+        now = self.instrument.clock.now()
+        self.instrument.log.append(f"move {self.to_counts(angle)}")
         self.target = self.to_counts(angle)
         move = TrapezoidMove.between(
             self.count(now), self.target, speed / COUNT, self.limits.acceleration / COUNT, begin=now
         )
-        stall = self.bench.faults.stall_at
+        stall = self.instrument.faults.stall_at
         if stall is not None and min(move.start, move.target) < stall < max(move.start, move.target):
             move = move.halted(stall)
         self.move = move
@@ -132,27 +132,27 @@ class Stage:
             self.train = None
 
     def moving(self) -> bool:
-        return self.bench.clock.now() < self.move.end
+        return self.instrument.clock.now() < self.move.end
 
     def status(self) -> StageStatus:
-        return StageStatus(round(self.count(self.bench.clock.now())), self.moving(), None, "")
+        return StageStatus(round(self.count(self.instrument.clock.now())), self.moving(), None, "")
 
     def start_home(self) -> None:
         raise DeviceRefused(self.name, "it has no reference")
 
     def wait(self, timeout: float) -> float:
-        now = self.bench.clock.now()
-        self.bench.clock.sleep(min(timeout, self.move.end - now))
+        now = self.instrument.clock.now()
+        self.instrument.clock.sleep(min(timeout, self.move.end - now))
         if self.moving():
             raise DeviceTimeout(self.name, "still moving")
-        if self.count(self.bench.clock.now()) != self.target:
+        if self.count(self.instrument.clock.now()) != self.target:
             raise DeviceError(self.name, "stopped short")
         return self.position()
 
     def arm(self, train: TriggerTrain) -> None:
         assert not self.moving()
-        assert (train.start - self.count(self.bench.clock.now())) * train.interval > 0
-        self.bench.log.append("arm stage")
+        assert (train.start - self.count(self.instrument.clock.now())) * train.interval > 0
+        self.instrument.log.append("arm stage")
         self.train = train
 
     def disarm(self) -> None:
@@ -161,16 +161,16 @@ class Stage:
         self.pulses = []
 
     def remaining_pulses(self) -> int | None:
-        now = self.bench.clock.now()
+        now = self.instrument.clock.now()
         return sum(time > now for time, _ in self.pulses) if self.train is None else self.train.n
 
     def stop(self) -> None:
-        self.bench.log.append("stop stage")
-        self._cut(self.move.braked(self.bench.clock.now(), self.limits.acceleration / COUNT))
+        self.instrument.log.append("stop stage")
+        self._cut(self.move.braked(self.instrument.clock.now(), self.limits.acceleration / COUNT))
 
     def abort(self) -> None:
-        self.bench.log.append("abort stage")
-        self._cut(self.move.halted(self.count(self.bench.clock.now())))
+        self.instrument.log.append("abort stage")
+        self._cut(self.move.halted(self.count(self.instrument.clock.now())))
 
     def _cut(self, move: TrapezoidMove) -> None:
         if self.moving():
@@ -182,14 +182,14 @@ class Stage:
         return {"model": "fake stage"}
 
     def close(self) -> None:
-        self.bench.log.append("close stage")
+        self.instrument.log.append("close stage")
 
 
 class Camera:
     name = "camera"
 
-    def __init__(self, bench: Instrument) -> None:
-        self.bench = bench
+    def __init__(self, instrument: FakeInstrument) -> None:
+        self.instrument = instrument
         self.rng = np.random.default_rng(1)
         self.last = np.zeros(SHAPE, np.uint16)
         self.settings = CameraSettings(0.02, TriggerSource.INTERNAL)
@@ -210,24 +210,24 @@ class Camera:
     def arm(self, n_frames: int) -> None:
         assert not self.armed
         assert n_frames >= 1
-        self.bench.log.append(f"arm camera {n_frames}")
-        self.armed, self.framestamp, self.ring, self.seen = True, 0, [], self.bench.clock.now()
+        self.instrument.log.append(f"arm camera {n_frames}")
+        self.armed, self.framestamp, self.ring, self.seen = True, 0, [], self.instrument.clock.now()
 
     def software_trigger(self) -> None:
         assert self.armed
         assert self.settings.trigger is TriggerSource.SOFTWARE
-        now = self.bench.clock.now()
-        self._trigger(now, round(self.bench.stage.count(now)))
+        now = self.instrument.clock.now()
+        self._trigger(now, round(self.instrument.stage.count(now)))
 
     def _trigger(self, time: float, count: int) -> None:
         number, self.number = self.number, self.number + 1
-        if number in self.bench.faults.ignored:
+        if number in self.instrument.faults.ignored:
             return
         self._expose(time, number, count)
 
     def _expose(self, time: float, number: int, count: int) -> None:
-        if number not in self.bench.faults.lost:
-            state = (count + 32768, self.bench.is_open, self.bench.is_in, max(number, 0))
+        if number not in self.instrument.faults.lost:
+            state = (count + 32768, self.instrument.is_open, self.instrument.is_in, max(number, 0))
             self.ring.append(Exposed(time, self.framestamp, number, state))
         self.framestamp += 1
 
@@ -235,17 +235,17 @@ class Camera:
         assert self.settings.trigger in (TriggerSource.SOFTWARE, TriggerSource.EXTERNAL)
         if self.settings.trigger is not TriggerSource.EXTERNAL:
             return
-        for time, count in self.bench.stage.pulses:
+        for time, count in self.instrument.stage.pulses:
             if self.seen < time <= now:
                 number = self.number
                 self.seen = time
                 self._trigger(time, count)
-                if number in self.bench.faults.extra_after:
-                    self._expose(time + self.bench.period / 2, -1, count)
+                if number in self.instrument.faults.extra_after:
+                    self._expose(time + self.instrument.period / 2, -1, count)
 
     def next_frame(self, timeout: float) -> CameraFrame:
         assert self.armed
-        clock = self.bench.clock
+        clock = self.instrument.clock
         deadline = clock.now() + timeout
         delay = self.settings.exposure + 0.001
         while True:
@@ -258,18 +258,18 @@ class Camera:
             clock.sleep(min(deadline - now, 0.01))
 
     def _take(self, frame: Exposed) -> CameraFrame:
-        if self.bench.faults.errors.get(frame.number, 0) > 0:
-            self.bench.faults.errors[frame.number] -= 1
+        if self.instrument.faults.errors.get(frame.number, 0) > 0:
+            self.instrument.faults.errors[frame.number] -= 1
             raise DeviceError(self.name, "ring overrun")
         self.ring.pop(0)
         count, is_open, is_in, number = frame.state
         counts = (LEVEL[bool(is_open)] + self.rng.integers(0, 20, SHAPE)).astype(np.uint16)
         row = [*digits(count), is_open, is_in, *digits(number)]
         counts[0, : len(row)] = LEVEL[bool(is_open)] + np.array(row)
-        if frame.number in self.bench.faults.repeats:
+        if frame.number in self.instrument.faults.repeats:
             counts = self.last.copy()
         self.last = counts
-        self.bench.on_frame(frame.number)
+        self.instrument.on_frame(frame.number)
         return CameraFrame(counts, frame.framestamp, frame.time)
 
     def disarm(self) -> None:
@@ -280,37 +280,37 @@ class Camera:
         return {"model": "fake camera"}
 
     def close(self) -> None:
-        self.bench.log.append("close camera")
+        self.instrument.log.append("close camera")
 
 
 class Shutter:
     name = "shutter"
 
-    def __init__(self, bench: Instrument) -> None:
-        self.bench = bench
+    def __init__(self, instrument: FakeInstrument) -> None:
+        self.instrument = instrument
 
     def open(self) -> None:
-        self.bench.is_open = not self.bench.faults.stuck_shutter
+        self.instrument.is_open = not self.instrument.faults.stuck_shutter
 
     def close(self) -> None:
-        self.bench.log.append("close shutter")
-        self.bench.is_open = False
+        self.instrument.log.append("close shutter")
+        self.instrument.is_open = False
 
     def is_open(self) -> bool:
-        return self.bench.is_open
+        return self.instrument.is_open
 
 
 class Sample:
     name = "sample"
 
-    def __init__(self, bench: Instrument) -> None:
-        self.bench = bench
+    def __init__(self, instrument: FakeInstrument) -> None:
+        self.instrument = instrument
 
     def out(self) -> None:
-        self.bench.is_in = False
+        self.instrument.is_in = False
 
     def back(self) -> None:
-        self.bench.is_in = True
+        self.instrument.is_in = True
 
 
 def digits(value: int) -> list[int]:

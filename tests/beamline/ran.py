@@ -14,7 +14,7 @@ from beamline.core.stop import StopRequest
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
-from tests.beamline.fakes import COUNT, Instrument, decode
+from tests.beamline.fakes import COUNT, FakeInstrument, decode
 
 SMALL = (
     "scan.angles.views=12",
@@ -37,7 +37,7 @@ class Ran:
     def __init__(
         self,
         runs: Path,
-        instrument: Instrument,
+        instrument: FakeInstrument,
         *overrides: str,
         stop: StopRequest | None = None,
         live: Callable[[Path, Path], Sequence[str]] | None = None,
@@ -48,7 +48,7 @@ class Ran:
         self.instrument = instrument
         try:
             self.result = run_scan(
-                small(*overrides), runs, [self.events.append], stop, live=live, bench=instrument.bench()
+                small(*overrides), runs, [self.events.append], stop, live=live, instrument=instrument.connected()
             )
         except BaseException as error:
             self.error = error

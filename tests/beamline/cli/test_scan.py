@@ -19,7 +19,7 @@ from beamline.scan import run as run_module
 from beamline.storage.readers.open import open_scan
 from drivers.errors import DeviceError
 from drivers.manual import Ask, ManualShutter
-from tests.beamline.fakes import Faults, Instrument
+from tests.beamline.fakes import FakeInstrument, Faults
 
 SIMULATED = str(config_folder() / "simulated.yaml")
 SMALL = {
@@ -37,9 +37,9 @@ def scan(*arguments: str, **overrides: Any) -> Result:
     return CliRunner().invoke(main, ["scan", SIMULATED, "--no-live", *settings, *arguments])
 
 
-def on(monkeypatch: pytest.MonkeyPatch, instrument: Instrument) -> None:
+def on(monkeypatch: pytest.MonkeyPatch, instrument: FakeInstrument) -> None:
     """Let the command find `instrument` where the configured devices would be."""
-    monkeypatch.setattr(run_module, "connect", lambda config, ask, heed: instrument.bench())
+    monkeypatch.setattr(run_module, "connect", lambda config, ask, heed: instrument.connected())
 
 
 def press(number: int, *at: int) -> Any:
@@ -57,7 +57,7 @@ def rows(runs: Path) -> int:
 def test_0_a_scan_prints_its_file_on_stdout_and_its_story_on_stderr(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    instrument = Instrument()
+    instrument = FakeInstrument()
     on(monkeypatch, instrument)
     result = scan("-o", str(tmp_path))
     assert result.exit_code == 0, result.output
@@ -70,7 +70,7 @@ def test_0_a_scan_prints_its_file_on_stdout_and_its_story_on_stderr(
 
 
 def test_0_with_json_stdout_is_the_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    on(monkeypatch, Instrument())
+    on(monkeypatch, FakeInstrument())
     result = scan("-o", str(tmp_path), "--json")
     assert result.exit_code == 0
     events = [json.loads(line) for line in result.stdout.splitlines()]
@@ -118,14 +118,14 @@ def test_2_no_such_file() -> None:
 
 
 def test_2_an_unknown_monitor_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    on(monkeypatch, Instrument())
+    on(monkeypatch, FakeInstrument())
     result = scan(**{"monitor.thresholds": "{bean: {warn: 0.1}}"})
     assert result.exit_code == 2
     assert "legal: beam" in result.stderr
 
 
 def test_3_a_device_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    on(monkeypatch, Instrument(Faults(errors={10: 99})))
+    on(monkeypatch, FakeInstrument(Faults(errors={10: 99})))
     result = scan("-o", str(tmp_path))
     assert result.exit_code == 3
     assert "ring overrun" in result.stderr
@@ -146,7 +146,7 @@ def test_3_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_4_the_first_signal_stops_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     before = signal.getsignal(number)
-    instrument = Instrument(on_frame=press(number, 8))
+    instrument = FakeInstrument(on_frame=press(number, 8))
     on(monkeypatch, instrument)
     result = scan("-o", str(tmp_path), "--json")
     assert result.exit_code == 4
@@ -159,7 +159,7 @@ def test_4_the_first_signal_stops_cleanly(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_5_missing_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    on(monkeypatch, Instrument(Faults(lost={9})))
+    on(monkeypatch, FakeInstrument(Faults(lost={9})))
     result = scan("-o", str(tmp_path))
     assert result.exit_code == 5
     assert "1 of 12 projections are missing: 4 (from 60° to 60°)" in result.stderr
@@ -169,7 +169,7 @@ def test_5_missing_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_130_a_second_ctrl_c_cuts_the_references_that_a_stop_still_takes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    instrument = Instrument(on_frame=press(signal.SIGINT, 5, 6))
+    instrument = FakeInstrument(on_frame=press(signal.SIGINT, 5, 6))
     on(monkeypatch, instrument)
     at_the_end = {"scan.mode": "step", "scan.flats.at": "end", "scan.darks.at": "end"}
     result = scan("-o", str(tmp_path), **at_the_end)
@@ -184,7 +184,7 @@ def test_130_an_abort(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
 
-    instrument = Instrument(on_frame=twice)
+    instrument = FakeInstrument(on_frame=twice)
     on(monkeypatch, instrument)
     result = scan("-o", str(tmp_path))
     assert result.exit_code == 130
@@ -195,11 +195,11 @@ def test_130_an_abort(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    instrument = Instrument()
+    instrument = FakeInstrument()
 
     def connect(config: object, ask: object, heed: object) -> Any:
         signal.raise_signal(signal.SIGINT)
-        return instrument.bench()
+        return instrument.connected()
 
     monkeypatch.setattr(run_module, "connect", connect)
     result = scan("-o", str(tmp_path / "runs"))
@@ -210,12 +210,12 @@ def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypat
 
 
 def test_a_shutter_moved_by_hand_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    instrument, asked = Instrument(), []
+    instrument, asked = FakeInstrument(), []
     monkeypatch.setattr(scan_module, "ask_operator", asked.append)
 
     def connect(config: object, ask: Any, heed: object) -> Any:
-        bench = instrument.bench()
-        return replace(bench, devices=replace(bench.devices, shutter=ByHand(instrument, ask)))
+        connected = instrument.connected()
+        return replace(connected, devices=replace(connected.devices, shutter=ByHand(instrument, ask)))
 
     monkeypatch.setattr(run_module, "connect", connect)
     assert scan("-o", str(tmp_path)).exit_code == 0
@@ -225,7 +225,7 @@ def test_a_shutter_moved_by_hand_is_asked_for(tmp_path: Path, monkeypatch: pytes
 class ByHand(ManualShutter):
     """A shutter that the operator moves when asked, and the fake instrument with it."""
 
-    def __init__(self, instrument: Instrument, ask: Ask) -> None:
+    def __init__(self, instrument: FakeInstrument, ask: Ask) -> None:
         def put(request: str) -> None:
             ask(request)
             instrument.is_open = request.startswith("Open")

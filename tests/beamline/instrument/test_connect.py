@@ -31,8 +31,8 @@ def test_dry_run_figures_are_what_the_devices_say(name: str, stage: str) -> None
         "devices.stage.acceleration_deg_s2=55",
     )
     limits, timing, to_counts = devices.describe(settings)
-    with devices.connect(settings) as bench:
-        stage, camera = bench.devices.stage, bench.devices.camera
+    with devices.connect(settings) as instrument:
+        stage, camera = instrument.devices.stage, instrument.devices.camera
         camera.configure(devices.camera_settings(settings, settings.scan.exposure_s, TriggerSource.EXTERNAL))
         assert stage.limits == limits
         assert camera.timing == timing
@@ -41,13 +41,13 @@ def test_dry_run_figures_are_what_the_devices_say(name: str, stage: str) -> None
 
 
 def test_close_frees_everything_twice() -> None:
-    bench = devices.connect(small())
-    bench.close()
-    bench.close()
+    instrument = devices.connect(small())
+    instrument.close()
+    instrument.close()
     with pytest.raises(DeviceError):
-        bench.devices.stage.position()
+        instrument.devices.stage.position()
     with pytest.raises(DeviceError):
-        bench.devices.camera.arm(1)
+        instrument.devices.camera.arm(1)
 
 
 def test_settings_that_a_device_would_refuse() -> None:
@@ -90,37 +90,37 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("drivers.dcam.camera.DcamCamera", Camera)
     asked: list[str] = []
-    bench = devices.connect(shipped("instrument", "devices.camera.index=1"), ask=asked.append)
+    instrument = devices.connect(shipped("instrument", "devices.camera.index=1"), ask=asked.append)
     assert made[0][0] == (None, 1)
     assert made[0][1]["options"] == DcamOptions(ring_bytes=1_000_000_000)
-    assert isinstance(bench.devices.shutter, ManualShutter)
-    assert isinstance(bench.devices.sample, ManualSampleMover)
-    assert bench.truth is None
-    bench.devices.shutter.open()
+    assert isinstance(instrument.devices.shutter, ManualShutter)
+    assert isinstance(instrument.devices.sample, ManualSampleMover)
+    assert instrument.truth is None
+    instrument.devices.shutter.open()
     assert asked == ["Open the beam shutter."]
-    bench.close()
+    instrument.close()
     assert stage.closed == 2
 
 
 def test_a_beam_monitor_is_part_of_the_bench(tmp_path: Path) -> None:
-    with devices.connect(small()) as bench:
-        assert bench.beam_monitor is None
+    with devices.connect(small()) as instrument:
+        assert instrument.beam_monitor is None
     transcript = tmp_path / "electrometer.txt"
     chosen = f"{{kind: electrometer, port: 'sim://electrometer', scale: 1e9, unit: nA, transcript: '{transcript}'}}"
-    with devices.connect(small(f"devices.beam_monitor={chosen}")) as bench:
-        assert bench.beam_monitor is not None
-        reading = bench.beam_monitor.reading()
+    with devices.connect(small(f"devices.beam_monitor={chosen}")) as instrument:
+        assert instrument.beam_monitor is not None
+        reading = instrument.beam_monitor.reading()
         assert (reading.value, reading.unit) == (pytest.approx(1.0), "nA")
-        assert abs(reading.time - bench.clock.now()) < 1
+        assert abs(reading.time - instrument.clock.now()) < 1
     with pytest.raises(DeviceError):
-        bench.beam_monitor.reading()
+        instrument.beam_monitor.reading()
     assert b"READ?" in transcript.read_bytes()
     page = tmp_path / "ring.txt"
     page.write_text("I = 99.5 mA", encoding="utf-8")
     chosen = f"{{kind: ring_current, url: '{page.as_uri()}', pattern: 'I = ([0-9.]+) mA'}}"
-    with devices.connect(small(f"devices.beam_monitor={chosen}")) as bench:
-        assert bench.beam_monitor is not None
-        assert bench.beam_monitor.reading().value == 99.5
+    with devices.connect(small(f"devices.beam_monitor={chosen}")) as instrument:
+        assert instrument.beam_monitor is not None
+        assert instrument.beam_monitor.reading().value == 99.5
 
 
 def test_a_port_that_is_not_there() -> None:

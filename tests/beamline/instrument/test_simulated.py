@@ -34,11 +34,11 @@ def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
     worked = dry_run(settings)
     assert worked.timeline.violations == ()
     block = worked.timeline.views
-    with devices.connect(settings) as bench:
-        assert bench.devices.stage.limits == worked.stage
-        bench.devices.shutter.open()
-        stamps, images = fly(bench, block, settings)
-        assert bench.devices.stage.remaining_pulses() in (0, None)
+    with devices.connect(settings) as instrument:
+        assert instrument.devices.stage.limits == worked.stage
+        instrument.devices.shutter.open()
+        stamps, images = fly(instrument, block, settings)
+        assert instrument.devices.stage.remaining_pulses() in (0, None)
     assert stamps == list(range(block.n))
     scene, detector = load_scene(BALL), Detector((32, 40), 4.6e-3, 19.5, 15.5)
     exact = np.array([1e5 * 0.05 / 0.107 * np.exp(-scene.sample.line_integrals(a, detector)) for a in block.angles])
@@ -72,21 +72,21 @@ def test_a_shutter_on_the_stage_s_output_lets_the_beam_through(kind: str, open_h
         f"devices.stage={STAGES[kind]}",
         f"devices.shutter={{kind: stage_output, output: 4, open_high: {str(open_high).lower()}, settle_s: 0.25}}",
     )
-    with devices.connect(settings) as bench:
-        camera, shutter = bench.devices.camera, bench.devices.shutter
+    with devices.connect(settings) as instrument:
+        camera, shutter = instrument.devices.camera, instrument.devices.shutter
         camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
         camera.arm(4)
 
         def brightest() -> int:
-            bench.clock.sleep(camera.timing.min_period)
+            instrument.clock.sleep(camera.timing.min_period)
             camera.software_trigger()
             return int(camera.next_frame(1.0).counts.max())
 
         shutter.close()
         assert (shutter.is_open(), brightest()) == (False, 0)
-        before = bench.clock.now()
+        before = instrument.clock.now()
         shutter.open()
-        assert bench.clock.now() - before == pytest.approx(0.25, abs=0.05)
+        assert instrument.clock.now() - before == pytest.approx(0.25, abs=0.05)
         assert (shutter.is_open(), brightest()) == (True, round(1e5 * 0.05 / 0.107))
         shutter.close()
         assert (shutter.is_open(), brightest()) == (False, 0)
@@ -106,12 +106,12 @@ def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
     worked = dry_run(settings)
     assert worked.timeline.violations == ()
     block = worked.timeline.views
-    with devices.connect(settings) as bench:
-        assert isinstance(bench.clock, VirtualClock)
-        bench.devices.shutter.open()
-        began = bench.clock.now()
-        stamps, images = fly(bench, block, settings)
-        seconds = bench.clock.now() - began
+    with devices.connect(settings) as instrument:
+        assert isinstance(instrument.clock, VirtualClock)
+        instrument.devices.shutter.open()
+        began = instrument.clock.now()
+        stamps, images = fly(instrument, block, settings)
+        seconds = instrument.clock.now() - began
     # Nothing but the polls of a standing stage separates the plan from the clock.
     assert seconds == pytest.approx(
         block_seconds(block, worked.stage, worked.camera, settle=0), abs=0.05 * len(block.trains)
@@ -130,15 +130,15 @@ def test_a_fly_scan_sees_the_sample_at_the_planned_angles(angles: str) -> None:
 
 def test_step_darks_and_flats() -> None:
     settings = small()
-    with devices.connect(settings) as bench:
+    with devices.connect(settings) as instrument:
         stage, camera, shutter, sample = (
-            getattr(bench.devices, name) for name in ("stage", "camera", "shutter", "sample")
+            getattr(instrument.devices, name) for name in ("stage", "camera", "shutter", "sample")
         )
         camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
         camera.arm(3)
 
         def shot() -> np.ndarray:
-            bench.clock.sleep(camera.timing.min_period)
+            instrument.clock.sleep(camera.timing.min_period)
             camera.software_trigger()
             return camera.next_frame(1.0).counts
 
@@ -155,8 +155,8 @@ def test_step_darks_and_flats() -> None:
 
 
 def settings_clock(settings: Config) -> type:
-    with devices.connect(settings) as bench:
-        return type(bench.clock)
+    with devices.connect(settings) as instrument:
+        return type(instrument.clock)
 
 
 def test_clocks() -> None:
@@ -164,8 +164,8 @@ def test_clocks() -> None:
     assert settings_clock(shipped("demo", "simulation.clock=virtual")) is VirtualClock
     assert settings_clock(shipped("demo", "simulation.clock={speed: 4}")) is ScaledClock
     given = VirtualClock(5.0)
-    with devices.connect(shipped("demo"), given) as bench:
-        assert bench.clock is given
+    with devices.connect(shipped("demo"), given) as instrument:
+        assert instrument.clock is given
 
 
 def test_benches_do_not_share_a_controller() -> None:
@@ -180,10 +180,10 @@ def test_benches_do_not_share_a_controller() -> None:
 def test_truth_lies_where_a_reconstruction_puts_it() -> None:
     """A region off the sensor's middle: z counts from the middle of the rows that were read."""
     settings = small("devices.camera.roi=[1136, 2020, 40, 56]")  # its rows' middle is 4 rows above the sensor's
-    with devices.connect(settings) as bench:
-        bench.devices.camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
-        assert bench.truth is not None
-        volume = bench.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), 4.6e-3)))
+    with devices.connect(settings) as instrument:
+        instrument.devices.camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
+        assert instrument.truth is not None
+        volume = instrument.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), 4.6e-3)))
     z, y, x = (
         float((volume.data.sum(axis=axes) * at).sum() / volume.data.sum())
         for axes, at in zip(((1, 2), (0, 2), (0, 1)), volume.grid.coordinates(), strict=True)

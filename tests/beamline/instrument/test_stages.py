@@ -20,17 +20,20 @@ from tests.beamline.ball_scan import COMMON, STAGES, small
 def test_a_shutter_never_sits_on_the_trigger_output(kind: str) -> None:
     settings = small(f"devices.stage={STAGES[kind]}")
     taken = {"pi_gcs": 2, "zaber": 3}[kind]
-    with devices.connect(settings) as bench, pytest.raises(DeviceRefused, match=f"output {taken} gives the trigger"):
-        output_of(settings.devices.stage, bench.devices.stage, taken)
+    with (
+        devices.connect(settings) as instrument,
+        pytest.raises(DeviceRefused, match=f"output {taken} gives the trigger"),
+    ):
+        output_of(settings.devices.stage, instrument.devices.stage, taken)
     pm16c = small()
-    with devices.connect(pm16c) as bench, pytest.raises(ConfigError, match="has no digital output"):
-        output_of(pm16c.devices.stage, bench.devices.stage, 1)
+    with devices.connect(pm16c) as instrument, pytest.raises(ConfigError, match="has no digital output"):
+        output_of(pm16c.devices.stage, instrument.devices.stage, 1)
 
 
 def test_a_stage_keeps_a_transcript_where_it_is_asked_to(tmp_path: Path) -> None:
     file = tmp_path / "stage.txt"
-    with devices.connect(small(f"devices.stage.transcript={file}")) as bench:
-        bench.devices.stage.position()
+    with devices.connect(small(f"devices.stage.transcript={file}")) as instrument:
+        instrument.devices.stage.position()
     assert b"PS?0" in file.read_bytes()
 
 
@@ -52,15 +55,15 @@ def test_a_dry_run_refuses_the_pulses_that_the_stage_would_refuse(stage: str, re
         worked = dry_run(settings)
         assert worked.timeline.step_counts == counts
         assert any("trigger output" in said for said in worked.timeline.violations) == (views in refused)
-        with devices.connect(settings) as bench:
-            assert bench.devices.stage.limits == worked.stage
-            bench.devices.stage.start_move(math.radians(-2), math.radians(10))
-            bench.devices.stage.wait(10.0)
+        with devices.connect(settings) as instrument:
+            assert instrument.devices.stage.limits == worked.stage
+            instrument.devices.stage.start_move(math.radians(-2), math.radians(10))
+            instrument.devices.stage.wait(10.0)
             expected = pytest.raises(DeviceRefused, match="cannot be emitted") if views in refused else nullcontext()
             with expected:
-                bench.devices.stage.arm(worked.timeline.views.trains[0])
+                instrument.devices.stage.arm(worked.timeline.views.trains[0])
 
 
 def test_limits_hold() -> None:
-    with devices.connect(small("devices.stage.high_deg=90")) as bench, pytest.raises(DeviceRefused):
-        bench.devices.stage.start_move(math.pi, 0.1)
+    with devices.connect(small("devices.stage.high_deg=90")) as instrument, pytest.raises(DeviceRefused):
+        instrument.devices.stage.start_move(math.pi, 0.1)

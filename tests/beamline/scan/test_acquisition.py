@@ -15,15 +15,15 @@ from beamline.scan.ledger import LedgerError
 from drivers.frame import FrameKind
 from drivers.protocols import CameraTiming
 from tests.beamline.acquired import Run, assert_safe, assert_true_angles
-from tests.beamline.fakes import COUNT, Camera, Faults, Instrument
+from tests.beamline.fakes import COUNT, Camera, FakeInstrument, Faults
 
 
 @pytest.mark.parametrize("mode", [Mode.FLY, Mode.STEP])
 @pytest.mark.parametrize("at", [Place.START, Place.BOTH])
 def test_a_scan_is_its_plan_frame_by_frame(mode: Mode, at: Place) -> None:
-    bench = Instrument()
-    timeline = bench.timeline(n=12, mode=mode, at=at)
-    run = Run(bench, timeline)
+    instrument = FakeInstrument()
+    timeline = instrument.timeline(n=12, mode=mode, at=at)
+    run = Run(instrument, timeline)
     assert run.error is None
     D, F, P = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
     after = [F] * 2 + [D] * 3 if at is Place.BOTH else []
@@ -36,7 +36,7 @@ def test_a_scan_is_its_plan_frame_by_frame(mode: Mode, at: Place) -> None:
     assert run.views == list(range(12))
     assert np.all(np.diff([f.time for f in run.frames]) > 0)
     assert run.scan.missing == []
-    assert_safe(bench)
+    assert_safe(instrument)
     assert [e for e, _ in run.events] == ["block_started", "block_done"] * len(timeline.blocks)
     done = [data for event, data in run.events if event == "block_done"]
     assert [data["frames"] for data in done] == [block.n for block in timeline.blocks]
@@ -44,15 +44,15 @@ def test_a_scan_is_its_plan_frame_by_frame(mode: Mode, at: Place) -> None:
 
 
 def test_the_frame_that_leaves_owns_its_memory() -> None:
-    run = Run(bench := Instrument(), bench.timeline())
+    run = Run(instrument := FakeInstrument(), instrument.timeline())
     for a, b in zip(run.frames, run.frames[1:], strict=False):
         assert not np.shares_memory(a.counts, b.counts)
 
 
 def test_several_passes_keep_their_order_and_angles() -> None:
-    bench = Instrument()
-    timeline = bench.timeline(n=12, passes=3)
-    run = Run(bench, timeline)
+    instrument = FakeInstrument()
+    timeline = instrument.timeline(n=12, passes=3)
+    run = Run(instrument, timeline)
     assert run.error is None
     assert_true_angles(run)
     degrees = np.degrees([f.angle for f in run.of(FrameKind.PROJECTION)])
@@ -64,10 +64,10 @@ def test_several_passes_keep_their_order_and_angles() -> None:
 @given(st.sets(st.integers(0, 23), max_size=5), st.sets(st.integers(0, 23), max_size=4), st.sampled_from([1, 2, 3]))
 def test_fly_any_lost_and_ignored_triggers_are_named(lost: set[int], ignored: set[int], passes: int) -> None:
     first = 5  # triggers before the views: 3 darks and 2 flats
-    bench = Instrument(Faults(lost={first + i for i in lost}, ignored={first + i for i in ignored}))
+    instrument = FakeInstrument(Faults(lost={first + i for i in lost}, ignored={first + i for i in ignored}))
     n = 24
     gone = sorted(lost | ignored)
-    run = Run(bench, bench.timeline(n=n, passes=passes))
+    run = Run(instrument, instrument.timeline(n=n, passes=passes))
     assert_true_angles(run)
     if not gone:
         assert run.error is None
@@ -76,13 +76,13 @@ def test_fly_any_lost_and_ignored_triggers_are_named(lost: set[int], ignored: se
     silent = [p for p in range(passes) if set(range(p * per_pass, (p + 1) * per_pass)) <= set(gone)]
     if silent:  # not one frame of a whole pass: the instrument is at fault, and there is no point in going on
         assert isinstance(run.error, InstrumentError)
-        assert_safe(bench, home=False)
+        assert_safe(instrument, home=False)
         n = (silent[0] + 1) * per_pass
     else:
         assert isinstance(run.error, LedgerError)
         assert run.error.missing == tuple(run.scan.missing)
         assert f"{len(gone)} of 24 projections are missing" in str(run.error)
-        assert_safe(bench)
+        assert_safe(instrument)
     assert run.views == [i for i in range(n) if i not in gone]
     assert run.scan.missing == [first + i for i in gone if i < n]
 
@@ -90,8 +90,8 @@ def test_fly_any_lost_and_ignored_triggers_are_named(lost: set[int], ignored: se
 @settings(max_examples=25, deadline=None)
 @given(st.sets(st.integers(0, 16)))
 def test_step_lost_frames_are_named_and_the_scan_goes_on(lost: set[int]) -> None:
-    bench = Instrument(Faults(lost=lost))
-    run = Run(bench, bench.timeline(n=12, mode=Mode.STEP))
+    instrument = FakeInstrument(Faults(lost=lost))
+    run = Run(instrument, instrument.timeline(n=12, mode=Mode.STEP))
     assert_true_angles(run)
     runs_of_three = [i for i in range(15) if {i, i + 1, i + 2} <= lost and not (i < 3 <= i + 2 or i < 5 <= i + 2)]
     if runs_of_three:
@@ -106,22 +106,22 @@ def test_step_lost_frames_are_named_and_the_scan_goes_on(lost: set[int]) -> None
         assert run.scan.missing == sorted(lost)
         assert isinstance(run.error, LedgerError) or not lost
         assert len(run.frames) == 17 - len(lost)
-    assert_safe(bench, home=not runs_of_three)
+    assert_safe(instrument, home=not runs_of_three)
 
 
 def test_where_the_start_is_too_vague_the_error_says_how_far_the_angles_may_be_off() -> None:
     """Pulses every 23 ms, and the first one expected to within 46 ms: an ignored first trigger cannot be told apart."""
-    bench = Instrument(Faults(ignored={5}))
-    bench.stage.limits = replace(bench.stage.limits, acceleration=np.radians(60).item())
-    run = Run(bench, bench.timeline(n=140, speed=55))
+    instrument = FakeInstrument(Faults(ignored={5}))
+    instrument.stage.limits = replace(instrument.stage.limits, acceleration=np.radians(60).item())
+    run = Run(instrument, instrument.timeline(n=140, speed=55))
     assert isinstance(run.error, LedgerError)
     assert "1 of 140 projections are missing" in str(run.error)
     assert "may all be wrong by up to 1 steps" in str(run.error)
 
 
 def test_frames_that_no_trigger_made_become_invalid_rows() -> None:
-    bench = Instrument(Faults(extra_after={9, 16}))
-    run = Run(bench, bench.timeline(n=12))
+    instrument = FakeInstrument(Faults(extra_after={9, 16}))
+    run = Run(instrument, instrument.timeline(n=12))
     assert run.views == list(range(12))
     invalid = run.of(FrameKind.INVALID)
     assert [f.trigger for f in invalid] == [-1, -1]
@@ -130,7 +130,7 @@ def test_frames_that_no_trigger_made_become_invalid_rows() -> None:
     assert isinstance(run.error, LedgerError)
     assert "2 frames came without a trigger" in str(run.error)
     assert run.error.missing == ()
-    assert_safe(bench)
+    assert_safe(instrument)
 
 
 class Dawdling(Camera):
@@ -141,16 +141,16 @@ class Dawdling(Camera):
         return replace(super().timing, min_period=self.settings.exposure + 0.05)
 
     def software_trigger(self) -> None:
-        self.bench.clock.sleep(0.01 * (1 - self.number % 2))
+        self.instrument.clock.sleep(0.01 * (1 - self.number % 2))
         super().software_trigger()
 
 
 @pytest.mark.parametrize("mode", [Mode.FLY, Mode.STEP])
 def test_software_triggers_leave_the_least_period_between_exposures_whenever_the_camera_fires(mode: Mode) -> None:
-    bench = Instrument()
-    bench.camera = Dawdling(bench)
-    bench.devices = replace(bench.devices, camera=bench.camera)
-    run = Run(bench, bench.timeline(n=8, mode=mode), None)
+    instrument = FakeInstrument()
+    instrument.camera = Dawdling(instrument)
+    instrument.devices = replace(instrument.devices, camera=instrument.camera)
+    run = Run(instrument, instrument.timeline(n=8, mode=mode), None)
     assert run.error is None
     for kind, exposure in ((FrameKind.DARK, 0.02), (FrameKind.FLAT, 0.03), (FrameKind.PROJECTION, 0.02)):
         assert np.diff([frame.time for frame in run.of(kind)]).min() > exposure + 0.05 - 1e-6

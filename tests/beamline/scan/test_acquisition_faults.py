@@ -6,15 +6,15 @@ from beamline.core.errors import InstrumentError
 from beamline.plan.plan import Place
 from drivers.errors import DeviceError, DeviceTimeout
 from tests.beamline.acquired import Run, assert_safe
-from tests.beamline.fakes import HOME, Faults, Instrument
+from tests.beamline.fakes import HOME, FakeInstrument, Faults
 
 
 def test_a_camera_error_once_is_survived_twice_is_not() -> None:
-    once = Instrument(Faults(errors={10: 1}))
+    once = FakeInstrument(Faults(errors={10: 1}))
     run = Run(once, once.timeline())
     assert run.error is None
     assert [data["message"] for event, data in run.events if event == "warning"] == ["camera: ring overrun."]
-    for_good = Instrument(Faults(errors={10: 99}))
+    for_good = FakeInstrument(Faults(errors={10: 99}))
     run = Run(for_good, for_good.timeline())
     assert isinstance(run.error, DeviceError)
     assert len(run.frames) == 10
@@ -24,65 +24,65 @@ def test_a_camera_error_once_is_survived_twice_is_not() -> None:
 
 
 def test_a_camera_without_triggers_is_an_instrument_error_that_says_what_to_check() -> None:
-    bench = Instrument(Faults(ignored=set(range(5, 99))))
-    run = Run(bench, bench.timeline())
+    instrument = FakeInstrument(Faults(ignored=set(range(5, 99))))
+    run = Run(instrument, instrument.timeline())
     assert isinstance(run.error, InstrumentError)
     assert "trigger cable" in str(run.error)
     assert len(run.frames) == 5
-    assert_safe(bench, home=False)
+    assert_safe(instrument, home=False)
 
 
 def test_a_camera_that_falls_silent_is_noticed_while_the_stage_still_turns() -> None:
-    bench = Instrument(Faults(ignored=set(range(20, 999))))
-    start = bench.clock.now()
-    run = Run(bench, bench.timeline(n=600, speed=3))
+    instrument = FakeInstrument(Faults(ignored=set(range(20, 999))))
+    start = instrument.clock.now()
+    run = Run(instrument, instrument.timeline(n=600, speed=3))
     assert isinstance(run.error, InstrumentError)
     assert "while the stage turned" in str(run.error)
     assert len(run.frames) == 20
-    assert bench.clock.now() - start < 15  # of the 60 s that the scan would take
-    assert_safe(bench, home=False)
+    assert instrument.clock.now() - start < 15  # of the 60 s that the scan would take
+    assert_safe(instrument, home=False)
 
 
 def test_a_stage_that_stops_short_fails_with_its_own_words() -> None:
-    bench = Instrument(Faults(stall_at=8700))
-    run = Run(bench, bench.timeline(n=12))
+    instrument = FakeInstrument(Faults(stall_at=8700))
+    run = Run(instrument, instrument.timeline(n=12))
     assert isinstance(run.error, DeviceError)
     assert "stopped short" in str(run.error)
     assert run.views == list(range(6))
     assert run.scan.missing == []
-    assert_safe(bench, home=False)
+    assert_safe(instrument, home=False)
 
 
 def test_a_shutter_that_does_not_open_is_noticed_before_a_frame_is_taken() -> None:
-    bench = Instrument(Faults(stuck_shutter=True))
-    run = Run(bench, bench.timeline())
+    instrument = FakeInstrument(Faults(stuck_shutter=True))
+    run = Run(instrument, instrument.timeline())
     assert isinstance(run.error, InstrumentError)
     assert "shutter: it is closed, flats need it open" in str(run.error)
     assert len(run.frames) == 3
-    assert_safe(bench, home=False)
+    assert_safe(instrument, home=False)
 
 
 def test_a_stage_that_cannot_be_made_safe_is_said_though_the_data_are_good() -> None:
-    bench = Instrument()
+    instrument = FakeInstrument()
 
     def fail() -> None:
         raise DeviceError("shutter", "does not answer")
 
-    bench.devices.shutter.close = fail  # type: ignore[method-assign]
-    run = Run(bench, bench.timeline(at=Place.NONE))
+    instrument.devices.shutter.close = fail  # type: ignore[method-assign]
+    run = Run(instrument, instrument.timeline(at=Place.NONE))
     assert isinstance(run.error, DeviceError)  # the device's own, with its parts
     assert run.error.device == "shutter"
     assert [data for event, data in run.events if event == "warning"] == []  # it is told once
     assert run.scan.unsafe
     assert len(run.frames) == 12
-    assert not bench.camera.armed
-    assert f"move {HOME}" not in bench.log
+    assert not instrument.camera.armed
+    assert f"move {HOME}" not in instrument.log
 
 
 def test_a_shutter_that_closes_at_the_second_try_is_told_and_the_scan_is_good() -> None:
-    bench = Instrument()
+    instrument = FakeInstrument()
     tries: list[int] = []
-    close = bench.devices.shutter.close
+    close = instrument.devices.shutter.close
 
     def at_the_second_try() -> None:
         tries.append(len(tries))
@@ -90,58 +90,58 @@ def test_a_shutter_that_closes_at_the_second_try_is_told_and_the_scan_is_good() 
             raise DeviceError("shutter", "does not answer")
         close()
 
-    bench.devices.shutter.close = at_the_second_try  # type: ignore[method-assign]
-    bench.is_open = True
-    run = Run(bench, bench.timeline(at=Place.NONE))
+    instrument.devices.shutter.close = at_the_second_try  # type: ignore[method-assign]
+    instrument.is_open = True
+    run = Run(instrument, instrument.timeline(at=Place.NONE))
     assert run.error is None
     assert [data["message"] for event, data in run.events if event == "warning"] == ["shutter: does not answer."]
     assert not run.scan.unsafe
-    assert_safe(bench)
+    assert_safe(instrument)
 
 
 def test_a_stage_that_does_not_obey_a_stop_is_aborted() -> None:
-    bench = Instrument(Faults(errors={10: 99}))
+    instrument = FakeInstrument(Faults(errors={10: 99}))
 
     def deaf() -> None:
         raise DeviceTimeout("stage", "no reply")
 
-    bench.devices.stage.stop = deaf  # type: ignore[method-assign]
-    run = Run(bench, bench.timeline())
+    instrument.devices.stage.stop = deaf  # type: ignore[method-assign]
+    run = Run(instrument, instrument.timeline())
     assert isinstance(run.error, DeviceError)
     assert run.error.device == "camera"
     assert [data["message"] for event, data in run.events if event == "warning"][1:] == ["stage: no reply."] * 2
-    assert bench.log.count("abort stage") == 1
-    assert_safe(bench, home=False)
+    assert instrument.log.count("abort stage") == 1
+    assert_safe(instrument, home=False)
 
 
 def test_a_way_home_that_fails_leaves_a_stage_that_stands() -> None:
-    bench = Instrument()
-    moving = bench.devices.stage.moving
+    instrument = FakeInstrument()
+    moving = instrument.devices.stage.moving
 
     def dies_on_the_way_home() -> bool:
-        if bench.log[-1] == f"move {HOME}":
+        if instrument.log[-1] == f"move {HOME}":
             raise DeviceTimeout("stage", "no reply")
         return moving()
 
-    bench.devices.stage.moving = dies_on_the_way_home  # type: ignore[method-assign]
-    run = Run(bench, bench.timeline())
+    instrument.devices.stage.moving = dies_on_the_way_home  # type: ignore[method-assign]
+    run = Run(instrument, instrument.timeline())
     assert isinstance(run.error, DeviceTimeout)
     assert not run.scan.unsafe
     assert len(run.frames) == 17
-    assert bench.log[-1] == "stop stage"
+    assert instrument.log[-1] == "stop stage"
     assert not moving()
-    assert not bench.is_open
+    assert not instrument.is_open
 
 
 def test_a_defect_in_one_driver_does_not_leave_the_other_devices_unsafe() -> None:
-    bench = Instrument(Faults(errors={10: 99}))
+    instrument = FakeInstrument(Faults(errors={10: 99}))
 
     def fail() -> None:
         raise ZeroDivisionError("defect")
 
-    bench.devices.stage.stop = fail  # type: ignore[method-assign]
-    run = Run(bench, bench.timeline())
+    instrument.devices.stage.stop = fail  # type: ignore[method-assign]
+    run = Run(instrument, instrument.timeline())
     assert isinstance(run.error, DeviceError)  # what went wrong first
     assert "ZeroDivisionError: defect" in [data["message"] for event, data in run.events if event == "warning"]
-    assert not bench.is_open
-    assert not bench.camera.armed
+    assert not instrument.is_open
+    assert not instrument.camera.armed

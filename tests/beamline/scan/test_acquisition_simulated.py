@@ -35,7 +35,7 @@ SCENE = {
 PULSES = st.sets(st.integers(0, N - 1), max_size=4)
 
 
-class Bench:
+class FaultyInstrument:
     """The simulated instrument with faults; what happens when frames are taken can be scheduled."""
 
     def __init__(self, pulses_lost: set[int], ignored: set[int], lost: set[int]) -> None:
@@ -86,29 +86,29 @@ class Bench:
 def test_lost_pulses_ignored_triggers_and_lost_frames_are_all_named(
     pulses_lost: set[int], ignored: set[int], lost: set[int]
 ) -> None:
-    bench = Bench(pulses_lost, ignored, lost)
+    instrument = FaultyInstrument(pulses_lost, ignored, lost)
     arrive = [i for i in range(N) if i not in pulses_lost]
     accepted = [i for number, i in enumerate(arrive) if number not in ignored]
     kept = [i for number, i in enumerate(accepted) if number not in lost]
-    acquisition, frames, error = bench.scan(StopRequest())
+    acquisition, frames, error = instrument.scan(StopRequest())
     assert [frame.trigger for frame in frames] == kept
-    bench.assert_true_angles(frames)
+    instrument.assert_true_angles(frames)
     assert acquisition.missing == [i for i in range(N) if i not in kept]
     assert isinstance(error, LedgerError) if acquisition.missing else error is None
-    assert bench.stage.position() == 0.0
-    assert not bench.shutter.is_open()
-    bench.stage.close()
+    assert instrument.stage.position() == 0.0
+    assert not instrument.shutter.is_open()
+    instrument.stage.close()
 
 
 @pytest.mark.parametrize("after", [1, 5, 12])
 def test_a_stop_while_turning_keeps_the_angles_of_the_frames_on_their_way(after: int) -> None:
-    bench = Bench(set(), set(), set())
-    acquisition, frames, error = bench.scan(StopRequest(), stop_after=after)
+    instrument = FaultyInstrument(set(), set(), set())
+    acquisition, frames, error = instrument.scan(StopRequest(), stop_after=after)
     assert isinstance(error, ScanStopped)
     assert after < len(frames) < N
     assert [frame.trigger for frame in frames] == list(range(len(frames)))
     assert all(frame.kind is FrameKind.PROJECTION for frame in frames)
-    bench.assert_true_angles(frames)
+    instrument.assert_true_angles(frames)
     assert acquisition.missing == []
-    assert bench.stage.position() == 0.0
-    bench.stage.close()
+    assert instrument.stage.position() == 0.0
+    instrument.stage.close()

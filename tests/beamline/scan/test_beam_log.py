@@ -19,7 +19,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.writers.layout import BEAM
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.protocols import BeamReading
-from tests.beamline.fakes import Instrument
+from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import small
 
 SILENT = DeviceTimeout("beam monitor", "no answer")
@@ -78,8 +78,8 @@ CHOSEN = "devices.beam_monitor={kind: electrometer, port: 'sim://electrometer', 
 
 def scan(folder: Path, monitor: Scripted) -> tuple[Path, list[Event]]:
     events: list[Event] = []
-    bench = replace(Instrument().bench(), beam_monitor=monitor)
-    return run_scan(small(CHOSEN), folder, [events.append], bench=bench).path, events
+    instrument = replace(FakeInstrument().connected(), beam_monitor=monitor)
+    return run_scan(small(CHOSEN), folder, [events.append], instrument=instrument).path, events
 
 
 def test_a_scan_keeps_the_readings_in_its_file(tmp_path: Path) -> None:
@@ -117,6 +117,6 @@ def test_a_monitor_that_hangs_holds_up_no_scan(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_scan_without_a_monitor_has_no_place_for_it(tmp_path: Path) -> None:
-    path = run_scan(small(), tmp_path, bench=Instrument().bench()).path
+    path = run_scan(small(), tmp_path, instrument=FakeInstrument().connected()).path
     with h5py.File(path) as file:
         assert BEAM not in file

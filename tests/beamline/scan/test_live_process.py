@@ -15,7 +15,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import run as module
 from beamline.scan.live_process import LiveReconstruction
 from beamline.scan.run import run_scan
-from tests.beamline.fakes import Instrument
+from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
 
 
@@ -31,7 +31,7 @@ print("a library's chatter")
 pathlib.Path(sys.argv[2]).write_text("volume")
 print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
 """
-    ran = Ran(tmp_path, Instrument(), live=script(code))
+    ran = Ran(tmp_path, FakeInstrument(), live=script(code))
     assert ran.error is None
     assert ran.result is not None
     assert ran.folder is not None
@@ -53,7 +53,7 @@ print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col
     ],
 )
 def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: str, says: str) -> None:
-    ran = Ran(tmp_path, Instrument(), live=script(code))
+    ran = Ran(tmp_path, FakeInstrument(), live=script(code))
     assert ran.error is None
     assert ran.result is not None
     assert ran.folder is not None
@@ -65,7 +65,7 @@ def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: s
 
 
 def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
+    ran = Ran(tmp_path, FakeInstrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
     assert ran.error is None
     assert any("cannot be started" in event.data["message"] for event in ran.of("warning"))
     ran.assert_good_file(19, "complete")
@@ -75,7 +75,7 @@ def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
     stop = StopRequest()
     ran = Ran(
         tmp_path,
-        Instrument(on_frame=lambda number: stop.abort() if number == 10 else None),
+        FakeInstrument(on_frame=lambda number: stop.abort() if number == 10 else None),
         stop=stop,
         live=script("import time; time.sleep(100)"),
     )
@@ -99,14 +99,14 @@ def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
 
     monkeypatch.setattr(module, "LiveReconstruction", Kept)
     monkeypatch.setattr(module, "Recorder", broken)
-    ran = Ran(tmp_path, Instrument(), live=script("import time; time.sleep(100)"))
+    ran = Ran(tmp_path, FakeInstrument(), live=script("import time; time.sleep(100)"))
     assert isinstance(ran.error, ZeroDivisionError)
     assert [process.poll() is None for process in started] == [False]
 
 
 def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path) -> None:
     stop = StopRequest()
-    instrument = Instrument()
+    instrument = FakeInstrument()
     events: list[Event] = []
 
     def sink(event: Event) -> None:
@@ -120,7 +120,7 @@ def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path)
         [sink],
         stop,
         live=script("import time; time.sleep(100)"),
-        bench=instrument.bench(),
+        instrument=instrument.connected(),
     )
     assert result.n_frames == 19
     assert result.recon is None

@@ -19,9 +19,9 @@ from beamline.monitor.flag import ScanContext
 from beamline.scan import recorder as module
 from beamline.scan.recorder import Recorder
 from drivers.frame import Frame, FrameKind
-from tests.beamline.fakes import Instrument
+from tests.beamline.fakes import FakeInstrument
 
-TIMELINE = Instrument().timeline()
+TIMELINE = FakeInstrument().timeline()
 
 
 class Writer:

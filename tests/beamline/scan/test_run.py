@@ -30,13 +30,13 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
 from recon.prep.correct import CorrectionSettings
-from tests.beamline.fakes import COUNT, Faults, Instrument
+from tests.beamline.fakes import COUNT, FakeInstrument, Faults
 from tests.beamline.ran import SMALL, Ran, small
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
 def test_a_run_from_trigger_to_file(tmp_path: Path, mode: str) -> None:
-    ran = Ran(tmp_path, Instrument(), f"scan.mode={mode}")
+    ran = Ran(tmp_path, FakeInstrument(), f"scan.mode={mode}")
     assert ran.error is None
     assert ran.result is not None
     assert ran.folder is not None
@@ -52,7 +52,7 @@ def test_a_run_from_trigger_to_file(tmp_path: Path, mode: str) -> None:
 
 
 def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument())
+    ran = Ran(tmp_path, FakeInstrument())
     assert ran.folder is not None
     names = [event.event for event in ran.events if event.event != "frame"]
     block = ["block_started", "block_done"]
@@ -69,7 +69,7 @@ def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
 
 
 def test_what_the_file_says_of_the_scan(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument())
+    ran = Ran(tmp_path, FakeInstrument())
     assert ran.folder is not None
     with h5py.File(ran.folder / "scan.h5") as file:
         plan = json.loads(file["entry/record/plan"][()])
@@ -83,7 +83,7 @@ def test_what_the_file_says_of_the_scan(tmp_path: Path) -> None:
 
 
 def test_missing_frames_are_named_after_everything_else_was_taken(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument(Faults(lost={8}, ignored={11, 12})))
+    ran = Ran(tmp_path, FakeInstrument(Faults(lost={8}, ignored={11, 12})))
     assert isinstance(ran.error, LedgerError)
     assert ran.error.missing == (8, 11, 12)
     assert "3 of 12 projections are missing: 3, 6-7" in str(ran.error)
@@ -103,7 +103,7 @@ def test_stop_and_abort_leave_a_readable_file(
 ) -> None:
     stop = StopRequest()
     wish = stop.abort if abort else stop.stop
-    ran = Ran(tmp_path, Instrument(on_frame=lambda number: wish() if number == 10 else None), stop=stop)
+    ran = Ran(tmp_path, FakeInstrument(on_frame=lambda number: wish() if number == 10 else None), stop=stop)
     assert type(ran.error) is kind
     n = ran.of("scan_done")[0].data["n_frames"]
     assert least <= n < 17
@@ -115,14 +115,14 @@ def test_stop_and_abort_leave_a_readable_file(
 def test_a_stop_before_the_start_makes_no_folder(tmp_path: Path) -> None:
     stop = StopRequest()
     stop.stop()
-    ran = Ran(tmp_path / "runs", Instrument(), stop=stop)
+    ran = Ran(tmp_path / "runs", FakeInstrument(), stop=stop)
     assert type(ran.error) is ScanAborted
     assert ran.folder is None
     assert ran.instrument.log == []
 
 
 def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    ran = Ran(tmp_path / "runs", Instrument(), "scan.period_s=0.021")
+    ran = Ran(tmp_path / "runs", FakeInstrument(), "scan.period_s=0.021")
     assert isinstance(ran.error, ConfigError)
     assert "nothing was started" in str(ran.error)
     assert ran.folder is None
@@ -131,7 +131,7 @@ def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None
 
 
 def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument(Faults(errors={10: 99})))
+    ran = Ran(tmp_path, FakeInstrument(Faults(errors={10: 99})))
     assert isinstance(ran.error, DeviceError)
     ran.assert_good_file(10, "failed")
     ran.assert_safe()
@@ -157,7 +157,7 @@ def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
     monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, failure))
-    ran = Ran(tmp_path, Instrument(), "scan.angles.views=200", "scan.period_s=0.05")
+    ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=200", "scan.period_s=0.05")
     assert isinstance(ran.error, DataError)
     assert re.search(r"first 8 frames are safe in .*scan\.h5", str(ran.error))
     ran.assert_good_file(8, "failed")
@@ -183,7 +183,7 @@ def test_logs_on_a_full_disk_do_not_hide_why_the_run_ended(tmp_path: Path, monke
 
     monkeypatch.setattr(Path, "open", opened)
     monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
-    ran = Ran(tmp_path, Instrument())
+    ran = Ran(tmp_path, FakeInstrument())
     assert str(ran.error) == "the first 8 frames are safe."
     ran.assert_good_file(8, "failed")
 
@@ -195,7 +195,7 @@ def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    ran = Ran(tmp_path, instrument := Instrument())
+    ran = Ran(tmp_path, instrument := FakeInstrument())
     assert isinstance(ran.error, DataError)
     assert re.search(
         rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing has moved", str(ran.error)
@@ -218,7 +218,7 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(recorder_module, "STALL", 0.05)
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))
     try:
-        ran = Ran(tmp_path, Instrument())
+        ran = Ran(tmp_path, FakeInstrument())
     finally:
         free.set()
     assert isinstance(ran.error, DataError)
@@ -228,7 +228,7 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Path) -> None:
     """Half a turn in 6 views is 3000 counts of the stage; a view every 2200 s would be 1.36 counts a second."""
-    ran = Ran(tmp_path, Instrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
+    ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
     assert ran.error is None
     assert ran.result is not None
     assert ran.result.flags == {}
@@ -240,7 +240,7 @@ def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Pat
 
 
 def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, Instrument(Faults(repeats={9, 10, 11})))
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10, 11})))
     assert ran.error is None
     assert ran.result is not None
     assert ran.folder is not None
@@ -255,7 +255,11 @@ def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
 def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))  # on a virtual clock the writer would be far behind
     ran = Ran(
-        tmp_path, Instrument(Faults(repeats={9})), "monitor.on_alarm=stop", "scan.angles.views=60", "scan.period_s=0.1"
+        tmp_path,
+        FakeInstrument(Faults(repeats={9})),
+        "monitor.on_alarm=stop",
+        "scan.angles.views=60",
+        "scan.period_s=0.1",
     )
     assert type(ran.error) is ScanStopped
     assert "stuck check raised an alarm" in str(ran.error)
@@ -270,7 +274,7 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
         raise ZeroDivisionError("defect")
 
     monkeypatch.setattr(recorder_module.monitor, "watch", broken)
-    ran = Ran(tmp_path, Instrument())
+    ran = Ran(tmp_path, FakeInstrument())
     assert ran.error is None
     ran.assert_good_file(19, "complete")
     assert ["monitor failed at row 0" in event.data["message"] for event in ran.of("warning")] == [True]
@@ -281,7 +285,7 @@ def test_an_interpreter_interrupt_closes_the_file_too(tmp_path: Path) -> None:
         if number == 10:
             raise KeyboardInterrupt
 
-    ran = Ran(tmp_path, Instrument(on_frame=interrupt))
+    ran = Ran(tmp_path, FakeInstrument(on_frame=interrupt))
     assert isinstance(ran.error, KeyboardInterrupt)
     ran.assert_good_file(10, "failed")
     ran.assert_safe()
@@ -293,8 +297,8 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
     def fail() -> None:
         raise DeviceError("stage", "its port does not close")
 
-    bench = replace(Instrument().bench(), close=fail)
-    monkeypatch.setattr(module, "connect", lambda config, ask, heed: bench)
+    instrument = replace(FakeInstrument().connected(), close=fail)
+    monkeypatch.setattr(module, "connect", lambda config, ask, heed: instrument)
     events: list[Event] = []
     with pytest.raises(DeviceError, match="does not close"):
         run_scan(small(), tmp_path, [events.append])
@@ -342,12 +346,12 @@ def test_the_duration_foretold_is_what_it_takes(tmp_path: Path, mode: str) -> No
     overrides = [*SMALL, f"scan.mode={mode}", angles, "simulation.clock=virtual", "scan.darks.at=both"]
     overrides += ["devices.camera.roi=[1148, 2028, 8, 40]", "scan.flats.exposure_s=0.5"]
     config = load(config_folder() / "simulated.yaml", overrides, environment={})
-    with connect(config) as bench:
-        began = bench.clock.now()
+    with connect(config) as instrument:
+        began = instrument.clock.now()
         events: list[Event] = []
-        run_scan(config, tmp_path, [events.append], bench=bench)
-        seconds = bench.clock.now() - began
-        assert bench.devices.stage.position() == 0.0
+        run_scan(config, tmp_path, [events.append], instrument=instrument)
+        seconds = instrument.clock.now() - began
+        assert instrument.devices.stage.position() == 0.0
     foretold = next(event.data["duration"] for event in events if event.event == "run_started")
     assert foretold == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
 
@@ -380,9 +384,9 @@ def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_pa
 @pytest.mark.parametrize("below", ["", "deeper/still"])
 def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> None:
     (tmp_path / "runs").write_text("a file")
-    instrument = Instrument()
+    instrument = FakeInstrument()
     with pytest.raises(ConfigError, match="there is a file at"):
-        run_scan(small(), tmp_path / "runs" / below, bench=instrument.bench())
+        run_scan(small(), tmp_path / "runs" / below, instrument=instrument.connected())
     assert instrument.log == []
 
 

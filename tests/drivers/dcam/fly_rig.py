@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 from uuid import uuid4
 
-from beamline.instrument.connect import Bench
+from beamline.instrument.connect import Instrument
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
 from drivers.protocols import Devices
@@ -58,9 +58,9 @@ class FlyRig:
         )
         self.camera: DcamCamera = world.connect(options)
 
-    def bench(self) -> Bench:
+    def connected(self) -> Instrument:
         devices = Devices(self.stage, self.camera, SimulatedShutter(), SimulatedSampleMover())
-        return Bench(devices, self.clock, None, self.close)
+        return Instrument(devices, self.clock, None, self.close)
 
     def close(self) -> None:
         self.stage.close()

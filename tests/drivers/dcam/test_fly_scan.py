@@ -106,7 +106,7 @@ class Scanned:
         self.error: Exception | None = None
         began, busy = time.monotonic(), time.process_time()
         try:
-            self.result = run_scan(config, runs, bench=rig.bench())
+            self.result = run_scan(config, runs, instrument=rig.connected())
         except Exception as error:
             self.error = error
         self.seconds, self.cpu_seconds = time.monotonic() - began, time.process_time() - busy

@@ -1,4 +1,4 @@
-"""Sight: what the simulated camera sees of a scene with its present settings: its pixels, and each frame's shot."""
+"""CameraView: what the simulated camera sees of a scene with its present settings: its pixels, each frame's shot."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Exposed:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class CameraView:
     """A scene behind a camera.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Sight: an instrument's camera in the middle of its sensor sees what a scan of the scene alone sees."""
+"""CameraView: an instrument's camera in the middle of its sensor sees what a scan of the scene alone sees."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
 from drivers.protocols import CameraSettings, TriggerSource
-from simulators.devices.sight import Exposed, Sight
+from simulators.devices.camera_view import CameraView, Exposed
 from simulators.scenes.shots import Scan
 from tests.simulators import shots
 
@@ -23,9 +23,9 @@ def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: in
     scan = Scan.of(replace(scene, detector=asked), seed=7)
     of = scan.frame(25).shot
     settings = CameraSettings(asked.exposure_s, TriggerSource.EXTERNAL, scan.roi, binning, readout)
-    sight = Sight(scan.scene, settings, asked.pixel_size_um * 1e-3, 7, of.angle_at, connected=scan.start)
+    view = CameraView(scan.scene, settings, asked.pixel_size_um * 1e-3, 7, of.angle_at, connected=scan.start)
     frame = Exposed(3, of.frame, of.time, of.angle, of.time + 1.0, True, True, of.view)
-    seen, expected = asdict(sight.shot(frame)), asdict(of)
+    seen, expected = asdict(view.shot(frame)), asdict(of)
     for name, value in expected["detector"].items():
         assert seen["detector"][name] == pytest.approx(value, rel=1e-12), name
     assert seen.pop("row_period") == pytest.approx(expected.pop("row_period"), rel=1e-12)
@@ -33,7 +33,7 @@ def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: in
 
 
 def test_without_a_roi_it_is_the_whole_sensor() -> None:
-    sight = Sight(shots.scene(), CameraSettings(0.01, TriggerSource.INTERNAL), 4.6e-3, 1, shots.never, 0.0)
-    assert sight.roi == (0, 0, *SENSOR_SHAPE)
-    assert sight.detector.shape == SENSOR_SHAPE
-    assert (sight.detector.axis_row, sight.detector.axis_col) == tuple((np.array(SENSOR_SHAPE) - 1) / 2)
+    view = CameraView(shots.scene(), CameraSettings(0.01, TriggerSource.INTERNAL), 4.6e-3, 1, shots.never, 0.0)
+    assert view.roi == (0, 0, *SENSOR_SHAPE)
+    assert view.detector.shape == SENSOR_SHAPE
+    assert (view.detector.axis_row, view.detector.axis_col) == tuple((np.array(SENSOR_SHAPE) - 1) / 2)
