@@ -126,3 +126,10 @@ def test_a_file_that_hdf5_cannot_close_does_not_cost_the_exit_code(
 def test_the_installed_command_is_the_process() -> None:
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))
     assert project["project"]["scripts"] == {"beamline": f"{module.__name__}:{module.run.__name__}"}
+
+
+def test_every_command_has_its_line_in_the_page_on_commands() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "commands.md").read_text(encoding="utf-8")
+    assert [
+        name for name in module.main.list_commands(click.Context(module.main)) if f"\nbeamline {name} " not in page
+    ] == []
