@@ -1,50 +1,51 @@
-"""Mapping: a frozen dataclass from a YAML mapping; unknown or missing keys and wrong types are refused by name."""
+"""Mapping: reads a scene's YAML mapping into frozen dataclasses; what is wrong is refused by the path of its key."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
-from types import MappingProxyType, NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from functools import cache, partial
+from types import MappingProxyType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    FiniteFloat,
+    StrictBool,
+    StrictStr,
+    TypeAdapter,
+    ValidationError,
+    create_model,
+)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+    from pydantic_core import ErrorDetails
 
 T = TypeVar("T", bound="DataclassInstance")
+K, V = TypeVar("K"), TypeVar("V")
 
 
 class SceneError(ValueError):
-    """A scene's mapping is wrong; the message names the key, what it holds and what is legal."""
+    """A scene's mapping is wrong; the message names the path of the key, its value and what is legal."""
 
 
 def build(cls: type[T], where: str, mapping: Any) -> T:
-    """`cls(**mapping)` for a dataclass of plain fields: numbers, words, true or false, lists and mappings of these,
-    dataclasses of such fields, and None for what may be left out.
+    """`cls(**mapping)` for a dataclass of numbers, text, booleans, tuples and mappings of these, dataclasses of such
+    fields, and None where a field is optional.
+
+    A number is finite and may be given as text: YAML 1.1 reads 1e5 and 1.0e5 (no sign) as text.
 
     Raises:
-        SceneError: naming the key (`where` is its path) and the legal ones.
+        SceneError: an unknown or missing key, or a wrong value; its path begins with `where`.
     """
-    declared = [field for field in fields(cls) if field.init]
-    needed = [field.name for field in declared if field.default is MISSING and field.default_factory is MISSING]
-    entries = keys(where, mapping, legal=[field.name for field in declared], needed=needed)
-    hints = get_type_hints(cls)
-    values = {key: _value(f"{where}.{key}", hints[key], value) for key, value in entries.items()}
     try:
-        return cls(**values)
-    except ValueError as error:
-        raise SceneError(f"{where}: {error}") from None
-
-
-def keys(where: str, mapping: Any, *, legal: Sequence[str], needed: Sequence[str] = ()) -> Mapping[str, Any]:
-    """The mapping itself, once its keys are known to be legal and complete."""
-    if not isinstance(mapping, Mapping):
-        raise SceneError(f"{where} must be a mapping with the keys {', '.join(legal)}; got {mapping!r}")
-    if unknown := [key for key in mapping if key not in legal]:
-        raise SceneError(f"{where}: key {unknown[0]!r} is unknown; legal: {', '.join(legal) or 'none'}")
-    if missing := [key for key in needed if key not in mapping]:
-        raise SceneError(f"{where}: key {missing[0]!r} is missing; needed: {', '.join(needed)}")
-    return mapping
+        return _adapter(cls).validate_python(mapping)
+    except ValidationError as error:
+        raise SceneError(_sentence(where, error.errors(include_url=False)[0])) from None
 
 
 def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[str, Any]]:
@@ -62,68 +63,95 @@ def choose(where: str, choices: Mapping[str, type[Any]], entry: Any) -> Any:
     return build(choices[kind], f"{where} ({kind})", rest)
 
 
-def items(where: str, key: str, mapping: Mapping[str, Any]) -> list[tuple[int, Any]]:
-    """The entries of a list, numbered; an absent one is empty."""
-    entries = mapping.get(key) or []
-    if not isinstance(entries, list | tuple):
-        raise SceneError(f"{where}: {key} must be a list, got {entries!r}")
-    return list(enumerate(entries))
-
-
-def number(where: str, value: Any) -> float:
-    """A finite float. Text that reads as a number is one: YAML 1.1 takes 1e5 and 1.0e5 (no sign) for text."""
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Within it a ValueError becomes a SceneError at that path; a SceneError has its path already."""
     try:
-        read = float(value) if isinstance(value, int | float | str) and not isinstance(value, bool) else math.nan
-    except ValueError:
-        read = math.nan
-    if not math.isfinite(read):
-        raise SceneError(f"{where} must be a finite number, got {value!r}")
-    return read
+        yield
+    except SceneError:
+        raise
+    except ValueError as error:
+        raise SceneError(f"{where}: {error}") from None
 
 
-def _value(where: str, kind: Any, value: Any) -> Any:
-    origin, choices = get_origin(kind), get_args(kind)
-    if origin in (Union, UnionType):  # only "something | None" is declared
-        (inner,) = (choice for choice in choices if choice is not NoneType)
-        return None if value is None else _value(where, inner, value)
-    if origin is Literal:
-        if value not in choices:
-            raise SceneError(f"{where} must be one of {', '.join(map(str, choices))}, got {value!r}")
-        return value
-    if origin is tuple:
-        return _values(where, choices, value)
-    if origin is Mapping:
-        return _entries(where, choices, value)
-    if isinstance(kind, type) and is_dataclass(kind):
-        return build(kind, where, value)
-    if kind is bool or kind is str:
-        if not isinstance(value, kind):
-            raise SceneError(f"{where} must be {'true or false' if kind is bool else 'text'}, got {value!r}")
-        return value
-    if kind is int:
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise SceneError(f"{where} must be a whole number, got {value!r}")
-        return value
-    return number(where, value)
+def _no_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number, got {value}")
+    return value
 
 
-def _entries(where: str, kinds: tuple[Any, ...], value: Any) -> Mapping[Any, Any]:
-    """A mapping from whole numbers or names; a number may stand as text, as JSON has its keys."""
-    if not isinstance(value, Mapping):
-        raise SceneError(f"{where} must be a mapping, got {value!r}")
-    of_key, of_value = kinds
-    entries = {}
-    for key, entry in value.items():
-        read = int(key) if of_key is int and isinstance(key, str) and key.isdecimal() else key
-        entries[_value(f"{where}: key", of_key, read)] = _value(f"{where}.{key}", of_value, entry)
-    return MappingProxyType(entries)
+_SCALARS: Mapping[Any, Any] = {
+    float: Annotated[FiniteFloat, BeforeValidator(_no_bool)],
+    int: Annotated[int, BeforeValidator(_no_bool)],
+    bool: StrictBool,
+    str: StrictStr,
+}
+_CONTAINERS: Mapping[Any, Any] = {
+    tuple: tuple,
+    Mapping: Annotated[dict[K, V], AfterValidator(MappingProxyType)],  # type: ignore[valid-type]
+    Union: Union,
+    UnionType: Union,
+}
 
 
-def _values(where: str, kinds: tuple[Any, ...], value: Any) -> tuple[Any, ...]:
-    """A list as a tuple; `kinds` are those of its items, or one and an ellipsis for a list of any length."""
-    endless = kinds[-1] is Ellipsis
-    if not isinstance(value, list | tuple) or not (endless or len(value) == len(kinds)):
-        what = "numbers" if all(kind in (int, float) for kind in kinds if kind is not Ellipsis) else "entries"
-        raise SceneError(f"{where} must be a list of {'' if endless else f'{len(kinds)} '}{what}, got {value!r}")
-    each = kinds[:1] * len(value) if endless else kinds
-    return tuple(_value(f"{where}[{i}]", kind, v) for i, (kind, v) in enumerate(zip(each, value, strict=True)))
+@cache
+def _adapter(cls: type[T]) -> TypeAdapter[T]:
+    return TypeAdapter(_checked(cls))
+
+
+def _checked(kind: Any) -> Any:
+    """A field's type with the rules above, for pydantic."""
+    if is_dataclass(kind):
+        return _checked_dataclass(kind)
+    if container := _CONTAINERS.get(get_origin(kind)):
+        return container[tuple(_checked(part) for part in get_args(kind))]
+    return _SCALARS.get(kind, kind)
+
+
+def _checked_dataclass(cls: Any) -> Any:
+    hints, declared = get_type_hints(cls), [field for field in fields(cls) if field.init]
+    needed = [field.name for field in declared if field.default is MISSING and field.default_factory is MISSING]
+    kinds: dict[str, Any] = {field.name: (_checked(hints[field.name]), None) for field in declared}
+
+    def instance(read: BaseModel) -> Any:
+        return cls(**{name: getattr(read, name) for name in read.model_fields_set})
+
+    check = BeforeValidator(partial(_check_keys, list(kinds), needed))
+    return Annotated[create_model(cls.__name__, **kinds), check, AfterValidator(instance)]
+
+
+def _check_keys(legal: Sequence[str], needed: Sequence[str], mapping: Any) -> Mapping[str, Any]:
+    if not isinstance(mapping, Mapping):
+        raise ValueError(f"must be a mapping with the keys {', '.join(legal)}; got {mapping!r}")
+    if unknown := [key for key in mapping if key not in legal]:
+        raise ValueError(f"key {unknown[0]!r} is unknown; legal: {', '.join(legal) or 'none'}")
+    if missing := [key for key in needed if key not in mapping]:
+        raise ValueError(f"key {missing[0]!r} is missing; needed: {', '.join(needed)}")
+    return mapping
+
+
+_EXPECTED = {
+    "float": "a finite number",
+    "finite": "a finite number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "string": "text",
+    "tuple": "a list",
+    "dict": "a mapping",
+}
+"""By the first word of the type of pydantic's error."""
+
+
+def _sentence(where: str, error: ErrorDetails) -> str:
+    """The path, what is expected there, and the value."""
+    kind, loc, value = error["type"], error["loc"], error["input"]
+    path = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if part != "[key]")
+    if kind == "value_error":
+        message = str(error["ctx"]["error"])
+        return f"{path} {message}" if message.startswith("must ") else f"{path}: {message}"
+    if kind == "missing":  # an entry of a tuple; keys are checked before
+        return f"{path} is missing, got {value!r}"
+    if kind == "too_long":
+        return f"{path} must be a list of {error['ctx']['max_length']}, got {value!r}"
+    expected = error["ctx"]["expected"] if kind == "literal_error" else _EXPECTED.get(kind.split("_")[0], error["msg"])
+    return f"{path}{': key' if '[key]' in loc else ''} must be {expected}, got {value!r}"

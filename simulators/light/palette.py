@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
-from simulators.frame.mapping import SceneError, build
+from simulators.frame.mapping import SceneError, build, located
 from simulators.light.materials import Material, by_mass, by_volume, layered_oxide, of_formula
 from simulators.light.spectrum import Attenuation
 
@@ -53,8 +53,8 @@ _KNOWN: Mapping[str, Callable[[], Material]] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class _Said:
-    """What a scene says of a material; see Material."""
+class _Properties:
+    """Properties of a material that a scene gives; see Material."""
 
     formula: str | None = None
     density: float | None = None
@@ -73,22 +73,22 @@ class Palette:
     own: Mapping[str, Material] = field(default_factory=lambda: MappingProxyType({}))
 
     def __call__(self, name: str) -> Material:
-        """Raises SceneError: nobody knows the name."""
+        """Raises ValueError where no material has this name."""
         found = self.own.get(name) or known(name)
         if found is None:
-            raise SceneError(
-                f"material {name!r} is unknown; known: {', '.join([*self.own, *_KNOWN])}, NMC and three digits; or say "
+            raise ValueError(
+                f"material {name!r} is unknown; known: {', '.join([*self.own, *_KNOWN])}, NMC and three digits; or add "
                 f"materials: {{{name}: {{formula: ..., density: ...}}}} in the phantom (g/cm3)"
             )
         return found
 
     def filters(self, name: str) -> Attenuation:
-        """The attenuation of a material, as `spectrum.light` asks for it. Raises SceneError as above."""
+        """The attenuation of a material, for `spectrum.light`. Raises ValueError as above."""
         return self(name).attenuation
 
 
-def palette(where: str, entry: Any) -> Palette:
-    """The materials of a scene: those known by name, changed and added to by its key `materials`.
+def palette_of(where: str, entry: Any) -> Palette:
+    """The materials of a scene: the known ones, changed and added to by its key `materials`.
 
         materials:
           NMC811: {state_of_charge: 0.5}
@@ -99,7 +99,7 @@ def palette(where: str, entry: Any) -> Palette:
     """
     entry = {} if entry is None else entry
     if not isinstance(entry, Mapping):
-        raise SceneError(f"{where} must be a mapping from names to what is said of them; got {entry!r}")
+        raise SceneError(f"{where} must be a mapping from names to the properties of materials; got {entry!r}")
     return Palette({str(name): _own(f"{where}.{name}", str(name), settings) for name, settings in entry.items()})
 
 
@@ -109,14 +109,12 @@ def known(name: str) -> Material | None:
 
 
 def _own(where: str, name: str, settings: Any) -> Material:
-    said = build(_Said, where, settings)
+    given = build(_Properties, where, settings)
     base = known(name)
-    density = said.density if said.density is not None else base.density if base else None
-    if density is None or (base is None and said.formula is None):
+    density = given.density if given.density is not None else base.density if base else None
+    if density is None or (base is None and given.formula is None):
         raise SceneError(f"{where}: {name!r} is no known material; give formula and density (g/cm3)")
-    try:
-        if base is None or said.formula is not None:
-            base = of_formula(name, str(said.formula), density)
-        return replace(base, density=density, state_of_charge=said.state_of_charge, edge_shift_ev=said.edge_shift_ev)
-    except ValueError as error:
-        raise SceneError(f"{where}: {error}") from None
+    with located(where):
+        if base is None or given.formula is not None:
+            base = of_formula(name, str(given.formula), density)
+        return replace(base, density=density, state_of_charge=given.state_of_charge, edge_shift_ev=given.edge_shift_ev)

@@ -20,7 +20,7 @@ from typing import Any
 
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
-from simulators.frame.mapping import SceneError, build, items, keys, named, number
+from simulators.frame.mapping import build, located, named
 from simulators.light.beam import Beam
 from simulators.samples.composed.phantoms import build_sample
 from simulators.samples.sample import Sample
@@ -48,6 +48,18 @@ class Scene:
     scan: ScanSettings = field(default_factory=ScanSettings)
 
 
+@dataclass(frozen=True)
+class _SceneKeys:
+    """The keys of a scene's mapping; what a phantom or an effect holds depends on its kind."""
+
+    phantom: Any
+    beam: Beam
+    axis_offset_px: float = 0.0
+    effects: tuple[Any, ...] | None = None
+    detector: DetectorSettings = field(default_factory=DetectorSettings)
+    scan: ScanSettings = field(default_factory=ScanSettings)
+
+
 def load_scene(mapping: Mapping[str, Any], read: ReadVolume | None = None) -> Scene:
     """A scene from a mapping as YAML gives it; the keys are shown at the head of this module.
 
@@ -57,23 +69,13 @@ def load_scene(mapping: Mapping[str, Any], read: ReadVolume | None = None) -> Sc
     Raises:
         SceneError: an unknown or missing key, a wrong value, or effects in an order that physics does not allow.
     """
-    legal = ("phantom", "beam", "axis_offset_px", "effects", "detector", "scan")
-    mapping = keys("scene", mapping, legal=legal, needed=("phantom", "beam"))
-    beam = build(Beam, "scene.beam", mapping["beam"])
+    keys = build(_SceneKeys, "scene", mapping)
     effects = []
-    for i, entry in items("scene", "effects", mapping):
+    for i, entry in enumerate(keys.effects or ()):
         where = f"scene.effects[{i}]"
         kind, rest = named(where, list(CATALOGUE), entry)
         effects.append(build(load_effect(kind), f"{where} ({kind})", rest))
-    try:
+    with located("scene.effects"):
         chain = Chain.of(effects)
-    except ValueError as error:
-        raise SceneError(f"scene.effects: {error}") from None
-    return Scene(
-        sample=build_sample("scene.phantom", mapping["phantom"], beam, read),
-        beam=beam,
-        chain=chain,
-        axis_offset_px=number("scene.axis_offset_px", mapping.get("axis_offset_px", 0.0)),
-        detector=build(DetectorSettings, "scene.detector", mapping.get("detector", {})),
-        scan=build(ScanSettings, "scene.scan", mapping.get("scan", {})),
-    )
+    sample = build_sample("scene.phantom", keys.phantom, keys.beam, read)
+    return Scene(sample, keys.beam, chain, keys.axis_offset_px, keys.detector, keys.scan)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 
@@ -84,6 +85,8 @@ class Cathode:
     attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     seed: int = 0
 
+    default_materials: ClassVar[Mapping[str, str]] = MADE_OF
+
     def __post_init__(self) -> None:
         for name in ("diameter", "height", "wall_um", "size_um"):
             if not getattr(self, name) > 0:
@@ -113,8 +116,7 @@ class Cathode:
             raise ValueError(f"habits are shares, {MOST:g} at most in sum, got {dict(self.habits)}")
         if not (self.inner_radius > 0 and self.bed_height > 0):
             raise ValueError(f"nothing is left inside {self.diameter} x {self.height} mm for the cathode")
-        check_roles("made_of", MADE_OF, self.made_of)
-        check_roles("attenuation", MADE_OF, self.attenuation)
+        check_roles(self)
 
     @property
     def inner_radius(self) -> float:
@@ -127,13 +129,9 @@ class Cathode:
         return self.height - (self.collector_um + self.separator_um) * 1e-3
 
     @property
-    def materials(self) -> Mapping[str, str]:
-        return {**MADE_OF, **self.made_of}
-
-    @property
-    def greys(self) -> Mapping[str, float]:
-        """1/mm."""
-        return {**{role: value * 2 / self.diameter for role, value in GREY.items()}, **self.attenuation}
+    def default_attenuation(self) -> Mapping[str, float]:
+        """1/mm of each role, in a beam without energies."""
+        return {role: value * 2 / self.diameter for role, value in GREY.items()}
 
     def pieces(self) -> tuple[Piece, ...]:
         """The can, what is in it, and the grains.

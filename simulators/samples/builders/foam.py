@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
@@ -57,6 +58,8 @@ class Foam:
     attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     seed: int = 0
 
+    default_materials: ClassVar[Mapping[str, str]] = MADE_OF
+
     def __post_init__(self) -> None:
         if not min(self.diameter, self.height, *(self.edges or ())) > 0:
             raise ValueError(
@@ -82,18 +85,13 @@ class Foam:
                 f"n_holes must be {MOST_HOLES} and candidates {MOST_CANDIDATES} at most, got {self.n_holes} and "
                 f"{self.candidates}"
             )
-        check_roles("made_of", MADE_OF, self.made_of)
-        check_roles("attenuation", MADE_OF, self.attenuation)
+        check_roles(self)
 
     @property
-    def materials(self) -> Mapping[str, str]:
-        return {**MADE_OF, **self.made_of}
-
-    @property
-    def greys(self) -> Mapping[str, float]:
-        """1/mm."""
+    def default_attenuation(self) -> Mapping[str, float]:
+        """1/mm of each role, in a beam without energies."""
         width = self.diameter if self.edges is None else max(self.edges[:2])
-        return {"matter": GREY * 2 / width, "hole": 0.0, **self.attenuation}
+        return {"matter": GREY * 2 / width, "hole": 0.0}
 
     def pieces(self) -> tuple[Piece, ...]:
         """The matter and its holes, the largest first."""

@@ -1,9 +1,10 @@
-"""Piece: a solid with the part that it plays in a phantom."""
+"""Piece: a solid with its role in a phantom, and the settings that give a material or an attenuation to each role."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 from simulators.samples.bodies.solids import Solid
 
@@ -11,9 +12,9 @@ from simulators.samples.bodies.solids import Solid
 @dataclass(frozen=True)
 class Piece:
     """Attributes:
-    solid: its attenuation is not looked at.
-    role: what it is: "wall", "particle", ...; its label too.
-    instead_of: the role of what it displaces.
+    solid: its attenuation is ignored.
+    role: "wall", "particle", ...; also its label.
+    instead_of: the role of the piece that it displaces.
     """
 
     solid: Solid
@@ -21,7 +22,35 @@ class Piece:
     instead_of: str | None = None
 
 
-def check_roles(what: str, legal: Mapping[str, object], said: Mapping[str, object]) -> None:
-    """Raises ValueError where a scene speaks of a role that the phantom does not have."""
-    if unknown := [role for role in said if role not in legal]:
-        raise ValueError(f"{what}: {unknown[0]!r} is no part of this phantom; its parts are {', '.join(legal)}")
+class PieceBuilder(Protocol):
+    """Settings of a phantom made of pieces, as a frozen dataclass."""
+
+    default_materials: ClassVar[Mapping[str, str]]
+    """Material of each role, in a beam with energies."""
+
+    @property
+    def made_of(self) -> Mapping[str, str]:
+        """Materials of the scene, in place of defaults."""
+        ...
+
+    @property
+    def attenuation(self) -> Mapping[str, float]:
+        """1/mm by role, in place of defaults; where there are any, no role has a material."""
+        ...
+
+    @property
+    def default_attenuation(self) -> Mapping[str, float]:
+        """1/mm of each role, in a beam without energies."""
+        ...
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """All pieces. Raises ValueError where they cannot be placed."""
+        ...
+
+
+def check_roles(settings: PieceBuilder) -> None:
+    """Raises ValueError where the scene names a role that the phantom does not have."""
+    roles = settings.default_materials
+    for key, named in (("made_of", settings.made_of), ("attenuation", settings.attenuation)):
+        if unknown := [role for role in named if role not in roles]:
+            raise ValueError(f"{key}: {unknown[0]!r} is no part of this phantom; its parts are {', '.join(roles)}")

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import ClassVar
 
 from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Vector
 from simulators.samples.builders.piece import Piece, check_roles
@@ -47,6 +48,8 @@ class Resolution:
     made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
+    default_materials: ClassVar[Mapping[str, str]] = MADE_OF
+
     def __post_init__(self) -> None:
         if not min(*self.widths_um, *self.balls_um, self.star_height_um, 1.0) > 0:
             raise ValueError(f"widths, diameters and heights must be positive in um, got {self}")
@@ -64,18 +67,13 @@ class Resolution:
             raise ValueError(f"a group needs 2 bars and a star 3 spokes, got {self.bars} and {self.spokes}")
         if not (self.widths_um or self.balls_um or self.star_um):
             raise ValueError("a pattern needs widths_um, a star_um or balls_um")
-        check_roles("made_of", MADE_OF, self.made_of)
-        check_roles("attenuation", MADE_OF, self.attenuation)
+        check_roles(self)
 
     @property
-    def materials(self) -> Mapping[str, str]:
-        return {**MADE_OF, **self.made_of}
-
-    @property
-    def greys(self) -> Mapping[str, float]:
-        """1/mm."""
+    def default_attenuation(self) -> Mapping[str, float]:
+        """1/mm of each role, in a beam without energies."""
         radius = self._size()[0]
-        return {**{role: value / radius for role, value in GREY.items()}, **self.attenuation}
+        return {role: value / radius for role, value in GREY.items()}
 
     def pieces(self) -> tuple[Piece, ...]:
         """The carrier, and what it holds."""

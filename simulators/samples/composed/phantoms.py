@@ -1,16 +1,18 @@
-"""Phantoms: the sample that a scene's mapping names; a kind's module is imported when it is named."""
+"""Phantoms: the sample that a scene's mapping names; a kind's module is imported only when it is named."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
-from simulators.frame.mapping import SceneError, build, choose, items, keys, named
+from simulators.frame.mapping import SceneError, build, located, named
 from simulators.light.beam import Beam
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.builders.piece import Piece, PieceBuilder
 from simulators.samples.sample import Sample
 from simulators.samples.voxels.stored import ReadVolume
-
-Builder = Callable[[str, Mapping[str, Any], Beam], Sample]
 
 
 def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = None) -> Sample:
@@ -18,103 +20,94 @@ def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = N
 
     Args:
         where: path of the entry, for messages.
-        beam: what decides how materials attenuate.
-        read: reads a volume that the sample names; None: none can be named.
+        beam: its energies decide how materials attenuate.
+        read: reads the file of a volume; None: the sample cannot be a volume.
 
     Raises:
         SceneError: an unknown kind, a wrong value, or a sample that cannot be built.
     """
-    kind, rest = named(where, [*_BUILDERS, "volume"], entry)
-    if kind == "volume":
-        return _volume(f"{where} ({kind})", rest, read)
-    return _BUILDERS[kind](f"{where} ({kind})", rest, beam)
+    kind, mapping = named(where, list(_KINDS), entry)
+    where = f"{where} ({kind})"
+    with located(where):
+        return _KINDS[kind](where, mapping, beam, read)
 
 
-def _battery(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    from simulators.samples.bodies.phantom import Phantom
+def _battery(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
     from simulators.samples.builders.battery import Battery
 
-    settings = build(Battery, where, mapping)
-    try:
-        return Phantom.of(settings.solids())
-    except ValueError as error:
-        raise SceneError(f"{where}: {error}") from None
+    return Phantom.of(build(Battery, where, mapping).solids())
 
 
-def _solids(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    """Solids, each grey (`attenuation` in 1/mm) or of a `material`, and then perhaps `instead_of` another."""
-    mapping = keys(where, mapping, legal=("solids", "materials"), needed=("solids",))
-    entries = [(f"{where}.solids[{i}]", entry) for i, entry in items(where, "solids", mapping)]
-    said = {key for _, entry in entries if isinstance(entry, Mapping) for key in entry}
-    if "materials" in mapping or said & {"material", "instead_of"}:
-        from simulators.samples.composed.made_of import sample_made_of
+def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
+    from simulators.samples.composed.solids import sample_of_solids
 
-        return sample_made_of(where, entries, mapping.get("materials"), beam)
-    from simulators.samples.bodies.phantom import Phantom
-    from simulators.samples.bodies.solids import SOLIDS, kind_of
-
-    solids, names = [], []
-    for at, entry in entries:
-        own = {"name": str(entry["name"])} if isinstance(entry, Mapping) and "name" in entry else {}
-        solids.append(choose(at, SOLIDS, {key: entry[key] for key in entry if key != "name"} if own else entry))
-        names.append(own.get("name", kind_of(solids[-1])))
-    return Phantom.of(solids, names)
+    return sample_of_solids(where, mapping, beam)
 
 
-def _volume(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Sample:
+def _volume(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
     from simulators.samples.voxels.scene import VolumeSettings, voxels_of
 
     settings = build(VolumeSettings, where, mapping)
     if read is None:
-        raise SceneError(f"{where}: {settings.file} cannot be read: whoever opened the scene reads no volumes")
-    try:
-        return voxels_of(settings, read)
-    except ValueError as error:
-        raise SceneError(f"{where}: {error}") from None
+        raise ValueError(f"{settings.file} cannot be read: no reader of volume files was given")
+    return voxels_of(settings, read)
 
 
-def _cathode(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    from simulators.samples.builders.cathode import Cathode
+def _pieces(cls: str) -> _Builder:
+    """The builder of a phantom of pieces: they are materials in a beam with energies, unless the scene states their
+    attenuation."""
 
-    return _pieces(Cathode, where, mapping, beam)
-
-
-def _foam(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    from simulators.samples.builders.foam import Foam
-
-    return _pieces(Foam, where, mapping, beam)
-
-
-def _resolution(where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    from simulators.samples.builders.resolution import Resolution
-
-    return _pieces(Resolution, where, mapping, beam)
-
-
-def _pieces(kind: Any, where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:
-    """A phantom of parts that are materials in a beam with energies, unless it says how its parts attenuate."""
-    from simulators.samples.composed.pieces import grey, of_materials
-
-    settings = build(kind, where, {key: value for key, value in mapping.items() if key != "materials"})
-    try:
+    def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
+        kind = getattr(import_module(f"simulators.samples.builders.{cls.lower()}"), cls)
+        settings: PieceBuilder = build(kind, where, {key: mapping[key] for key in mapping if key != "materials"})
         pieces = settings.pieces()
         if beam.has_energy and not settings.attenuation:
-            return of_materials(where, pieces, settings.materials, mapping.get("materials"), beam)
+            material_of = {**settings.default_materials, **settings.made_of}
+            return _of_materials(where, pieces, material_of, mapping.get("materials"), beam)
         if settings.made_of or "materials" in mapping:
-            raise SceneError(
-                f"{where}: materials need a beam with energies (energy_kev), and no attenuation beside them"
-            )
-        return grey(pieces, settings.greys)
-    except SceneError:
-        raise
-    except ValueError as error:
-        raise SceneError(f"{where}: {error}") from None
+            raise SceneError(f"{where}: materials need a beam with energies (energy_kev) and no attenuation")
+        return _grey(pieces, {**settings.default_attenuation, **settings.attenuation})
+
+    return sample
 
 
-_BUILDERS: Mapping[str, Builder] = {
+def _grey(pieces: Sequence[Piece], attenuation: Mapping[str, float]) -> Sample:
+    """The pieces with an attenuation (1/mm) for each role, whatever the beam."""
+    solids = [
+        replace(piece.solid, attenuation=attenuation[piece.role] - attenuation.get(piece.instead_of or "", 0.0))
+        for piece in pieces
+    ]
+    return Phantom.of(solids, [piece.role for piece in pieces])
+
+
+def _of_materials(
+    where: str, pieces: Sequence[Piece], material_of: Mapping[str, str], materials: Any, beam: Beam
+) -> Sample:
+    """The pieces with a material for each role; `materials` are the scene's own, see simulators.light.palette."""
+    from simulators.light.palette import palette_of
+    from simulators.samples.composed.parts import Part, sample_of
+
+    palette = palette_of(f"{where}.materials", materials)
+    used = {role for piece in pieces for role in (piece.role, piece.instead_of) if role is not None}
+    found = {role: palette(material_of[role]) for role in sorted(used)}
+    parts = [
+        Part(
+            replace(piece.solid, attenuation=1.0),
+            found[piece.role],
+            found[piece.instead_of] if piece.instead_of else None,
+            piece.role,
+        )
+        for piece in pieces
+    ]
+    return sample_of(parts, beam, palette.filters)
+
+
+_Builder = Callable[[str, Mapping[str, Any], Beam, ReadVolume | None], Sample]
+_KINDS: Mapping[str, _Builder] = {
     "battery": _battery,
     "solids": _solids,
-    "cathode": _cathode,
-    "foam": _foam,
-    "resolution": _resolution,
+    "cathode": _pieces("Cathode"),
+    "foam": _pieces("Foam"),
+    "resolution": _pieces("Resolution"),
+    "volume": _volume,
 }

@@ -14,7 +14,7 @@ from beamline.simulate.energy_scan import open_energy_scan
 from beamline.xafs.edge import find_edge
 from beamline.xafs.series import take
 from drivers.clock import SystemClock
-from simulators.light.palette import palette
+from simulators.light.palette import palette_of
 
 SCENE: dict[str, Any] = {
     "phantom": {
@@ -41,7 +41,7 @@ def _scene(folder: Path, **changes: Any) -> str:
 def test_frames_are_beer_lambert_at_each_energy(tmp_path: Path) -> None:
     scan = open_energy_scan(_scene(tmp_path), ENERGIES)
     assert (scan.material, scan.name) == ("NMC811", "scene")
-    colours = palette("", SCENE["phantom"]["materials"])
+    colours = palette_of("", SCENE["phantom"]["materials"])
     bath, oxide = (colours(name).attenuation(ENERGIES) for name in ("electrolyte", "NMC811"))
     u = scan.scan.detector.u()
     chord = 2 * np.sqrt(0.06**2 - u**2, where=np.abs(u) < 0.06, out=np.zeros_like(u))
@@ -56,7 +56,7 @@ def test_harmonics_flatten_the_contrast(tmp_path: Path) -> None:
     clean = [frame for _, frame in open_energy_scan(_scene(tmp_path), ENERGIES).frames(ENERGIES)]
     dirty_beam = SCENE["beam"] | {"harmonics": {3: 0.05}}
     dirty = [frame for _, frame in open_energy_scan(_scene(tmp_path, beam=dirty_beam), ENERGIES).frames(ENERGIES)]
-    colours = palette("", SCENE["phantom"]["materials"])
+    colours = palette_of("", SCENE["phantom"]["materials"])
     oxide, bath = (colours(name).attenuation([8.3485, 3 * 8.3485]) for name in ("NMC811", "electrolyte"))
     expected = -np.log(np.array([0.95, 0.05]) @ np.exp(-0.01 * oxide - 0.11 * bath))
     assert dirty[1][16, 32] == pytest.approx(expected, abs=1e-3)
@@ -99,7 +99,7 @@ def test_energies_at_which_nothing_comes_through_are_left_out(tmp_path: Path) ->
     taken = take(open_energy_scan(path, energies).series(), lambda event: None, SystemClock(), lambda: False)
     assert taken.curve.energies.size >= 9 and taken.curve.energies.max() < 8.344
     assert taken.curve.left_out.min() > 8.335 and taken.curve.left_out.max() == pytest.approx(8.364)
-    expected = palette("", SCENE["phantom"]["materials"])("NMC811").attenuation(taken.curve.energies[:5])
+    expected = palette_of("", SCENE["phantom"]["materials"])("NMC811").attenuation(taken.curve.energies[:5])
     np.testing.assert_allclose(taken.curve.absorption[:5], expected, rtol=0.02)
 
 

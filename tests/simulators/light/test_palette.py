@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simulators.frame.mapping import SceneError
-from simulators.light.palette import known, palette
+from simulators.light.palette import known, palette_of
 
 # Densities as sold or as measured on crystals, in g/cm3, to a few per cent.
 DENSITIES = {
@@ -20,7 +20,7 @@ DENSITIES = {
 
 @pytest.mark.parametrize(("name", "density"), DENSITIES.items(), ids=DENSITIES)
 def test_a_material_needs_no_more_than_its_name(name: str, density: float) -> None:
-    material = palette("materials", None)(name)
+    material = palette_of("materials", None)(name)
     assert material.name == name
     assert material.density == pytest.approx(density, rel=0.01)
     assert sum(share for _, share in material.fractions) == pytest.approx(1.0, abs=1e-5)
@@ -28,21 +28,21 @@ def test_a_material_needs_no_more_than_its_name(name: str, density: float) -> No
 
 
 def test_the_digits_of_an_nmc_are_its_metals() -> None:
-    shares = dict(palette("materials", None)("NMC622").fractions)
+    shares = dict(palette_of("materials", None)("NMC622").fractions)
     moles = np.array([shares[28] / 58.693, shares[25] / 54.938, shares[27] / 58.933])
     np.testing.assert_allclose(moles / moles.sum(), [0.6, 0.2, 0.2], rtol=1e-4)
-    assert 25 not in dict(palette("materials", None)("NMC901").fractions)
+    assert 25 not in dict(palette_of("materials", None)("NMC901").fractions)
     assert known("NMC000") is None and known("NMC12") is None
 
 
 def test_the_electrolyte_is_one_molar() -> None:
     """Of one litre, 1300 g, 31 g are phosphorus."""
-    shares = dict(palette("materials", None)("electrolyte").fractions)
+    shares = dict(palette_of("materials", None)("electrolyte").fractions)
     assert shares[15] == pytest.approx(30.97 / 1300, rel=1e-3)
 
 
 def test_a_scene_changes_and_adds_materials() -> None:
-    colours = palette(
+    colours = palette_of(
         "materials",
         {"NMC811": {"state_of_charge": 0.5, "edge_shift_ev": 3.0}, "coating": {"formula": "Al2O3", "density": 3.95},
          "Al": {"density": 1.35}},
@@ -58,7 +58,7 @@ def test_a_scene_changes_and_adds_materials() -> None:
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ([], r"materials must be a mapping from names to what is said of them; got \[\]"),
+        ([], r"materials must be a mapping from names to the properties of materials; got \[\]"),
         ({"NMC811": 3}, "materials.NMC811 must be a mapping"),
         ({"NMC811": {"charge": 1}}, "materials.NMC811: key 'charge' is unknown; legal: formula, density, state_of"),
         ({"NMC811": {"state_of_charge": 2}}, "materials.NMC811: NMC811: state_of_charge must lie in 0 ... 1, got 2.0"),
@@ -71,11 +71,11 @@ def test_a_scene_changes_and_adds_materials() -> None:
 )
 def test_an_impossible_material_is_refused(entry: Any, words: str) -> None:
     with pytest.raises(SceneError, match=words):
-        palette("materials", entry)
+        palette_of("materials", entry)
 
 
 def test_an_unknown_name_is_told_the_known_ones() -> None:
     with pytest.raises(
-        SceneError, match=r"material 'mud' is unknown; known: glue, LiCoO2, .* NMC and three digits; or"
+        ValueError, match=r"material 'mud' is unknown; known: glue, LiCoO2, .* NMC and three digits; or"
     ):
-        palette("materials", {"glue": {"formula": "C2H4", "density": 1.1}})("mud")
+        palette_of("materials", {"glue": {"formula": "C2H4", "density": 1.1}})("mud")

@@ -120,7 +120,7 @@ def test_what_cannot_be_is_refused() -> None:
         ({"detector": {"binning": 3}}, "binning must be 1, 2 or 4, got 3"),
         ({"detector": {"electrons_per_count": 0}}, "electrons_per_count must be positive"),
         ({"detector": {"exposure_s": 0}}, "must be positive"),
-        ({"detector": {"readout": "fast"}}, "must be one of standard, ultra_quiet, photon_number, got 'fast'"),
+        ({"detector": {"readout": "fast"}}, "readout must be 'standard', 'ultra_quiet' or 'photon_number', got 'fast'"),
         ({"scan": {"views": 0}}, "views and period_s must be positive"),
         ({"scan": {"flats": 10**7}}, "views, darks and flats must be 1000000 at most"),
         ({"scan": {"range_deg": -1e9}}, "range_deg 1e6"),

@@ -11,7 +11,7 @@ import pytest
 
 from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
-from simulators.light.palette import palette
+from simulators.light.palette import palette_of
 from simulators.samples.sample import Sample
 from simulators.scenes.scene import load_scene
 
@@ -33,7 +33,7 @@ def test_a_scene_s_grain_stands_out_by_its_contrast() -> None:
     sample = _sample(BATH, GRAIN, GREY, materials=charged, energy_kev=8.3485)
     assert sample.names == ("electrolyte", "active", "wall")
     centre = sample.line_integrals(0.0, Detector.centred((1, 1), 0.01))[0, 0]
-    colours = palette("", charged)
+    colours = palette_of("", charged)
     oxide, bath = (float(colours(name).attenuation(8.3485)) for name in ("NMC811", "electrolyte"))
     assert centre == pytest.approx(0.2 * bath + 0.02 * (oxide - bath) + 0.02 * 2.0)
 
@@ -61,7 +61,7 @@ def test_tables_are_loaded_only_where_a_material_is_named() -> None:
     ("solids", "light", "words"),
     [
         ([BATH], {}, r"scene.phantom \(solids\): materials need the beam's energy"),
-        ([BATH | {"attenuation": 1.0}], {"energy_kev": 8}, r"solids\[0\]: attenuation and material say the same thing"),
+        ([BATH | {"attenuation": 1.0}], {"energy_kev": 8}, r"solids\[0\]: attenuation and material exclude each other"),
         ([BATH, GREY | {"material": "mud"}], {"energy_kev": 8}, r"solids\[1\]: attenuation and material"),
         ([BATH | {"material": "mud"}], {"energy_kev": 8}, r"solids\[0\]: material 'mud' is unknown"),
         ([BATH | {"material": 5}], {"energy_kev": 8}, r"solids\[0\]: material must be text"),
