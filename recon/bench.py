@@ -18,7 +18,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.footprints import HU, HV
 from recon.reconstruction import Method, reconstruct
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import Active, Gradients, Room, project, render_view, view_table
+from recon.splatting.splat import Active, Gradients, Scratch, project, render_view, view_table
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]
@@ -87,15 +87,15 @@ def kernel_timings(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: 
     active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], gaussians.density_unit)
     table = view_table(active, view, 0, _FAINT, _SIGMAS)
     pairs = float((2 * np.maximum(table[:, HU], 0) * 2 * np.maximum(table[:, HV], 0)).sum())
-    room, image = Room.of(n, view.detector_shape), np.empty(view.detector_shape, np.float32)
+    scratch, image = Scratch.of(n, view.detector_shape), np.empty(view.detector_shape, np.float32)
     slope = np.random.default_rng(1).normal(size=image.shape).astype(np.float32)
     into, centres = Gradients.zeros(n), np.empty((n, 2), np.float32)
-    seen = render_view(active, view, 0, _FAINT, _SIGMAS, image=image, room=room)
+    seen = render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch)
     return [
         timed("footprints", lambda: view_table(active, view, 0, _FAINT, _SIGMAS), now, repeats, pairs),
         timed(
             "forward",
-            lambda: render_view(active, view, 0, _FAINT, _SIGMAS, image=image, room=room),
+            lambda: render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch),
             now,
             repeats,
             pairs,

@@ -13,10 +13,9 @@ from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property
 from drivers.dcam.description import description
 from drivers.dcam.options import DcamOptions, TriggerMode
 from drivers.dcam.properties import Properties
-from drivers.dcam.ring import START_TIMEOUT, Ring
+from drivers.dcam.ring import START_TIMEOUT, Ring, require_stamps, seconds_of
 from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
-from drivers.dcam.stamps import require_stamps, seconds_of
 from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource

@@ -142,3 +142,27 @@ class Ring:
             )
         memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
         return np.ndarray((rows, cols), dtype="<u2", buffer=memoryview(memory), strides=(stride, 2)).copy()
+
+
+def seconds_of(frame: BufFrame) -> float:
+    """Timestamp of a frame in s, from an epoch of the camera's own."""
+    return float(frame.timestamp.seconds + 1e-6 * frame.timestamp.microseconds)
+
+
+def require_stamps(first: BufFrame, second: BufFrame, device: str) -> None:
+    """Check that the camera counted and dated two successive frames: without that, a lost frame could not be seen.
+
+    Raises:
+        DeviceError: the framestamps are not one apart, or the times do not grow.
+    """
+    if second.framestamp - first.framestamp == 1 and seconds_of(second) > seconds_of(first):
+        return
+    raise DeviceError(
+        device,
+        f"it does not count and date its frames: framestamps {first.framestamp}, {second.framestamp}, "
+        f"times {seconds_of(first):.6f} s, {seconds_of(second):.6f} s",
+        request="2 frames in free run",
+        expected="framestamps one apart and times that grow, without which a lost frame cannot be seen",
+        advice="Update the camera's firmware and the vendor's DCAM-API runtime",
+        state="Nothing was measured",
+    )

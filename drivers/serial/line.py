@@ -20,7 +20,7 @@ import serial
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, readable
-from drivers.serial.port import open_port
+from drivers.serial.ports import open_port
 from drivers.serial.transcript import Transcript
 
 QUIET = 0.05

@@ -1,3 +1,8 @@
-"""Compute kernels, each beside a readable twin in `reference`; nothing here knows files, clocks or devices."""
+"""Compute kernels: cpu (numba), gpu (Triton), and the reference implementation that both are tested against.
 
-from recon.base import threads as threads
+Nothing here knows files, clocks or devices.
+"""
+
+# Torch is imported before any numba kernel runs: both share the system's libgomp, and torch is 20 times slower where
+# numba's threads start first.
+import torch  # noqa: F401

@@ -19,7 +19,7 @@ from recon.kernels.cpu import losses as losses_cpu
 from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.adam import adam_all, add_lengths
 from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
-from recon.splatting.splat import Active, Gradients, RenderedView, Room, grid_layout, render_view
+from recon.splatting.splat import Active, Gradients, RenderedView, Scratch, grid_layout, render_view
 
 Array = TypeVar("Array")
 
@@ -133,7 +133,7 @@ class Cpu:
     """The numba kernels on numpy arrays."""
 
     def __init__(self) -> None:
-        self._room: tuple[tuple[int, tuple[int, int]], Room] | None = None
+        self._scratch: tuple[tuple[int, tuple[int, int]], Scratch] | None = None
 
     def array(self, values: F32) -> F32:
         return np.array(values, np.float32)
@@ -144,19 +144,19 @@ class Cpu:
     def begin(self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> CpuPass:
         return CpuPass(self, means, log_scales, quaternions, raw, unit)
 
-    def room(self, n: int, detector_shape: tuple[int, int]) -> Room:
-        """Memory for a view of n Gaussians; the last one again where it fits."""
-        if self._room is None or self._room[0] != (n, detector_shape):
-            self._room = ((n, detector_shape), Room.of(n, detector_shape))
-        return self._room[1]
+    def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:
+        """Scratch buffers for a view of n Gaussians; the last ones are used again where they fit."""
+        if self._scratch is None or self._scratch[0] != (n, detector_shape):
+            self._scratch = ((n, detector_shape), Scratch.of(n, detector_shape))
+        return self._scratch[1]
 
     def projection_loss(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE) -> CpuLoss:
         return CpuLoss(shape, ssim_weight, term)
 
     def misfit(self, image: F32, target: F32, weights: F32 | None) -> float:
         off = image - target if weights is None else weights * (image - target)
-        seen = target if weights is None else weights * target
-        power = float(np.vdot(seen, seen))
+        measured = target if weights is None else weights * target
+        power = float(np.vdot(measured, measured))
         return (float(np.vdot(off, off)) / power) ** 0.5 if power > 0 else 0.0
 
     def total_variation(self, volume: F32, weight: float) -> tuple[float, F32]:
@@ -190,8 +190,8 @@ class CpuPass:
         self.into = Gradients.zeros(raw.shape[0])
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> CpuView:
-        room = self._backend.room(len(self.active.densities), geometry.detector_shape)
-        return CpuView(render_view(self.active, geometry, view, faint, cut, model, room=room), self.into)
+        scratch = self._backend.scratch(len(self.active.densities), geometry.detector_shape)
+        return CpuView(render_view(self.active, geometry, view, faint, cut, model, scratch=scratch), self.into)
 
     def box(self, grid: Grid, faint: float, cut: float) -> CpuBox:
         return CpuBox(self, grid, faint, cut)
@@ -203,12 +203,12 @@ class CpuPass:
 class CpuView:
     """A view by the numba kernels."""
 
-    def __init__(self, seen: RenderedView, into: Gradients) -> None:
-        self._seen, self._into, self.image = seen, into, seen.image
+    def __init__(self, rendered: RenderedView, into: Gradients) -> None:
+        self._rendered, self._into, self.image = rendered, into, rendered.image
 
     def backward(self, gradient: F32) -> F32:
         centres = np.empty((len(self._into.densities), 2), np.float32)
-        self._seen.backward(gradient, self._into, centres)
+        self._rendered.backward(gradient, self._into, centres)
         return centres
 
 

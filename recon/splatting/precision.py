@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.kernels.reference import projection_loss
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
-from recon.splatting.losses import projection_loss
 from recon.splatting.splat import project, voxelize
 
 _VIEWS, _ROWS, _COLS, _GAUSSIANS = 12, 8, 32, 150  # the twin evaluates every Gaussian at every pixel

@@ -88,15 +88,23 @@ def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigm
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
-    """Memory that views of n Gaussians may share, one after the other: a step on 50k of them allocates several MB."""
+class Scratch:
+    """Scratch buffers for a view of n Gaussians; views rendered one after the other may share one.
+
+    New ones for each view would allocate several MB a step for 50 000 Gaussians.
+
+    Attributes:
+        table: float32 [n, 8], the footprints.
+        moments: float32 [n, 6], moments of the image gradient under each footprint.
+        layers: see `render_layers`.
+    """
 
     table: F32
     moments: F32
     layers: F32
 
     @classmethod
-    def of(cls, n: int, detector_shape: tuple[int, int]) -> Room:
+    def of(cls, n: int, detector_shape: tuple[int, int]) -> Scratch:
         return cls(footprint_table(n), np.empty((n, 6), np.float32), render_layers(*detector_shape))
 
 
@@ -106,9 +114,9 @@ class RenderedView:
 
     Attributes:
         image: line integrals [row, col].
-        active: the Gaussians; neither they nor `room` may change before `backward`.
+        active: the Gaussians; neither they nor `scratch` may change before `backward`.
         camera, length: the view, and what stands in for a ray's length in a Gaussian.
-        room: holds the table of footprints.
+        scratch: holds the table of footprints.
         exact, rays: positions of the Gaussians that are integrated ray by ray, and their rays (None: there are none).
     """
 
@@ -116,15 +124,15 @@ class RenderedView:
     active: Active
     camera: Camera
     length: float
-    room: Room
+    scratch: Scratch
     exact: NDArray[np.intp]
     rays: Rays | None
 
     def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
         """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
-        a, table = self.active, self.room.table
+        a, table = self.active, self.scratch.table
         footprints_backward(
-            table, moments(table, gradient, self.room.moments), a.means, a.scales, a.rotations, a.densities,
+            table, moments(table, gradient, self.scratch.moments), a.means, a.scales, a.rotations, a.densities,
             self.camera, into.means, into.log_scales, into.rotations, into.densities, centres, length=self.length,
         )  # fmt: skip
         if self.rays is None:
@@ -147,29 +155,29 @@ def render_view(
     model: RayModel | None = None,
     *,
     image: F32 | None = None,
-    room: Room | None = None,
+    scratch: Scratch | None = None,
 ) -> RenderedView:
     """Line integrals of one view into `image` [row, col] (overwritten; None makes one); `faint` in its units.
 
-    `room` is overwritten, too: a view that shares it has to be done with before the next one.
+    `scratch` is overwritten too: a view that shares it must have run `backward` before the next one is rendered.
     """
     chosen, shape, a = model or RayModel(), geometry.detector_shape, active
     picture = np.empty(shape, np.float32) if image is None else image
-    space = Room.of(len(a.densities), shape) if room is None else room
-    seen, length = camera(geometry, view), chosen.length(geometry)
+    buffers = Scratch.of(len(a.densities), shape) if scratch is None else scratch
+    projection, length = camera(geometry, view), chosen.length(geometry)
     footprints(
-        a.means, a.scales, a.rotations, a.densities, seen, faint, sigmas, space.table,
+        a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, buffers.table,
         length=length, exact_above=chosen.exact_above,
     )  # fmt: skip
-    render(space.table, picture, space.layers)
+    render(buffers.table, picture, buffers.layers)
     exact, rays = np.empty(0, np.intp), None
     if geometry.is_cone and chosen.exact_above < math.inf:
-        exact = np.flatnonzero(space.table[:, HU] == INEXACT)
+        exact = np.flatnonzero(buffers.table[:, HU] == INEXACT)
     if exact.size:
         some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
-        rays = Rays(*some, seen, shape, faint, sigmas)
+        rays = Rays(*some, projection, shape, faint, sigmas)
         rays.add_to(picture)
-    return RenderedView(picture, active, seen, length, space, exact, rays)
+    return RenderedView(picture, active, projection, length, buffers, exact, rays)
 
 
 class _Project(torch.autograd.Function):
@@ -180,10 +188,10 @@ class _Project(torch.autograd.Function):
     ) -> Tensor:  # fmt: skip
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
-        shared, views = Room.of(len(active.densities), geometry.detector_shape), []
+        shared, views = Scratch.of(len(active.densities), geometry.detector_shape), []
         for view, image in enumerate(images):  # each keeps its own table until it goes back
-            room = replace(shared, table=footprint_table(len(active.densities)))
-            views.append(render_view(active, geometry, view, faint, cut, model, image=image, room=room))
+            scratch = replace(shared, table=footprint_table(len(active.densities)))
+            views.append(render_view(active, geometry, view, faint, cut, model, image=image, scratch=scratch))
         ctx.state = (_array(quaternions), _array(raw), unit, views)
         return torch.from_numpy(images)
 

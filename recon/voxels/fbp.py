@@ -15,9 +15,9 @@ from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 from scipy import fft
 
-from recon.base import threads as threads  # torch before the first numba thread
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.kernels.cpu.activation import OPTIONS
 from recon.voxels.view_weights import ray_weights
 
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
@@ -67,7 +67,7 @@ def filter_projections(
     return fft.irfft(spectrum, n, axis=-1, workers=get_num_threads())[..., :cols]
 
 
-@njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
+@njit(**OPTIONS)
 def _back_project(filtered, cosines, sines, axis_cols, x, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """out[z, y, x] = Σ_view filtered[view, u(x, y), z] by linear interpolation; x and y in pixels."""
     views, cols, nz = filtered.shape

@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from recon.base import threads as threads  # torch before the first numba thread
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, OPTIONS

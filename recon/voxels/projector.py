@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base import threads as threads  # torch before the first numba thread
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
+from recon.kernels.reference import total_variation
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.losses import total_variation
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from tests.recon.helpers import in_double

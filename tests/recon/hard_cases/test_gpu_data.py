@@ -12,9 +12,9 @@ from recon.base.geometry import Geometry
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm
+from recon.kernels.reference import projection_loss
 from recon.splatting import optimise as fit
 from recon.splatting.backend import backend_for
-from recon.splatting.losses import projection_loss
 from recon.splatting.settings import FitSettings
 from tests.recon.hard_cases.measure import STEP
 from tests.recon.hard_cases.on_gpu import DEVICE, quiet, some

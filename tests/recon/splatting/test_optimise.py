@@ -11,11 +11,11 @@ import torch
 from recon.base.geometry import Geometry
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
+from recon.kernels.reference import projection_loss
+from recon.kernels.reference import total_variation as twin_tv
 from recon.splatting import optimise as fit
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.losses import projection_loss
-from recon.splatting.losses import total_variation as twin_tv
 from recon.splatting.settings import NAMES, FitSettings, growth
 from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make

@@ -14,7 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import Active, Gradients, Room, project, render_view, voxelize
+from recon.splatting.splat import Active, Gradients, Scratch, project, render_view, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
 
@@ -156,12 +156,12 @@ def test_views_that_share_memory_give_what_views_of_their_own_give(
     views, model = PATHS["cone, some exact"]
     a = random_gaussians().arrays()
     active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], 0.7)
-    room, y = Room.of(40, SHAPE), rng.normal(size=SHAPE).astype(np.float32)
+    buffers, y = Scratch.of(40, SHAPE), rng.normal(size=SHAPE).astype(np.float32)
     for view in range(views.n_views):
         found = []
-        for space in (room, None):
+        for scratch in (buffers, None):
             into, centres = Gradients.zeros(40), np.empty((40, 2), np.float32)
-            seen = render_view(active, views, view, 1e-6, 3.5, model, room=space)
+            seen = render_view(active, views, view, 1e-6, 3.5, model, scratch=scratch)
             seen.backward(y, into, centres)
             found.append((seen.image, into.means, into.log_scales, into.rotations, into.densities, centres))
         for shared, own in zip(*found, strict=True):

@@ -8,8 +8,8 @@ import torch
 from skimage.metrics import structural_similarity
 
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm, ProjectionLoss, total_variation
-from recon.splatting.losses import data_term, projection_loss, ssim
-from recon.splatting.losses import total_variation as twin_total_variation
+from recon.kernels.reference import data_term, projection_loss, ssim
+from recon.kernels.reference import total_variation as twin_total_variation
 
 
 def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tuple[np.ndarray, np.ndarray]:

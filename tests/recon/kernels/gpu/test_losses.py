@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
+from recon.kernels.reference import projection_loss
+from recon.kernels.reference import total_variation as twin_total_variation
 from recon.splatting.backend import Cpu, backend_for
-from recon.splatting.losses import projection_loss
-from recon.splatting.losses import total_variation as twin_total_variation
 from tests.recon.kernels.gpu.on_gpu import DEVICE
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
