@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from beamline.report.html import METRICS, formatted
+from beamline.report.metrics import METRICS, formatted
 
 
 def results(data: Mapping[str, Any]) -> str:

@@ -87,7 +87,7 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
 def measure(
     volume: Volume, prepared: Prepared, truth: Volume | None, mask: NDArray[np.int8] | None
 ) -> dict[str, float]:
-    """Figures of merit by the names of beamline.report.html.METRICS.
+    """Figures of merit by the names of beamline.report.metrics.METRICS.
 
     With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. Always: the residual
     in up to 16 of the views used, and in the views held out where there are any.

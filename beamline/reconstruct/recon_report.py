@@ -13,7 +13,8 @@ import numpy as np
 from beamline.projections.prepare import Prepared
 from beamline.projections.selection import Selection
 from beamline.report import figures
-from beamline.report.html import METRICS, Picture, Report, formatted
+from beamline.report.html import Picture, Report
+from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, judged_by
 from beamline.storage.readers.open import ScanSource
 from beamline.storage.writers.recon_file import Value

@@ -1,4 +1,4 @@
-"""What a trade-off found: the table as text, CSV, JSON and a page, with the pictures of its Pareto fronts."""
+"""The results of a trade-off: a table as text, CSV, JSON and HTML page, with pictures of its Pareto fronts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -15,46 +15,59 @@ from typing import Any
 from beamline.core.files import named_on_failure, whole_file
 from beamline.core.machine import machine_line
 from beamline.core.version import version
-from beamline.report.html import METRICS, Picture, page, picture_html, table_html
+from beamline.report.html import Picture, render
+from beamline.report.metrics import METRICS
 from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
-from beamline.tradeoff.table import Table
+from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
 from beamline.tradeoff.trials import Outcome
 from recon.assess.time_model import parts_of
 
 _FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
-_COLUMNS = 120
-_SHORT = {"psnr": "PSNR", "ssim3d": "SSIM", "residual_held_out": "held out", "resolution": "FSC"}
-_LONG = {
-    "psnr": "dB against the truth",
-    "ssim3d": "mean over the slices of three directions",
-    "residual_held_out": "residual of views held out",
-    "resolution": "period in {} to which two halves of the views agree",
+_WIDTH = 120  # characters
+
+
+@dataclass(frozen=True)
+class _Column:
+    """How the tables name a metric. `{}` in `heading` and `legend` is the unit of length."""
+
+    short: str
+    heading: str
+    legend: str
+
+
+_COLUMNS = {
+    "psnr": _Column("PSNR", "PSNR (dB)", "dB against the truth"),
+    "ssim3d": _Column("SSIM", "SSIM 3D", "mean over the slices of three directions"),
+    "residual_held_out": _Column("held out", "held-out res.", "residual of views held out"),
+    "resolution": _Column("FSC", "FSC ({})", "period in {} to which two halves of the views agree"),
 }
 
 
-def text(table: Table) -> str:
-    """The table for people; * marks what no other trial beats in both time and quality."""
+def text(table: TrialTable) -> str:
+    """The table for people; * marks the trials that no other beats in both time and quality."""
     lines = [machine_line(dict(table.machine)), ""]
     shown = [o for o in table.outcomes if o.trial.group != "precision"]
     width = max((len(outcome.trial.label) for outcome in shown), default=5)
     names = _metric_names(table)
-    lines.append(f"  {'trial':<{width}}{'s':>8}{'CPU s':>8}{'MB':>6}" + "".join(f"{_SHORT[n]:>9}" for n in names))
-    best = {table.compared[i].trial for i in table.front("seconds")}
+    lines.append(
+        f"  {'trial':<{width}}{'s':>8}{'CPU s':>8}{'MB':>6}" + "".join(f"{_COLUMNS[n].short:>9}" for n in names)
+    )
+    best = {table.compared[i].trial for i in table.front(TIME)}
     for outcome in table.outcomes:
         if outcome.trial.group == "precision" and outcome.status == "done":
             continue
         mark = "*" if outcome.trial in best else " "
         row = f"{mark} {outcome.trial.label:<{width}}"
         if outcome.status == "done":
-            row += f"{_time(outcome.seconds):>8}{_time(outcome.cpu_seconds):>8}{_megabytes(outcome):>6}"
-            row += "".join(f"{_cell(n, outcome):>9}" for n in names)
+            widths = (8, 8, 6, *(9 for _ in names))
+            row += "".join(f"{cell:>{n}}" for cell, n in zip(_cells(outcome, names), widths, strict=True))
         else:
             row += f"  {outcome.status}" + (f": {outcome.message}" if outcome.message else "")
         lines.append(row)
-    legend = "; ".join(f"{_SHORT[n]}: {_LONG[n].format(table.length_unit)}" for n in names)
-    said = [*([f"{legend}."] if legend else []), "*: on the front of time and quality.", *conclusions(table)]
-    return "\n".join([*lines, "", *(fill(line, _COLUMNS, subsequent_indent="  ") for line in said)])
+    legend = "; ".join(f"{_COLUMNS[n].short}: {_COLUMNS[n].legend.format(table.length_unit)}" for n in names)
+    notes = [*([f"{legend}."] if legend else []), "*: on the front of time and quality.", *conclusions(table)]
+    return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
 
 
 def _time(seconds: float) -> str:
@@ -67,26 +80,26 @@ def _time(seconds: float) -> str:
     return f"{seconds:.{max(0, digits)}f}"
 
 
-def _said(seconds: float) -> str:
-    """A time to three significant digits, in the unit that suits it."""
+def _duration(seconds: float) -> str:
+    """A time to three significant digits, in µs, ms, or the units of `parts_of`."""
     for unit, name in ((1e-3, "µs"), (1.0, "ms")):
         if 0 < seconds < unit:
             return f"{seconds / unit * 1e3:.3g} {name}"
     return parts_of(seconds)
 
 
-def conclusions(table: Table) -> list[str]:
-    """Sentences: what each further dB costs along the front, and what float32 costs."""
-    compared, qualities, seconds = table.compared, table.qualities, table.costs("seconds")
-    kept = table.front("seconds")
+def conclusions(table: TrialTable) -> list[str]:
+    """Sentences: the time of each further dB along the front, and the error and time of float32."""
+    compared, qualities, seconds = table.compared, table.qualities, table.costs(TIME)
+    kept = table.front(TIME)
     out = [f"Quality: {table.quality_name}, dB."]
     if not kept:
         return [*out, "No trial has both a time and a quality."]
     first = compared[kept[0]]
-    out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_said(first.seconds)}.")
+    out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
     for stretch in pareto.steps(kept, seconds, qualities):
         out.append(
-            f"+{stretch.gain:.2f} dB for {_said(stretch.cost)} more ({_said(stretch.per_decibel)} a dB): "
+            f"+{stretch.gain:.2f} dB for {_duration(stretch.cost)} more ({_duration(stretch.per_decibel)} a dB): "
             f"{compared[stretch.end].trial.label}."
         )
     out += [_precision(o.details) for o in table.outcomes if o.trial.group == "precision" and o.details]
@@ -95,15 +108,15 @@ def conclusions(table: Table) -> list[str]:
 
 def _precision(details: Mapping[str, float]) -> str:
     return (
-        "The same small fit in float32 and in the float64 twin: residual "
+        "The same small fit in float32 and in the float64 reference implementation: residual "
         f"{details['residual_float32']:.5f} and {details['residual_float64']:.5f}, volumes "
-        f"{details['difference']:.2g} apart (relative RMS), {_said(details['seconds_float32'])} and "
-        f"{_said(details['seconds_float64'])}."
+        f"{details['difference']:.2g} apart (relative RMS), {_duration(details['seconds_float32'])} and "
+        f"{_duration(details['seconds_float64'])}."
     )
 
 
-def write_table(folder: Path, table: Table) -> None:
-    """tradeoff.csv and tradeoff.json, each whole, in place of earlier ones."""
+def write_table(folder: Path, table: TrialTable) -> None:
+    """Write tradeoff.csv and tradeoff.json, each completely, in place of earlier ones."""
     record = {
         "format": "splatline tradeoff 1",
         "version": version(),
@@ -113,15 +126,15 @@ def write_table(folder: Path, table: Table) -> None:
         "quality": table.by,
         "length_unit": table.length_unit,
         "trials": [outcome.as_record() for outcome in table.outcomes],
-        "front_seconds": [table.compared[i].trial.label for i in table.front("seconds")],
-        "front_memory": [table.compared[i].trial.label for i in table.front("memory")],
+        "front_seconds": [table.compared[i].trial.label for i in table.front(TIME)],
+        "front_memory": [table.compared[i].trial.label for i in table.front(MEMORY)],
     }
     _write(folder / "tradeoff.json", json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False))
     _write(folder / "tradeoff.csv", to_csv(table))
 
 
-def to_csv(table: Table) -> str:
-    """One line a trial; empty where there is no figure."""
+def to_csv(table: TrialTable) -> str:
+    """One line for each trial; a value that is not known is empty."""
     names = _metric_names(table)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -136,85 +149,81 @@ def to_csv(table: Table) -> str:
     return out.getvalue()
 
 
-def write_figures(folder: Path, table: Table) -> None:
-    """The pictures and the page; nothing where no trial was made."""
+def write_figures(folder: Path, table: TrialTable) -> None:
+    """Write the pictures, as far as there are data for them, and the page."""
     pictures = []
-    for cost, title in (("seconds", "Quality against time"), ("memory", "Quality against memory")):
+    for cost in (TIME, MEMORY):
         if table.front(cost):
             caption = (
-                f"{table.quality_name} of every trial against its {'time' if cost == 'seconds' else 'peak memory'}; "
-                "the line is the best that can be had for so much, its corners the trials that no other beats in both."
+                f"{table.quality_name} of every trial against its {cost.words}. The line is the best quality "
+                "at each cost; its corners are the trials that no other beats in both."
             )
-            pictures.append((f"quality_{cost}.png", Picture(title, caption, _pareto(table, cost))))
+            picture = Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
+            pictures.append((f"quality_{cost.name}.png", picture))
     curves = [o for o in table.compared if o.trial.group == "method" and len(o.curve) > 1]
     if curves:
         caption = (
-            "−20 log₁₀ of the residual that each baseline recorded while it ran: solid where it is of views held out, "
-            "dashed where of the views used, which falls on when the volume already follows their noise. A fit's is "
-            "that of its Gaussians, which may lie between voxels and beyond the volume, by which the table judges."
+            "−20 log₁₀ of the residual that each baseline recorded during its run. Solid: views held out. Dashed: "
+            "views used; this residual still falls when the volume already fits their noise. A fit's residual is that "
+            "of its Gaussians, which may lie between voxels and outside the volume; the table judges the volume."
         )
-        pictures.append(("curves.png", Picture("Each method's own curve", caption, cost_curves(curves))))
+        pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
     for name, picture in pictures:
         with named_on_failure(folder / name), whole_file(folder / name, replace=True) as partial:
             partial.write_bytes(picture.png)
     _write(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]))
 
 
-def _pareto(table: Table, cost: str) -> bytes:
-    scale, unit = (1.0, "time (s)") if cost == "seconds" else (1e-6, "peak memory of the process (MB)")
+def _pareto(table: TrialTable, cost: Cost) -> bytes:
+    points = zip(table.compared, table.costs(cost), table.qualities, strict=True)
     return pareto_plot(
-        [(o.trial, c * scale, q) for o, c, q in zip(table.compared, table.costs(cost), table.qualities, strict=True)],
+        [(outcome.trial, value * cost.scale, quality) for outcome, value, quality in points],
         table.front(cost),
-        unit,
+        cost.axis,
         "PSNR (dB)" if table.by == "psnr" else "held-out residual (dB below the data)",
     )
 
 
-def to_html(table: Table, pictures: Sequence[Picture]) -> str:
+def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
     """The page."""
     names = _metric_names(table)
-    best = {table.compared[i].trial for i in table.front("seconds")}
-    head = "".join(
-        f"<th scope='col'>{escape(h)}</th>" for h in ("s", "CPU s", "MB", *(_heading(n, table) for n in names))
+    on_front = {table.compared[i].trial for i in table.front(TIME)}
+    return render(
+        "tradeoff.html",
+        title="What accuracy costs",
+        summary=f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}.",
+        conclusions=conclusions(table),
+        pictures=pictures,
+        columns=["s", "CPU s", "MB", *(_COLUMNS[n].heading.format(table.length_unit) for n in names)],
+        rows=[
+            {
+                "label": outcome.trial.label,
+                "on_front": outcome.trial in on_front,
+                "cells": _cells(outcome, names),
+                "reason": f"{outcome.status}: {outcome.message}".rstrip(": "),
+            }
+            for outcome in table.outcomes
+            if outcome.trial.group != "precision"
+        ],
+        scan=table.scan,
+        command=table.command,
     )
-    rows = []
-    for o in table.outcomes:
-        if o.trial.group == "precision":
-            continue
-        label = escape(o.trial.label)
-        label = f"<strong>{label}</strong>" if o.trial in best else label
-        if o.status == "done":
-            cells = "".join(
-                f"<td>{escape(c)}</td>"
-                for c in (_time(o.seconds), _time(o.cpu_seconds), _megabytes(o), *(_cell(n, o) for n in names))
-            )
-        else:
-            why = escape(f"{o.status}: {o.message}".rstrip(": "))
-            cells = f"<td colspan='{len(names) + 3}'>{why}</td>"
-        rows.append(f"<tr><th scope='row'>{label}</th>{cells}</tr>")
-    body = "".join(rows)
-    summary = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
-    sections = [
-        f"<h1>What accuracy costs</h1>\n<p class='summary'>{escape(summary)}</p>",
-        "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in conclusions(table)) + "</ul>",
-        *(picture_html(picture) for picture in pictures),
-        "<h2>Trials</h2>\n<p>Bold: on the front of time and quality.</p>\n"
-        f"<table class='metrics'><thead><tr><td></td>{head}</tr></thead>\n<tbody>{body}</tbody></table>",
-        "<h2>Scan</h2>\n" + table_html(table.scan),
-        f"<h2>To repeat</h2>\n<pre><code>{escape(table.command)}</code></pre>",
+
+
+def _cells(outcome: Outcome, names: Sequence[str]) -> list[str]:
+    """The measured values of a trial; none where it failed."""
+    if outcome.status != "done":
+        return []
+    return [
+        _time(outcome.seconds),
+        _time(outcome.cpu_seconds),
+        _megabytes(outcome),
+        *(_cell(name, outcome) for name in names),
     ]
-    return page("What accuracy costs", sections)
 
 
-def _metric_names(table: Table) -> list[str]:
-    order = ("psnr", "ssim3d", "residual_held_out", "resolution")
-    return [name for name in order if any(name in o.metrics for o in table.outcomes)]
-
-
-def _heading(name: str, table: Table) -> str:
-    if name == "resolution":
-        return f"FSC ({table.length_unit})"
-    return {"psnr": "PSNR (dB)", "ssim3d": "SSIM 3D", "residual_held_out": "held-out res."}[name]
+def _metric_names(table: TrialTable) -> list[str]:
+    return [name for name in _COLUMNS if any(name in o.metrics for o in table.outcomes)]
 
 
 def _cell(name: str, outcome: Outcome) -> str:
@@ -231,7 +240,7 @@ def _megabytes(outcome: Outcome) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Plain values for JSON and CSV; what is not finite becomes None."""
+    """Plain values for JSON and CSV; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(k): finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -23,7 +23,7 @@ from beamline.reconstruct.recon_report import facts_of
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.report import write_figures, write_table
-from beamline.tradeoff.table import Table
+from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Depth, Outcome, Timed, plan, seconds_left
 from drivers.clock import Clock
 from recon.base.volume import Grid
@@ -62,7 +62,7 @@ class TradeoffOptions:
 
 def run_tradeoff(
     options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic
-) -> Table:
+) -> TrialTable:
     """Make all trials, and leave table, pictures and page in the folder. The event `done` says where.
 
     The table in the folder is complete after every trial, so that whatever ends this leaves what was measured. Where
@@ -91,7 +91,7 @@ def run_tradeoff(
         default_count(Grid.of_field(data.geometry, grid.voxel_size)),
         options.depth,
     )
-    table = Table(
+    table = TrialTable(
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
         by="psnr" if truth is not None else "residual_held_out",
         length_unit=prepared.length_unit,
@@ -147,8 +147,8 @@ def split(prepared: Prepared, truth: Any) -> Data:
 
 
 def _each(
-    table: Table, work: Path, options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float]
-) -> Iterator[Table]:
+    table: TrialTable, work: Path, options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float]
+) -> Iterator[TrialTable]:
     """The table after each trial, and after one that Ctrl-C cut off."""
     begin = now()
     timed: list[Timed] = []
@@ -169,4 +169,4 @@ def _each(
         timed.append(Timed.of(result, now() - started))
         table = table.with_outcome(index, result)
         yield table
-        sink(Event("trial", clock.now(), {"n": index + 1, "of": len(table.outcomes), **table.told(result)}))
+        sink(Event("trial", clock.now(), {"n": index + 1, "of": len(table.outcomes), **table.event_data(result)}))

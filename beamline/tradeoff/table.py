@@ -1,9 +1,9 @@
-"""Table of a trade-off: all its trials with what became of them, and which of them are on the front of a cost."""
+"""All trials of a trade-off with their outcomes, and which of them are on the Pareto front of a cost."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,17 +12,43 @@ from beamline.tradeoff.trials import Outcome
 
 
 @dataclass(frozen=True)
-class Table:
-    """All trials of a trade-off and what they were made on.
+class Cost:
+    """A cost of a trial, and how a picture shows it.
+
+    Attributes:
+        name: in file names.
+        words: in titles and captions.
+        axis: label with its unit.
+        scale: from the value to that unit.
+        of: the cost of an outcome; NaN where it is not known.
+    """
+
+    name: str
+    words: str
+    axis: str
+    scale: float
+    of: Callable[[Outcome], float]
+
+
+TIME = Cost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds)
+MEMORY = Cost(
+    "memory", "memory", "peak memory of the process (MB)", 1e-6,
+    lambda outcome: math.nan if outcome.peak_bytes is None else float(outcome.peak_bytes),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrialTable:
+    """All trials of a trade-off, with the scan and the machine that they ran on.
 
     Attributes:
         outcomes: in the order of the plan.
-        by: what quality means: "psnr" or "residual_held_out", as dB either way.
+        by: the measure of quality: "psnr" or "residual_held_out", both as dB.
         length_unit: of the resolution, "mm" or "px".
         machine: of `beamline.core.machine.machine`.
         scan: facts for people, by name.
-        command: that repeats it.
-        stopped: somebody ended it before all trials were done.
+        command: the command that repeats the trade-off.
+        stopped: it was interrupted before all trials were done.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -33,7 +59,7 @@ class Table:
     command: str
     stopped: bool = False
 
-    def with_outcome(self, index: int, outcome: Outcome) -> Table:
+    def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
 
     @property
@@ -42,7 +68,7 @@ class Table:
 
     @property
     def compared(self) -> tuple[Outcome, ...]:
-        """The trials that reconstruct the scan and did it."""
+        """The trials that reconstructed the scan successfully."""
         return tuple(o for o in self.outcomes if o.status == "done" and o.trial.group != "precision")
 
     @property
@@ -54,20 +80,19 @@ class Table:
     def quality_name(self) -> str:
         return "PSNR" if self.by == "psnr" else "−20 log₁₀ of the held-out residual"
 
-    def front(self, cost: str) -> list[int]:
-        """Positions in `compared` that are on the front of `cost`: "seconds" or "memory".
+    def costs(self, cost: Cost) -> list[float]:
+        """The cost of each trial in `compared`."""
+        return [cost.of(outcome) for outcome in self.compared]
 
-        Costs to 1 %: below that it is chance which of two trials was the cheaper one.
+    def front(self, cost: Cost) -> list[int]:
+        """Positions in `compared` of the trials on the front of quality and `cost`.
+
+        Costs are compared to 1 %: smaller differences between two trials are chance.
         """
         return pareto.front([pareto.rounded(value) for value in self.costs(cost)], self.qualities)
 
-    def costs(self, cost: str) -> list[float]:
-        if cost == "seconds":
-            return [outcome.seconds for outcome in self.compared]
-        return [math.nan if o.peak_bytes is None else float(o.peak_bytes) for o in self.compared]
-
-    def told(self, outcome: Outcome) -> dict[str, Any]:
-        """One trial, for an event; `gaussians` are those at its start, as in its settings."""
+    def event_data(self, outcome: Outcome) -> dict[str, Any]:
+        """One trial, as the data of an event; `gaussians` are those at its start, as in its settings."""
         return {
             **asdict(outcome.trial),
             "label": outcome.trial.label,

@@ -11,10 +11,12 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from jinja2 import UndefinedError
 
 from beamline.core.errors import DataError
 from beamline.report import figures
-from beamline.report.html import METRICS, Picture, Report, formatted, to_html, write_report
+from beamline.report.html import Picture, Report, render, to_html, write_report
+from beamline.report.metrics import METRICS, formatted
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
@@ -89,10 +91,10 @@ def test_page_nests_is_self_contained_and_escapes() -> None:
 
 def test_metrics_stand_in_their_method_column() -> None:
     page = to_html(_report())
-    row = re.search(r"<tr><th scope='row'>PSNR.*?</tr>", page)
+    row = re.search(r'<tr><th scope="row">PSNR.*?</tr>', page)
     assert row is not None
     assert re.findall(r"<td>(.*?)</td>", row[0]) == ["25.12 dB", "31.46 dB"]
-    row = re.search(r"<tr><th scope='row'>SSIM 3D.*?</tr>", page)
+    row = re.search(r'<tr><th scope="row">SSIM 3D.*?</tr>', page)
     assert row is not None
     assert re.findall(r"<td>(.*?)</td>", row[0]) == ["–", "0.9000"]
     assert "NRMSE" not in page
@@ -103,6 +105,11 @@ def test_flags_are_counted_and_listed() -> None:
     assert "2 flags" in text
     assert "axis <not> confident" in text
     assert "No flags" in "".join(_parsed(to_html(_report())).text)
+
+
+def test_a_template_without_one_of_its_values_is_no_page() -> None:
+    with pytest.raises(UndefinedError, match="report"):
+        render("report.html", title="t", summary="s", scan={}, rows=[])
 
 
 def test_every_metric_formats() -> None:

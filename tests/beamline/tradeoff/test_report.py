@@ -13,15 +13,15 @@ import pytest
 
 from beamline.core.machine import machine
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
-from beamline.tradeoff.table import Table
+from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Depth, Outcome, Trial, plan
 
 BASE = Trial("method", "fbp", 10)
 FIT = Trial("method", "r2", 10, steps=100, gaussians=2000)
 
 
-def _table(*outcomes: Outcome, by: str = "psnr") -> Table:
-    return Table(outcomes, by, "mm", machine(), {"file": "a <b>.h5"}, "beamline tradeoff 'a <b>.h5'")
+def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
+    return TrialTable(outcomes, by, "mm", machine(), {"file": "a <b>.h5"}, "beamline tradeoff 'a <b>.h5'")
 
 
 def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
@@ -37,7 +37,7 @@ def test_the_table_fits_into_120_columns(depth: Depth) -> None:
         Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4)
         for trial in plan(methods, 1801, 200_000, depth)
     )
-    said = text(Table(outcomes, "psnr", "mm", machine(), {}, ""))
+    said = text(TrialTable(outcomes, "psnr", "mm", machine(), {}, ""))
     rows = said.split("\n\n")[1].splitlines()[1:]
     assert len(rows) == sum(o.trial.group != "precision" for o in outcomes)
     assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's

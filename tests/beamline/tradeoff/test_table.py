@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from beamline.core.machine import machine
-from beamline.tradeoff.table import Table
+from beamline.tradeoff.table import MEMORY, TIME, TrialTable
 from beamline.tradeoff.trials import Outcome, Trial
 
 
@@ -15,6 +15,6 @@ def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
         Outcome(replace(trial, views=views), "done", seconds, memory, {"psnr": psnr})
         for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
     ]
-    table = Table(tuple(outcomes), "psnr", "mm", machine(), {}, "")
-    assert table.front("seconds") == [0, 1]
-    assert table.front("memory") == [1]
+    table = TrialTable(tuple(outcomes), "psnr", "mm", machine(), {}, "")
+    assert table.front(TIME) == [0, 1]
+    assert table.front(MEMORY) == [1]

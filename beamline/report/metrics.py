@@ -1,0 +1,36 @@
+"""Figures of merit as people read them: label, unit, digits and which direction is better."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a figure of merit is shown."""
+
+    label: str
+    unit: str
+    digits: int
+    better: str
+
+
+METRICS = {
+    "psnr": Metric("PSNR", "dB", 2, "higher"),
+    "ssim3d": Metric("SSIM 3D", "", 4, "higher"),
+    "nrmse": Metric("NRMSE", "", 4, "lower"),
+    "snr": Metric("SNR", "dB", 2, "higher"),
+    "cnr": Metric("CNR", "dB", 2, "higher"),
+    "residual": Metric("Data residual, views used", "", 4, "lower"),
+    "residual_held_out": Metric("Data residual, views held out", "", 4, "lower"),
+    "seconds": Metric("Time", "s", 1, "lower"),
+}
+
+
+def formatted(name: str, value: float) -> str:
+    """The value of the metric `name` with its unit; "undefined" if it is not finite, as the dB of a zero ratio is."""
+    metric = METRICS[name]
+    if not math.isfinite(value):
+        return "undefined"
+    return f"{value:.{metric.digits}f} {metric.unit}".rstrip()
