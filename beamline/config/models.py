@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
 from beamline.config.devices import DeviceSection
+from beamline.config.monitor import Monitor
 from beamline.config.section import Section
 from beamline.plan.plan import Mode, Place
 
@@ -115,12 +116,6 @@ class Storage(Section):
     folder: Annotated[str, Field(min_length=1)] = "runs"
     preview_bin: PositiveInt = 4
     flush_every: PositiveInt = 1
-
-
-class Monitor(Section):
-    on_alarm: Literal["log", "stop"] = "log"
-    thresholds: dict[str, dict[str, FiniteFloat]] = Field(default_factory=dict)
-    """Per check, the limits that differ from its defaults."""
 
 
 class Recon(Section):

@@ -3,68 +3,77 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from beamline.monitor.preview import thinned
 from drivers.frame import Frame, FrameKind
 
-NAME = "dark"
 TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
 
 
-@dataclass(frozen=True)
-class Limits:
-    """`drift`: counts by which a dark may differ from the first one; `light`: fraction of the flats' mean."""
-
-    drift: float = 5.0
-    light: float = 0.5
-
-
 @dataclass(frozen=True, eq=False)
-class State:
+class DarkState:
     """Preview blocks and mean counts of the first dark and mean of the first flat, None before any."""
 
-    limits: Limits = Limits()
     blocks: NDArray[np.float32] | None = None
     dark: float | None = None
     flat: float | None = None
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
+@dataclass(frozen=True)
+class Dark:
     """Score: dark over flat where the shutter seems open, else counts of drift.
 
     The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.
     """
-    if frame.kind is FrameKind.DARK:
-        if state.flat is not None and digest.mean > state.limits.light * state.flat:
-            return state, _open(state, frame.index, digest.mean / state.flat)
+
+    name: ClassVar[str] = "dark"
+    bit: ClassVar[int] = 6
+    unit: ClassVar[str] = "counts of drift, or fraction of the flats' counts"
+    meaning: ClassVar[str] = "a dark differs from the first one, or darks are nearly as bright as flats"
+
+    drift: Annotated[float, Field(ge=0, description="counts by which a dark may differ from the first one")] = 5.0
+    light: Annotated[float, Field(ge=0, description="fraction of the flats' mean from which a dark has light")] = 0.5
+
+    def start(self) -> DarkState:
+        return DarkState()
+
+    def look(self, state: DarkState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[DarkState]:
+        if frame.kind is FrameKind.DARK:
+            return self._look_at_dark(state, frame.index, digest)
+        if frame.kind is FrameKind.FLAT and state.flat is None:
+            state = replace(state, flat=digest.mean)
+            if state.dark is not None and state.dark > self.light * digest.mean:
+                return Look(state, self._shutter_open(frame.index, state.dark / digest.mean))
+        return Look(state)
+
+    def _look_at_dark(self, state: DarkState, view: int, digest: FrameDigest) -> Look[DarkState]:
+        if state.flat is not None and digest.mean > self.light * state.flat:
+            return Look(state, self._shutter_open(view, digest.mean / state.flat))
         blocks = digest.preview[thinned(digest.preview)]
         if state.blocks is None:
-            return replace(state, blocks=blocks, dark=digest.mean), None
+            return Look(replace(state, blocks=blocks, dark=digest.mean))
         drift = _trimmed_mean(blocks - state.blocks)
-        if abs(drift) > state.limits.drift:
-            advice = (
-                f"The dark moved by {drift:+.1f} counts since the first dark: check the camera's cooling and for stray "
-                "light."
-            )
-            return state, Flag(NAME, Level.WARN, frame.index, drift, state.limits.drift, advice)
-    elif frame.kind is FrameKind.FLAT and state.flat is None:
-        state = replace(state, flat=digest.mean)
-        if state.dark is not None and state.dark > state.limits.light * digest.mean:
-            return state, _open(state, frame.index, state.dark / digest.mean)
-    return state, None
+        if abs(drift) <= self.drift:
+            return Look(state)
+        advice = (
+            f"The dark moved by {drift:+.1f} counts since the first dark: check the camera's cooling and for stray "
+            "light."
+        )
+        return Look(state, Flag(self.name, Level.WARN, view, drift, self.drift, advice))
 
-
-def _open(state: State, view: int, ratio: float) -> Flag:
-    advice = (
-        f"The darks have {ratio:.0%} of the flats' counts: the shutter was open for the darks or closed for the flats. "
-        "Check the shutter and the beam, then start again."
-    )
-    return Flag(NAME, Level.ALARM, view, ratio, state.limits.light, advice)
+    def _shutter_open(self, view: int, ratio: float) -> Flag:
+        advice = (
+            f"The darks have {ratio:.0%} of the flats' counts: the shutter was open for the darks or closed for the "
+            "flats. Check the shutter and the beam, then start again."
+        )
+        return Flag(self.name, Level.ALARM, view, ratio, self.light, advice)
 
 
 def _trimmed_mean(values: NDArray[np.float32]) -> float:

@@ -6,15 +6,16 @@ It is the moment of order 0 of the consistency conditions of Helgason (1965) and
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
 
 import numpy as np
+from pydantic import Field
 
+from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from beamline.monitor.preview import edges, thinned, transmission
 from drivers.frame import Frame, FrameKind
 
-NAME = "mass"
 CALIBRATION = 10  # projections
 SIGMAS = 6.0
 AIR = 0.05  # line integral at the edges up to which the whole sample is in the field
@@ -23,55 +24,60 @@ EMPTY = 1e-3  # mean line integral of a field with nothing in it but noise
 
 
 @dataclass(frozen=True)
-class Limits:
-    """`warn`: relative change of the total; `frames`: how many in a row make a finding."""
-
-    warn: float = 0.03
-    frames: float = 3
-
-
-@dataclass(frozen=True)
-class State:
+class MassState:
     """`masses`: of the first projections; `usual`: their median, None before; `running`: outliers in a row."""
 
-    limits: Limits = Limits()
     masses: tuple[float, ...] = ()
     usual: float | None = None
     scatter: float = 0.0
     running: int = 0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
-    """Score: relative change of the mean line integral. Silent where the sample is cut off by the detector's edge."""
-    if frame.kind is not FrameKind.PROJECTION:
-        return state, None
-    through = transmission(digest.preview, context, frame.exposure, thinned(digest.preview))
-    if through is None:
-        return state, None
-    integrals = -np.log(np.clip(np.nan_to_num(through, nan=1.0), DARKEST, None))
-    left, right = edges(integrals)
-    if max(left, right) > AIR:
-        return replace(state, running=0), None
-    mass = float(integrals.mean()) - (left + right) / 2  # the beam's changes are not the sample's
-    if state.usual is None:
-        return _calibrate(state, mass), None
-    if state.usual < EMPTY:
-        return state, None
-    score = mass / state.usual - 1
-    limit = max(state.limits.warn, SIGMAS * state.scatter)
-    if abs(score) <= limit:
-        return replace(state, running=0), None
-    state = replace(state, running=state.running + 1)
-    if state.running < state.limits.frames:
-        return state, None
-    advice = (
-        f"The sample's total absorption changed by {score:+.1%} for {state.running} views: something "
-        f"{'entered' if score > 0 else 'left'} the field, or the sample changes. Look at the latest projection."
-    )
-    return state, Flag(NAME, Level.WARN, frame.index, score, limit, advice)
+@dataclass(frozen=True)
+class Mass:
+    """Score: relative change of the mean line integral. No finding where the detector's edge cuts the sample off."""
+
+    name: ClassVar[str] = "mass"
+    bit: ClassVar[int] = 5
+    unit: ClassVar[str] = "relative change"
+    meaning: ClassVar[str] = "the total absorption differs from that of the first projections, several views in a row"
+
+    warn: Annotated[float, Field(ge=0, description="relative change of the total absorption")] = 0.03
+    frames: Annotated[int, Field(ge=1, description="projections in a row beyond the limit that make a finding")] = 3
+
+    def start(self) -> MassState:
+        return MassState()
+
+    def look(self, state: MassState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MassState]:
+        if frame.kind is not FrameKind.PROJECTION:
+            return Look(state)
+        through = transmission(digest.preview, context, frame.exposure, thinned(digest.preview))
+        if through is None:
+            return Look(state)
+        integrals = -np.log(np.clip(np.nan_to_num(through, nan=1.0), DARKEST, None))
+        left, right = edges(integrals)
+        if max(left, right) > AIR:
+            return Look(replace(state, running=0))
+        mass = float(integrals.mean()) - (left + right) / 2  # the beam's changes are not the sample's
+        if state.usual is None:
+            return Look(_calibrate(state, mass))
+        if state.usual < EMPTY:
+            return Look(state)
+        score = mass / state.usual - 1
+        limit = max(self.warn, SIGMAS * state.scatter)
+        if abs(score) <= limit:
+            return Look(replace(state, running=0))
+        state = replace(state, running=state.running + 1)
+        if state.running < self.frames:
+            return Look(state)
+        advice = (
+            f"The sample's total absorption changed by {score:+.1%} for {state.running} views: something "
+            f"{'entered' if score > 0 else 'left'} the field, or the sample changes. Look at the latest projection."
+        )
+        return Look(state, Flag(self.name, Level.WARN, frame.index, score, limit, advice))
 
 
-def _calibrate(state: State, mass: float) -> State:
+def _calibrate(state: MassState, mass: float) -> MassState:
     masses = (*state.masses, mass)
     if len(masses) < CALIBRATION:
         return replace(state, masses=masses)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.flag import ScanContext
+from beamline.monitor.check import ScanContext
 
 EDGE_FRACTION = 16  # an edge strip is a sixteenth of the columns
 ENOUGH = 128  # blocks per side that tell a check what it needs; a large preview is thinned to about so many

@@ -1,43 +1,52 @@
-"""Saturation: pixels at the end of their range, whose true count nobody will ever know."""
+"""Saturation: pixels at the end of their range, whose true count is unknown."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
-NAME = "saturation"
 FEW_PIXELS = 2  # a cosmic ray saturates a pixel or two; that is no exposure too long
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Fractions of the pixels."""
+class SaturationState:
+    """`hot`: the fraction of the pixels that is saturated even without light."""
 
-    warn: float = 1e-5
-    alarm: float = 1e-3
-
-
-@dataclass(frozen=True)
-class State:
-    """`hot`: the fraction that is saturated even without light."""
-
-    limits: Limits = Limits()
     hot: float = 0.0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
+@dataclass(frozen=True)
+class Saturation:
     """Score: fraction of saturated pixels beyond those that are saturated in the darks."""
-    if frame.kind is FrameKind.DARK:
-        return replace(state, hot=max(state.hot, digest.saturated_fraction)), None
-    score = digest.saturated_fraction - state.hot
-    limits = state.limits
-    if score <= max(limits.warn, FEW_PIXELS / context.pixels):
-        return state, None
-    level, limit = (Level.ALARM, limits.alarm) if score > limits.alarm else (Level.WARN, limits.warn)
-    advice = (
-        f"{score:.2%} of the pixels are saturated (>= {context.saturation:g}). Shorten the exposure or add a filter."
-    )
-    return state, Flag(NAME, level, frame.index, score, limit, advice)
+
+    name: ClassVar[str] = "saturation"
+    bit: ClassVar[int] = 1
+    unit: ClassVar[str] = "fraction of the pixels"
+    meaning: ClassVar[str] = "more pixels are saturated than in the darks"
+
+    warn: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
+    alarm: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it is an alarm")] = 1e-3
+
+    def start(self) -> SaturationState:
+        return SaturationState()
+
+    def look(
+        self, state: SaturationState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> Look[SaturationState]:
+        if frame.kind is FrameKind.DARK:
+            return Look(SaturationState(max(state.hot, digest.saturated_fraction)))
+        score = digest.saturated_fraction - state.hot
+        if score <= max(self.warn, FEW_PIXELS / context.pixels):
+            return Look(state)
+        level, limit = (Level.ALARM, self.alarm) if score > self.alarm else (Level.WARN, self.warn)
+        advice = (
+            f"{score:.2%} of the pixels are saturated (>= {context.saturation:g}). Shorten the exposure or add a "
+            "filter."
+        )
+        return Look(state, Flag(self.name, level, frame.index, score, limit, advice))

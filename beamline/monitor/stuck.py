@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
+from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame
 
-NAME = "stuck"
-
 
 @dataclass(frozen=True)
-class Limits:
-    """Nothing to set: one repetition is one too many."""
-
-
-@dataclass(frozen=True)
-class State:
+class StuckState:
     """`checksum` of the frame before; `repeats`: how many frames in a row have had it."""
 
-    limits: Limits = Limits()
     checksum: int | None = None
     repeats: int = 0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
-    """Score: repetitions in a row. Frames of one single grey (a simulated dark without noise) say nothing."""
-    if digest.checksum != state.checksum or digest.variance == 0:
-        return replace(state, checksum=digest.checksum, repeats=0), None
-    state = replace(state, repeats=state.repeats + 1)
-    advice = (
-        f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "
-        "the camera or its driver repeats a buffer. Stop and restart the camera."
-    )
-    return state, Flag(NAME, Level.ALARM, frame.index, state.repeats, 0, advice)
+@dataclass(frozen=True)
+class Stuck:
+    """No limits: one repetition is one too many. Score: repetitions in a row."""
+
+    name: ClassVar[str] = "stuck"
+    bit: ClassVar[int] = 2
+    unit: ClassVar[str] = "repetitions"
+    meaning: ClassVar[str] = "the image equals the one before, pixel for pixel: the camera delivered a frame twice"
+
+    def start(self) -> StuckState:
+        return StuckState()
+
+    def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
+        """Compare checksums. Frames of a single grey value (a simulated dark without noise) are not compared."""
+        if digest.checksum != state.checksum or digest.variance == 0:
+            return Look(replace(state, checksum=digest.checksum, repeats=0))
+        state = replace(state, repeats=state.repeats + 1)
+        advice = (
+            f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "
+            "the camera or its driver repeats a buffer. Stop and restart the camera."
+        )
+        return Look(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))

@@ -2,47 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
-NAME = "timing"
-
 
 @dataclass(frozen=True)
-class Limits:
-    """Periods by which an interval may differ from a whole number of periods."""
-
-    warn: float = 0.25
-
-
-@dataclass(frozen=True)
-class State:
+class TimingState:
     """Trigger and time of the projection before; -1 before the first."""
 
-    limits: Limits = Limits()
     trigger: int = -1
     time: float = 0.0
 
 
-def check(state: State, frame: Frame, digest: FrameDigest, context: ScanContext) -> tuple[State, Flag | None]:
-    """Score: triggers that have no frame, or else periods by which the frame came too late (negative: too early)."""
-    if frame.kind is not FrameKind.PROJECTION or context.period is None:
-        return state, None
-    before, state = state, replace(state, trigger=frame.trigger, time=frame.time)
-    steps = frame.trigger - before.trigger
-    if steps > 1:
-        advice = f"{steps - 1} trigger{'s' if steps > 2 else ''} before this one exposed no frame, or it was lost."
-        return state, Flag(NAME, Level.ALARM, frame.index, steps - 1, 0, advice)
-    if before.trigger < 0 or frame.trigger in context.pass_starts:
-        return state, None
-    score = (frame.time - before.time) / context.period - steps
-    if abs(score) <= state.limits.warn:
-        return state, None
-    advice = (
-        f"The frame came {abs(score):.0%} of a period too {'late' if score > 0 else 'early'}: the stage does not turn "
-        "evenly, or the trigger line picks up noise."
-    )
-    return state, Flag(NAME, Level.WARN, frame.index, score, state.limits.warn, advice)
+@dataclass(frozen=True)
+class Timing:
+    """Score: periods whose trigger has no frame, else periods by which the frame came late (negative: early)."""
+
+    name: ClassVar[str] = "timing"
+    bit: ClassVar[int] = 4
+    unit: ClassVar[str] = "trigger periods"
+    meaning: ClassVar[str] = "the frame came early or late, or triggers before it gave no frame (fly scans)"
+
+    warn: Annotated[float, Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
+
+    def start(self) -> TimingState:
+        return TimingState()
+
+    def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
+        if frame.kind is not FrameKind.PROJECTION or context.period is None:
+            return Look(state)
+        after = TimingState(frame.trigger, frame.time)
+        steps = frame.trigger - state.trigger
+        if steps > 1:
+            advice = f"{steps - 1} trigger{'s' if steps > 2 else ''} before this one exposed no frame, or it was lost."
+            return Look(after, Flag(self.name, Level.ALARM, frame.index, steps - 1, 0, advice))
+        if state.trigger < 0 or frame.trigger in context.pass_starts:
+            return Look(after)
+        score = (frame.time - state.time) / context.period - steps
+        if abs(score) <= self.warn:
+            return Look(after)
+        advice = (
+            f"The frame came {abs(score):.0%} of a period too {'late' if score > 0 else 'early'}: the stage does not "
+            "turn evenly, or the trigger line picks up noise."
+        )
+        return Look(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))

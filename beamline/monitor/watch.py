@@ -1,89 +1,62 @@
-"""All checks together: a frame goes in, flags come out, and a scan's worth of knowledge is carried along as a value."""
+"""Monitor: all checks together. A frame goes in, flags come out; what is known of the scan so far is a value."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
-from types import ModuleType
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError
-from beamline.monitor import bands, beam, dark, mass, saturation, stuck, timing
+from beamline.monitor.check import Check, Flag, ScanContext
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
-
-CHECKS: tuple[ModuleType, ...] = (beam, saturation, stuck, bands, timing, mass, dark)
-NAMES: tuple[str, ...] = tuple(module.NAME for module in CHECKS)
-ALARM_SHIFT = 16  # bit i: check i flagged the frame; bit 16 + i: and it was an alarm
 
 
 @dataclass(frozen=True, eq=False)
 class Monitor:
-    """What the monitor knows: the scan, each check's state, and how many references its means are made of."""
+    """What the monitor knows after the frames so far.
+
+    Attributes:
+        context: the scan, and the mean references of the latest groups.
+        checks: with their limits.
+        states: of the checks, in their order.
+        kind, counted: of the latest group of frames: their kind, and how many there are.
+    """
 
     context: ScanContext
+    checks: tuple[Check, ...]
     states: tuple[Any, ...]
-    counted: int = 0
     kind: FrameKind = FrameKind.INVALID
+    counted: int = 0
 
 
-def start(context: ScanContext, thresholds: Mapping[str, Mapping[str, float]] | None = None) -> Monitor:
-    """A fresh watch. `thresholds` gives, per check, the limits that differ from its defaults.
-
-    Raises:
-        ConfigError: a check or a limit that does not exist; the message names the legal ones.
-    """
-    thresholds = thresholds or {}
-    for name in thresholds:
-        if name not in NAMES:
-            raise ConfigError(f"monitor.thresholds names a check {name!r}; legal: {', '.join(NAMES)}")
-    return Monitor(context, tuple(module.State(limits=_limits(module, thresholds)) for module in CHECKS))
+def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
+    """A monitor before the first frame."""
+    return Monitor(context, tuple(checks), tuple(check.start() for check in checks))
 
 
-def watch(before: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, tuple[Flag, ...]]:
-    """Look at a frame: the watch with it, and what the checks found. O(pixels of the preview)."""
-    flags: list[Flag] = []
-    states: list[Any] = []
-    for module, state in zip(CHECKS, before.states, strict=True):
-        state, flag = module.check(state, frame, digest, before.context)
-        states.append(state)
-        flags += [] if flag is None else [flag]
-    return replace(_remember(before, frame, digest), states=tuple(states)), tuple(flags)
+def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, tuple[Flag, ...]]:
+    """Look at the next frame: the monitor after it, and what the checks found. O(pixels of the preview)."""
+    looks = [
+        check.look(state, frame, digest, monitor.context)
+        for check, state in zip(monitor.checks, monitor.states, strict=True)
+    ]
+    after = replace(_with_reference(monitor, frame, digest), states=tuple(look.state for look in looks))
+    return after, tuple(look.flag for look in looks if look.flag is not None)
 
 
-def bitmask(flags: Iterable[Flag]) -> int:
-    """The flags as bits, in the order of NAMES; see ALARM_SHIFT."""
-    bits = 0
-    for flag in flags:
-        bit = 1 << NAMES.index(flag.check)
-        bits |= bit | (bit << ALARM_SHIFT if flag.level is Level.ALARM else 0)
-    return bits
-
-
-def _limits(module: ModuleType, thresholds: Mapping[str, Mapping[str, float]]) -> Any:
-    given = dict(thresholds.get(module.NAME, {}))
-    legal = [field.name for field in fields(module.Limits)]
-    for name in given:
-        if name not in legal:
-            raise ConfigError(
-                f"monitor.thresholds.{module.NAME} has no limit {name!r}; legal: {', '.join(legal) or 'none'}"
-            )
-    return module.Limits(**given)
-
-
-def _remember(before: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
-    """Mean previews of the latest group of darks and of flats."""
-    counted = before.counted + 1 if frame.kind is before.kind else 1
-    context = before.context
+def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
+    """The monitor with the frame's preview in the mean of its group, where it is a dark or a flat."""
+    counted = monitor.counted + 1 if frame.kind is monitor.kind else 1
+    context = monitor.context
     if frame.kind is FrameKind.DARK:
         context = replace(context, dark=_mean(context.dark, digest.preview, counted))
     elif frame.kind is FrameKind.FLAT:
         context = replace(context, flat=_mean(context.flat, digest.preview, counted), flat_exposure=frame.exposure)
-    return replace(before, context=context, counted=counted, kind=frame.kind)
+    return replace(monitor, context=context, counted=counted, kind=frame.kind)
 
 
 def _mean(so_far: NDArray[np.float32] | None, preview: NDArray[np.float32], n: int) -> NDArray[np.float32]:

@@ -14,12 +14,14 @@ import numpy as np
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, plan_of, resolved_yaml
+from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect
 from beamline.instrument.connect import Instrument, camera_settings
-from beamline.monitor import watch as monitor
+from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import ScanContext
+from beamline.monitor.watch import Monitor
+from beamline.monitor.watch import start as start_monitor
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import work_out
@@ -68,12 +70,11 @@ def dry_run(settings: Config) -> DryRun:
     """Work a configuration out.
 
     Raises:
-        ConfigError: angles, a scene, monitor thresholds or device settings that cannot be. Broken limits are no error
+        ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
             here: they are the timeline's violations.
     """
     plan = plan_of(settings)
     stage, camera, to_counts = connect.describe(settings)
-    monitor.start(ScanContext(2**camera.bits - 1, math.prod(camera.shape)), settings.monitor.thresholds)
     free = free_bytes(Path(settings.storage.folder))
     worked = work_out(
         plan,
@@ -119,7 +120,7 @@ class ReadyScan:
     Attributes:
         settings: the camera's, as it accepted them for the views.
         timing: what the camera says of them.
-        watch: the monitor before the first frame.
+        monitor: before the first frame.
         info: what the file will say of the scan.
     """
 
@@ -127,7 +128,7 @@ class ReadyScan:
     timeline: Timeline
     settings: CameraSettings
     timing: CameraTiming
-    watch: monitor.Monitor
+    monitor: Monitor
     info: ScanInfo
 
 
@@ -138,7 +139,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
         runs: where the file will be, for the free disk.
 
     Raises:
-        ConfigError: a plan that cannot be, every broken limit, an unknown threshold, or a simulated scene that cannot
+        ConfigError: a plan that cannot be, every broken limit, or a simulated scene that cannot
             be exposed with the camera's settings.
         DeviceRefused: the camera does not take its settings.
     """
@@ -158,12 +159,12 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
         free_bytes=free,
     )
     refuse_violations(timeline)
-    watch = monitor.start(_context(plan, timeline, timing), config.monitor.thresholds)
+    monitor = start_monitor(_context(plan, timeline, timing), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
-    digest(np.zeros(timing.shape, np.uint16), watch.context.saturation, preview_bin)
+    digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, preview_bin)
     if instrument.simulated is not None:
         instrument.simulated.rehearse()
-    return ReadyScan(plan, timeline, settings, timing, watch, _info(config, instrument, plan, timeline))
+    return ReadyScan(plan, timeline, settings, timing, monitor, _info(config, instrument, plan, timeline))
 
 
 def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> ScanContext:

@@ -16,9 +16,10 @@ import numpy as np
 from beamline.core.errors import BeamlineError, DataError, in_words
 from beamline.core.events import Emit
 from beamline.core.stop import StopRequest
-from beamline.monitor import watch as monitor
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, digest
-from beamline.monitor.flag import Flag, Level
+from beamline.monitor.watch import Monitor, look
 from beamline.plan.plan import Timeline
 from drivers.frame import Frame
 
@@ -55,7 +56,7 @@ class Recorder:
     def __init__(
         self,
         writer: Writer,
-        watch: monitor.Monitor,
+        monitor: Monitor,
         timeline: Timeline,
         *,
         preview_bin: int,
@@ -63,7 +64,7 @@ class Recorder:
         stop: StopRequest,
         stop_on_alarm: bool,
     ) -> None:
-        self._writer, self._watch, self._preview_bin = writer, watch, preview_bin
+        self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
         self._emit, self._stop, self._stop_on_alarm = emit, stop, stop_on_alarm
         self._progress = _Progress(timeline)
         self._active: set[tuple[str, Level]] = set()
@@ -135,9 +136,9 @@ class Recorder:
                 self._failure = error
 
     def _record(self, frame: Frame) -> None:
-        found = digest(frame.counts, self._watch.context.saturation, self._preview_bin)
+        found = digest(frame.counts, self._monitor.context.saturation, self._preview_bin)
         flags = self._look(frame, found)
-        self._writer.append(frame, found, monitor.bitmask(flags))
+        self._writer.append(frame, found, bitmask(flags))
         self.n_frames += 1
         self._tell(flags)
         data = self._progress.update(frame, self.n_frames)
@@ -149,7 +150,7 @@ class Recorder:
         if self._blind:
             return ()
         try:
-            self._watch, flags = monitor.watch(self._watch, frame, found)
+            self._monitor, flags = look(self._monitor, frame, found)
         except Exception as error:
             self._blind = True
             self._emit("warning", {"message": f"the monitor failed at row {frame.index} and is off: {error!r}"})

@@ -248,7 +248,7 @@ class _Run:
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         return Recorder(
             writer,
-            self.ready.watch,
+            self.ready.monitor,
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             emit=self.emit,

@@ -6,7 +6,7 @@
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time, flags of each frame
+      frame_log                 kind, trigger, framestamp, time, flags of each frame; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from beamline.core.version import version
 from beamline.monitor.digest import FrameDigest, preview_shape
+from beamline.storage.flag_legend import FLAGS, write_legend
 from drivers.frame import FrameKind
 
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
@@ -65,7 +66,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "/entry/frame_log/trigger": ("<i8", ""),
         "/entry/frame_log/framestamp": ("<i8", ""),
         "/entry/frame_log/time": ("<f8", "s"),
-        "/entry/frame_log/flags": ("<u4", ""),
+        FLAGS: ("<u4", ""),
         "/entry/digest/minimum": ("<f8", ""),
         "/entry/digest/maximum": ("<f8", ""),
         "/entry/digest/mean": ("<f8", ""),
@@ -204,6 +205,7 @@ def create(
         _growing(file, path, (), np.dtype(kind))
         if unit:
             file[path].attrs["units"] = unit
+    write_legend(file)
     file["/entry/frame_log/time"].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
     if info.beam_unit is not None:
         file.create_group(BEAM).attrs["NX_class"] = "NXlog"

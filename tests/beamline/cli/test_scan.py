@@ -119,9 +119,9 @@ def test_2_no_such_file() -> None:
 
 def test_2_an_unknown_monitor_check(monkeypatch: pytest.MonkeyPatch) -> None:
     on(monkeypatch, FakeInstrument())
-    result = scan(**{"monitor.thresholds": "{bean: {warn: 0.1}}"})
+    result = scan(**{"monitor.bean.warn": 0.1})
     assert result.exit_code == 2
-    assert "legal: beam" in result.stderr
+    assert "legal keys there: on_alarm, beam, saturation" in result.stderr
 
 
 def test_3_a_device_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor import watch as scan
+from beamline.monitor.check import Check, Flag, ScanContext
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Flag, ScanContext
 from drivers.frame import Frame, FrameKind
 
 ROWS, COLS = 64, 96
@@ -76,13 +77,13 @@ class Bench:
         return self.darks() + self.flats()
 
     def watch(
-        self, frames: Iterable[Frame], period: float | None = PERIOD, **thresholds: dict[str, float]
+        self, frames: Iterable[Frame], period: float | None = PERIOD, checks: Sequence[Check] = CHECKS
     ) -> list[Flag]:
         """All flags of a fresh monitor that sees `frames`."""
-        state = scan.start(ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period), thresholds)
+        state = scan.start(ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period), checks)
         flags: list[Flag] = []
         for frame in frames:
-            state, found = scan.watch(state, frame, digest(frame.counts, SATURATION, 4))
+            state, found = scan.look(state, frame, digest(frame.counts, SATURATION, 4))
             flags += found
         return flags
 

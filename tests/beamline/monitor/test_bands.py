@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from beamline.monitor.flag import Flag, Level
+from beamline.monitor.check import Flag, Level
 from drivers.frame import Frame
 
 

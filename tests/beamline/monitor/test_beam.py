@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from beamline.monitor.flag import Flag, Level
+from beamline.monitor.beam import Beam
+from beamline.monitor.check import Flag, Level
 
 WIDE = ((0.0, 0.0, 80.0, 0.004),)  # a disc wider than the detector: no air anywhere
 
@@ -77,4 +78,4 @@ def test_without_flats_the_first_views_are_the_reference(bench: Any) -> None:
 
 def test_limits_can_be_set(bench: Any) -> None:
     frames = bench.references() + bench.views(10) + bench.views(1, first=10, light=0.95)
-    assert only(bench.watch(frames, beam={"warn": 0.08})) == []
+    assert only(bench.watch(frames, checks=[Beam(warn=0.08)])) == []

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.monitor import dark
+from beamline.monitor.check import Flag, Level, ScanContext
+from beamline.monitor.dark import Dark
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Flag, Level, ScanContext
 from drivers.frame import Frame, FrameKind
 
 
@@ -49,10 +49,11 @@ def small_darks(n: int, rng: np.random.Generator) -> list[Frame]:
 
 
 def flags_of(frames: list[Frame], preview_bin: int) -> list[Flag]:
-    state, found = dark.State(), []
+    state, found = Dark().start(), []
     for frame in frames:
-        state, flag = dark.check(state, frame, digest(frame.counts, 65535, preview_bin), ScanContext(65535, 32 * 48))
-        found += [] if flag is None else [flag]
+        look = Dark().look(state, frame, digest(frame.counts, 65535, preview_bin), ScanContext(65535, 32 * 48))
+        state = look.state
+        found += [] if look.flag is None else [look.flag]
     return found
 
 

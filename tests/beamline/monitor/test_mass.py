@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.monitor.flag import Flag, Level
+from beamline.monitor.check import Flag, Level
 
 SAMPLE = ((0.0, 0.0, 30.0, 0.02), (10.0, 5.0, 8.0, 0.05), (-12.0, 3.0, 6.0, 0.05))
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.monitor.flag import ScanContext
+from beamline.monitor.check import ScanContext
 from beamline.monitor.preview import ENOUGH, edge_light, edges, light, thinned, transmission
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from beamline.monitor.flag import Flag, Level
+from beamline.monitor.check import Flag, Level
 
 
 def only(flags: list[Flag]) -> list[Flag]:

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from beamline.monitor import watch as scan
+from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.digest import digest
-from beamline.monitor.flag import Flag, Level, ScanContext
 
 PERIOD = 0.1  # as the bench makes them
 
@@ -47,7 +47,7 @@ def test_the_return_between_two_passes_is_no_finding(bench: Any) -> None:
     for starts in (frozenset({0}), frozenset({0, 4})):
         state, found = scan.start(ScanContext(65535, 64 * 96, PERIOD, starts)), 0
         for frame in frames:
-            state, new = scan.watch(state, frame, digest(frame.counts, 65535, 4))
+            state, new = scan.look(state, frame, digest(frame.counts, 65535, 4))
             found += len(only(new))
         flags.append(found)
     assert flags == [1, 0]

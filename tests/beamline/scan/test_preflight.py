@@ -48,11 +48,6 @@ def test_violations_are_refused_all_at_once() -> None:
         refuse_violations(replace(worked, violations=("too fast", "too far")))
 
 
-def test_thresholds_are_checked_before_the_scan() -> None:
-    with pytest.raises(ConfigError, match=r"monitor\.thresholds names a check 'beem'"):
-        dry_run(shipped("simulated", "monitor.thresholds={beem: {warn: 1}}"))
-
-
 def test_instrument_loads_no_simulator_and_a_dry_run_no_vendor_library() -> None:
     code = (
         "import sys; from beamline.config import load as config; from beamline.scan.preflight import dry_run;"

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.core.stop import StopRequest
-from beamline.monitor import watch as monitor
+from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.flag import ScanContext
+from beamline.monitor.watch import start
 from beamline.scan import recorder as module
 from beamline.scan.recorder import Recorder
 from drivers.frame import Frame, FrameKind
@@ -43,10 +43,15 @@ class Writer:
 
 
 def record(writer: Writer) -> Recorder:
-    watch = monitor.start(ScanContext(65535, 4))
     stop = StopRequest()
     return Recorder(
-        writer, watch, TIMELINE, preview_bin=2, emit=lambda event, data: None, stop=stop, stop_on_alarm=False
+        writer,
+        start(ScanContext(65535, 4)),
+        TIMELINE,
+        preview_bin=2,
+        emit=lambda event, data: None,
+        stop=stop,
+        stop_on_alarm=False,
     )
 
 

@@ -273,7 +273,7 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     def broken(*_: object) -> None:
         raise ZeroDivisionError("defect")
 
-    monkeypatch.setattr(recorder_module.monitor, "watch", broken)
+    monkeypatch.setattr(recorder_module, "look", broken)
     ran = Ran(tmp_path, FakeInstrument())
     assert ran.error is None
     ran.assert_good_file(19, "complete")

@@ -1,0 +1,56 @@
+"""Section `monitor` of the configuration: what an alarm does, and the limits of every check, as the registry has them.
+
+The keys `monitor.<check>.<limit>` are derived from the fields of the checks: a check that enters the registry can be
+configured without an edit here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+
+from pydantic import create_model, model_validator
+
+from beamline.config.section import Section
+from beamline.monitor.check import Check
+from beamline.monitor.checks import CHECKS
+
+
+class MonitorSection(Section):
+    on_alarm: Literal["log", "stop"] = "log"
+    """An alarm of a check is logged, or it stops the scan."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_thresholds(cls, data: Any) -> Any:
+        """Take out `thresholds`, which held the limits until 0.1; the empty one is in every older resolved file."""
+        if not isinstance(data, dict) or "thresholds" not in data:
+            return data
+        if old := data["thresholds"]:
+            group, keys = next(iter(old.items())) if isinstance(old, dict) else ("<check>", None)
+            limit = next(iter(keys)) if isinstance(keys, dict) and keys else "<limit>"
+            raise ValueError(
+                f"thresholds is no key any more; write monitor.{group}.{limit} instead of "
+                f"monitor.thresholds.{group}.{limit}"
+            )
+        return {key: value for key, value in data.items() if key != "thresholds"}
+
+
+def _limits_of(check: Check) -> Any:
+    """The section with the limits of a check, and its default, as pydantic.create_model takes a field."""
+    types = get_type_hints(type(check), include_extras=True)
+    keys: dict[str, Any] = {limit.name: (types[limit.name], limit.default) for limit in fields(check)}
+    section = create_model(f"{type(check).__name__}Limits", __base__=Section, __doc__=f"Flag: {check.meaning}.", **keys)
+    return section, section()
+
+
+if TYPE_CHECKING:
+    Monitor = MonitorSection
+else:
+    _LIMITS = {check.name: _limits_of(check) for check in CHECKS if fields(check)}
+    Monitor = create_model("Monitor", __base__=MonitorSection, __doc__=MonitorSection.__doc__, **_LIMITS)
+
+
+def configured_checks(monitor: MonitorSection) -> tuple[Check, ...]:
+    """All checks, with the limits that the configuration gives them."""
+    return tuple(replace(check, **dict(getattr(monitor, check.name, ()))) for check in CHECKS)

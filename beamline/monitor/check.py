@@ -1,0 +1,104 @@
+"""Check: what every check of the monitor is, what it may know about the scan, and what it finds.
+
+A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It looks at one
+frame after another and carries what it needs to remember as an immutable state, so that a scan can be replayed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import Field, dataclass
+from enum import StrEnum
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.digest import FrameDigest
+from drivers.frame import Frame
+
+State = TypeVar("State")
+
+
+class Level(StrEnum):
+    WARN = "warn"  # look at it when you have time
+    ALARM = "alarm"  # the data are suffering now
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A check's finding.
+
+    Attributes:
+        check: name of the check.
+        level: how bad.
+        view: the frame's row in the file.
+        score: the measured figure, in the check's unit.
+        limit: the figure that it exceeds.
+        advice: what it means and what to do.
+    """
+
+    check: str
+    level: Level
+    view: int
+    score: float
+    limit: float
+    advice: str
+
+
+@dataclass(frozen=True, eq=False)
+class ScanContext:
+    """What does not depend on the frame, and the references seen so far.
+
+    Attributes:
+        saturation: the count from which a pixel is saturated.
+        pixels: of a frame.
+        period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
+        pass_starts: triggers at which a new pass of a fly scan begins, after any pause.
+        dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
+        flat_exposure: s of these flats, which may have an exposure of their own.
+    """
+
+    saturation: float
+    pixels: int
+    period: float | None = None
+    pass_starts: frozenset[int] = frozenset({0})
+    dark: NDArray[np.float32] | None = None
+    flat: NDArray[np.float32] | None = None
+    flat_exposure: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Look(Generic[State]):
+    """Result of a look at one frame: the check's state after it, and its finding (None: nothing to report)."""
+
+    state: State
+    flag: Flag | None = None
+
+
+class Check(Protocol):
+    """One check of the monitor: a frozen dataclass whose fields are its limits, each with a default.
+
+    The type of a field, pydantic constraints and description included, is what the configuration
+    `monitor.<check>.<limit>` accepts (see beamline.config.monitor).
+
+    Attributes:
+        name: in the configuration, in events and in the legend of a file.
+        bit: in the bitmask of a frame in a file, 0 ... 15. Never changed and never used again: old files hold it.
+        unit: of the score and, unless a limit says otherwise, of the limits.
+        meaning: what the flag says of a frame, one sentence for the legend of a file.
+    """
+
+    name: ClassVar[str]
+    bit: ClassVar[int]
+    unit: ClassVar[str]
+    meaning: ClassVar[str]
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def start(self) -> Any:
+        """The state before the first frame."""
+        ...
+
+    def look(self, state: Any, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[Any]:
+        """Look at the next frame. Costs O(pixels of the preview) at most."""
+        ...

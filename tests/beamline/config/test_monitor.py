@@ -1,0 +1,77 @@
+"""Section monitor: every limit of every check is a key with a type, a range and a default, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from beamline.config.load import config_folder, load, resolved_yaml, schema
+from beamline.config.monitor import configured_checks
+from beamline.core.errors import ConfigError
+from beamline.monitor.beam import Beam
+from beamline.monitor.checks import CHECKS
+from beamline.monitor.mass import Mass
+
+
+@pytest.mark.parametrize("name", ["demo", "simulated", "instrument"])
+def test_the_shipped_files_have_the_defaults_of_the_checks(name: str) -> None:
+    assert configured_checks(load(config_folder() / f"{name}.yaml", (), {}).monitor) == CHECKS
+
+
+def test_limits_reach_their_check_and_no_other() -> None:
+    words = ["monitor.beam.warn=0.08", "monitor.mass={frames: 5}"]
+    changed = {"beam": Beam(warn=0.08), "mass": Mass(frames=5)}
+    expected = [changed.get(check.name, check) for check in CHECKS]
+    assert list(configured_checks(load(config_folder() / "demo.yaml", words, {}).monitor)) == expected
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("monitor.beam.warn=-0.1", r"monitor\.beam\.warn is -0\.1; expected a number >= 0"),
+        ("monitor.beam.warn=much", r"monitor\.beam\.warn is 'much'; expected a number >= 0"),
+        ("monitor.beam.warn=.nan", r"monitor\.beam\.warn is \.nan; expected a number >= 0"),
+        ("monitor.mass.frames=2.5", r"monitor\.mass\.frames is 2\.5; expected a whole number >= 1"),
+        (
+            "monitor.beam.wran=0.1",
+            r"is not a known key \(did you mean warn\?\); legal keys there: warn, alarm, lost",
+        ),
+        ("monitor.bean={warn: 0.1}", r"monitor\.bean is not .*beam.*legal keys there: on_alarm, beam, saturation"),
+        ("monitor.timing=0.3", r"monitor\.timing is 0\.3; expected a group of keys: warn"),
+        ("monitor.on_alarm=stopp", r"monitor\.on_alarm is 'stopp' \(did you mean stop\?\); expected log \| stop"),
+    ],
+)
+def test_a_limit_that_cannot_be_is_refused_with_the_legal_ones(word: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^--set {word.split('=')[0]}.*{message}"):
+        load(config_folder() / "demo.yaml", [word], {})
+
+
+def test_files_of_earlier_versions_are_read_or_refused_with_the_new_key(tmp_path: Path) -> None:
+    path = tmp_path / "old.yaml"
+    text = (config_folder() / "demo.yaml").read_text(encoding="utf-8")
+    path.write_text(f"{text}monitor: {{on_alarm: stop, thresholds: {{}}}}\n", encoding="utf-8")
+    read = load(path, (), {})
+    assert (read.monitor.on_alarm, configured_checks(read.monitor)) == ("stop", CHECKS)
+    assert "thresholds" not in resolved_yaml(read)
+    path.write_text(f"{text}monitor:\n  thresholds: {{beam: {{warn: 0.08}}}}\n", encoding="utf-8")
+    line = text.count("\n") + 1
+    with pytest.raises(ConfigError, match=rf"old\.yaml:{line}: monitor: .* write monitor\.beam\.warn instead of"):
+        load(path, (), {})
+
+
+def test_a_resolved_file_gives_the_same_checks(tmp_path: Path) -> None:
+    path = tmp_path / "resolved.yaml"
+    config = load(config_folder() / "demo.yaml", ["monitor.dark.drift=2"], {})
+    path.write_text(resolved_yaml(config), encoding="utf-8")
+    assert load(path, (), {}).monitor == config.monitor
+
+
+def test_the_schema_describes_every_limit() -> None:
+    definitions = schema()["$defs"]
+    for check in CHECKS:
+        for limit in fields(check):
+            entry = definitions[f"{type(check).__name__}Limits"]["properties"][limit.name]
+            assert entry["default"] == limit.default
+            assert entry["description"] and "minimum" in entry

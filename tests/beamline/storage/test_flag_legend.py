@@ -1,0 +1,68 @@
+"""The legend in a file says which check each bit of the flags stands for, also to programs that know other checks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
+from beamline.monitor.digest import digest
+from beamline.storage.describe import describe
+from beamline.storage.flag_legend import LEGEND, FlagBit, flagged_by, read_legend
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.frame import Frame, FrameKind
+from tests.beamline.storage.conftest import StandingClock
+
+NAMES = [check.name for check in CHECKS]
+
+
+@pytest.fixture
+def path(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """A scan of 4 views: beam flagged in views 1 and 2 (an alarm), mass in view 2."""
+    found = [[], [("beam", Level.WARN)], [("beam", Level.ALARM), ("mass", Level.WARN)], []]
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+        frame = Frame(rng.integers(0, 99, (4, 6)).astype(np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
+        for row, pairs in enumerate(found):
+            flags = bitmask(Flag(name, level, row, 1.0, 0.0, "") for name, level in pairs)
+            writer.append(replace(frame, index=row), digest(frame.counts), flags)
+    return writer.path
+
+
+def test_a_scan_holds_name_bits_unit_and_meaning_of_every_check(path: Path) -> None:
+    with h5py.File(path) as file:
+        legend = file[LEGEND]
+        assert list(legend["name"].asstr()[()]) == NAMES
+        assert list(legend["unit"].asstr()[()]) == [check.unit for check in CHECKS]
+        assert list(legend["meaning"].asstr()[()]) == [check.meaning for check in CHECKS]
+        assert [2**bit for bit in legend["bit"][()]] == [bitmask([Flag(n, Level.WARN, 0, 1, 0, "")]) for n in NAMES]
+        np.testing.assert_array_equal(legend["alarm_bit"][()] - legend["bit"][()], ALARM_SHIFT)
+
+
+def test_info_names_the_checks_also_of_a_file_without_a_legend(path: Path) -> None:
+    assert describe(path)["attributes"]["flags"] == "beam 2, mass 1"
+    with h5py.File(path, "r+", libver=("v110", "v110")) as file:
+        del file[LEGEND]
+    assert describe(path)["attributes"]["flags"] == "beam 2, mass 1"
+
+
+def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: Path) -> None:
+    with h5py.File(path, "r+", libver=("v110", "v110")) as file:
+        names = file[f"{LEGEND}/name"]
+        names[0] = "a check of a later version"
+        assert read_legend(file)[0] == FlagBit("a check of a later version", 0)
+    assert describe(path)["attributes"]["flags"] == "a check of a later version 2, mass 1"
+
+
+@given(st.lists(st.sets(st.sampled_from(NAMES)), max_size=20))
+def test_counting_undoes_the_bitmask(found: list[set[str]]) -> None:
+    bits = np.array([bitmask(Flag(name, Level.ALARM, 0, 1, 0, "") for name in names) for names in found], np.uint32)
+    counts = {name: sum(name in names for names in found) for name in NAMES}
+    legend = [FlagBit(check.name, check.bit) for check in CHECKS]
+    assert flagged_by(bits, legend) == {name: n for name, n in counts.items() if n}
