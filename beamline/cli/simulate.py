@@ -19,10 +19,19 @@ from beamline.core.files import named_on_failure, refuse_existing, whole_file
 from beamline.core.free_memory import free_memory
 from beamline.core.machine import machine, machine_line
 from beamline.core.text import size
-from beamline.simulate.explained import explained, table
 from beamline.simulate.figure import sheet
 from beamline.simulate.labels import labels_path
-from beamline.simulate.scene_file import MOST_FRAMES, Scan, SceneFile, begun, open_scene, shipped_scenes, shown
+from beamline.simulate.scene_file import (
+    MOST_FRAMES,
+    Scan,
+    SceneFile,
+    cost_table,
+    exposure_errors,
+    frame_cost,
+    open_scene,
+    scan_of,
+    shipped_scenes,
+)
 from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
 from beamline.simulate.write import Simulated, refuse, write_scan
 from drivers.clock import Clock, SystemClock
@@ -74,7 +83,7 @@ def simulate(
     Exit code: 0 done, 2 a wrong scene, 4 stopped, 5 disk, 130 interrupted.
     """
     clock = SystemClock()
-    with terminated_like_interrupted(), json_events(as_json) as sinks, shown(scene):
+    with terminated_like_interrupted(), json_events(as_json) as sinks, exposure_errors(scene):
         if not (explains or out or truth or picture):
             raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
         if truth_bin and not truth:
@@ -82,7 +91,7 @@ def simulate(
         picture = out.with_suffix(".png") if out and not picture else picture
         _refuse_outputs(out, truth, picture)
         opened = open_scene(scene, overrides)
-        scan = begun(opened, seed, views, clock.now())
+        scan = scan_of(opened, seed, views, clock.now())
         if out:
             refuse(scan, out)
         tell = _Teller(fan_out(*sinks), clock, plain=not as_json)
@@ -138,10 +147,10 @@ class _Teller:
 
 
 def _explain(scan: Scan, tell: _Teller) -> None:
-    found, where = explained(scan, time.perf_counter), machine()
+    found, where = frame_cost(scan, time.perf_counter), machine()
     costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
     tell.event("explain", asdict(found) | {"costs": costs, "machine": where})
-    tell.lines(f"{machine_line(where)}\n\n{table(found)}")
+    tell.lines(f"{machine_line(where)}\n\n{cost_table(found)}")
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[str, object]:

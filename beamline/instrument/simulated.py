@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from simulators.devices.camera import SimulatedOrcaQuest
     from simulators.devices.shutter import BeamGate
     from simulators.devices.trigger_line import TriggerLine
-    from simulators.effects.chain import Label
+    from simulators.effects.anomaly import Label
     from simulators.scenes.scene import Scene
     from simulators.wires.wire import Wire
 

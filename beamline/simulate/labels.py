@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from beamline.core.files import named_on_failure, whole_file
 
 if TYPE_CHECKING:
-    from simulators.effects.chain import Label
+    from simulators.effects.anomaly import Label
 
 Region = tuple[int, int, int, int]
 

@@ -1,8 +1,8 @@
-"""Scene file: a scene from a YAML file, or one of those that come with the package, by name."""
+"""Scene file: opens a scene, from a YAML file or by the name of a shipped one, and says what its frames cost."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,24 +12,37 @@ import yaml
 from beamline.config.load import config_folder
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
+from beamline.core.text import size
 from beamline.storage.volume_file import read_volume
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
 from simulators.samples.voxels.stored import ReadVolume, Stored
+from simulators.scenes.explain import Explained, explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
 from simulators.scenes.settings import MOST_FRAMES
 from simulators.scenes.shots import Scan
 
-__all__ = ["MOST_FRAMES", "Scan", "SceneFile", "begun", "open_scene", "shipped_scenes", "shown", "volumes_beside"]
+__all__ = [
+    "MOST_FRAMES",
+    "Scan",
+    "SceneFile",
+    "cost_table",
+    "exposure_errors",
+    "frame_cost",
+    "open_scene",
+    "scan_of",
+    "shipped_scenes",
+    "volumes_beside",
+]
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """A scene, and where it stands.
+    """A scene and its file.
 
     Attributes:
-        text: the file's, for the record; with what was put over it.
+        text: of the file, with overridden values, for the record.
     """
 
     scene: Scene
@@ -43,11 +56,11 @@ def shipped_scenes() -> dict[str, Path]:
 
 
 def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
-    """The scene that `name` says: a file, or the name of a shipped one, with KEY=VALUE `overrides` put over it.
+    """The scene of a file, or a shipped one by name, with values overridden by KEY=VALUE `overrides`.
 
     Raises:
         ConfigError: there is no such scene, or it is wrong.
-        DataError: a volume that it names cannot be read.
+        DataError: a volume of the scene cannot be read.
     """
     shipped = shipped_scenes()
     path = Path(name)
@@ -70,11 +83,11 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
         raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
 
 
-def begun(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
-    """The scan of a scene, see Scan.of; its last frame has been made once, so that what cannot be is known by now.
+def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
+    """The scan of a scene, see Scan.of. Its last frame is computed once, so that an impossible scene is refused here.
 
     Raises:
-        CannotExposeError: the scene cannot be exposed as it asks for.
+        CannotExposeError: the scene cannot be exposed with its settings.
     """
     scan = Scan.of(scene.scene, seed, views, start)
     expose(scan.scene, scan.frame(len(scan) - 1).shot)
@@ -82,20 +95,33 @@ def begun(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
 
 
 @contextmanager
-def shown(scene: str) -> Iterator[None]:
-    """What a scene cannot show, though each of its values is legal, is told as what is wrong with it.
-
-    Raises:
-        ConfigError: instead of CannotExposeError.
-    """
+def exposure_errors(scene: str) -> Iterator[None]:
+    """Within it a CannotExposeError becomes a ConfigError that names the scene."""
     try:
         yield
     except CannotExposeError as error:
         raise ConfigError(f"{scene} cannot be exposed: {error}.") from error
 
 
+def frame_cost(scan: Scan, now: Callable[[], float]) -> Explained:
+    """The cost of the view in the middle of the scan, where an anomaly is likeliest."""
+    return explain(scan.scene, scan.frame(len(scan) - 1 - scan.views // 2).shot, now)
+
+
+def cost_table(found: Explained) -> str:
+    """A line for each step, in order, and the effects that the scene does not name."""
+    lines = [f"{'step':<22}{'acts on':<15}{'ms/frame':>9}{'memory':>10}  what happens"]
+    for cost in found.costs:
+        domain = "" if cost.domain is None else cost.domain.words
+        lines.append(f"{cost.name:<22}{domain:<15}{cost.ms:>9.2f}{size(cost.size):>10}  {cost.summary}")
+    lines.append(f"{'a frame':<37}{found.ms:>9.2f}")
+    lines.append("\nNot named by the scene, hence neither imported nor computed:")
+    lines += [f"  {name:<20}{summary}" for name, summary in found.unused]
+    return "\n".join(lines)
+
+
 def volumes_beside(folder: Path) -> ReadVolume:
-    """Reads the volumes that a scene in `folder` names: by full paths, or by paths from there. It raises DataError."""
+    """A reader of the volumes that a scene in `folder` names, by full or relative paths. It raises DataError."""
 
     def read_beside(file: str, dataset: str | None) -> Stored:
         return Stored(*read_volume(folder / file, dataset))  # a full path stays itself

@@ -23,7 +23,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
-from simulators.effects.chain import Label
+from simulators.effects.anomaly import Label
 from simulators.scenes.expose import expose
 from simulators.scenes.shots import Planned, Scan
 

@@ -9,9 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Label
-from simulators.effects.penumbra import lit
-from simulators.effects.views import Views, check, within
+from simulators.effects.anomaly import Label, Views, check_views, lit_share, within
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot
 
@@ -42,7 +40,7 @@ class BlackBand:
                 f"width must be positive and penumbra >= 0 in mm, and share in 0 ... 1 (excluded), got {self.width}, "
                 f"{self.penumbra} and {self.share}"
             )
-        check(self.views)
+        check_views(self.views)
 
     def apply(self, image: Image, shot: Shot) -> Image:
         if within(self.views, shot):
@@ -57,5 +55,5 @@ class BlackBand:
     def _light(self, shot: Shot) -> NDArray[np.float64]:
         """Share of the light in each column of the band."""
         from_left = (np.arange(shot.detector.shape[1], dtype=np.float64) + 0.5) * shot.detector.pitch
-        light = self.share + (1 - self.share) * lit(from_left - self.width, self.penumbra)
+        light = self.share + (1 - self.share) * lit_share(from_left - self.width, self.penumbra)
         return light[light < 1]

@@ -1,6 +1,7 @@
-"""Catalogue: every effect by name, without importing any: an effect's module is loaded when a scene names it.
+"""Catalogue: every effect by name, with its domain and its place in it; no effect's module is imported here.
 
-The module of effect `photon_noise` is simulators.effects.photon_noise, and its class PhotonNoise.
+The module of effect `photon_noise` is simulators.effects.photon_noise, and its class PhotonNoise. It is imported when a
+scene names the effect.
 """
 
 from __future__ import annotations
@@ -16,42 +17,90 @@ from simulators.frame.domain import Domain
 
 @dataclass(frozen=True)
 class Entry:
+    """An effect of the catalogue.
+
+    Attributes:
+        domain: what it acts on.
+        summary: what happens, in half a sentence.
+        follows: effects of the same domain that must come before it: those with which the frame would differ if they
+            came after it.
+        reason: why they must.
+    """
+
     domain: Domain
-    says: str
-    """What happens, in half a sentence."""
+    summary: str
+    follows: frozenset[str] = frozenset()
+    reason: str = ""
 
 
+_BEAM = frozenset({"beam_profile", "narrow_field"})
+_CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
 CATALOGUE: Mapping[str, Entry] = MappingProxyType(
     {
         "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
-        "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later and see the sample turned further"),
-        "afterglow": Entry(Domain.MOTION, "the scintillator still glows from before"),
+        "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
+        "afterglow": Entry(Domain.MOTION, "the scintillator still emits light of earlier moments"),
         "encoder_error": Entry(Domain.MOTION, "the stage is not quite at the angle that its encoder reads"),
         "backlash": Entry(Domain.MOTION, "after the stage has turned backwards the sample lags behind"),
         "stage_wobble": Entry(Domain.MOTION, "the rotation axis tilts as the stage turns"),
         "runout": Entry(Domain.MOTION, "the rotation axis wanders as the stage turns"),
-        "jump": Entry(Domain.MOTION, "the sample slips on the stage once"),
+        "jump": Entry(
+            Domain.MOTION,
+            "the sample slips on the stage once",
+            frozenset({"encoder_error", "backlash", "stage_wobble", "runout"}),
+            "errors of the stage depend on the stage's angle, and the sample slips on the stage",
+        ),
         "floaters": Entry(Domain.OPTICAL_DEPTH, "crumbs far from the axis come into view for a few views"),
         "phase_fringes": Entry(Domain.OPTICAL_DEPTH, "edges get bright rims on the way to the detector"),
         "harmonics": Entry(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
-        "beam_hardening": Entry(Domain.OPTICAL_DEPTH, "the beam has several energies, and the softer ones go first"),
-        "beam_profile": Entry(Domain.PHOTONS, "the beam is bright in the middle and striped, and wanders"),
-        "ring_current": Entry(Domain.PHOTONS, "the ring current falls and is topped up"),
+        "beam_hardening": Entry(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
+        "beam_profile": Entry(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
+        "ring_current": Entry(Domain.PHOTONS, "the ring current decays and is topped up"),
         "ghost": Entry(Domain.PHOTONS, "something like fog crosses the frame in a few views"),
         "black_band": Entry(Domain.PHOTONS, "a slit darkens a band at the left side"),
         "narrow_field": Entry(Domain.PHOTONS, "the beam is narrower than the sample"),
         "lost_beam": Entry(Domain.PHOTONS, "for a while there is no light, or less of it"),
-        "scatter": Entry(Domain.PHOTONS, "photons that the sample deflects arrive elsewhere"),
-        "scintillator_blur": Entry(Domain.PHOTONS, "scintillator and optics blur, and glare far away"),
+        "scatter": Entry(
+            Domain.PHOTONS,
+            "photons that the sample deflects arrive elsewhere",
+            _BEAM,
+            "the sample scatters the light that reaches it",
+        ),
+        "scintillator_blur": Entry(
+            Domain.PHOTONS,
+            "scintillator and optics blur, and glare far away",
+            _BEAM | {"black_band"},
+            "the scintillator blurs all light that reaches it",
+        ),
         "flat_structure": Entry(Domain.PHOTONS, "dust and scratches on scintillator and optics"),
-        "quantum_efficiency": Entry(Domain.PHOTONS, "the sensor detects a share of the photons"),
-        "prnu": Entry(Domain.PHOTONS, "pixels differ in how much light they detect"),
+        "quantum_efficiency": Entry(
+            Domain.PHOTONS,
+            "the sensor detects a share of the photons",
+            frozenset({"scatter"}),
+            "stray light is detected like any other",
+        ),
+        "prnu": Entry(
+            Domain.PHOTONS,
+            "pixels differ in how much light they detect",
+            frozenset({"scatter", "scintillator_blur"}),
+            "pixels differ in their response to light that is spread already",
+        ),
         "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
         "dark_current": Entry(Domain.ELECTRONS, "electrons without light"),
         "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
         "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
-        "saturation": Entry(Domain.ELECTRONS, "a pixel holds no more than its full well"),
-        "dead_pixels": Entry(Domain.ELECTRONS, "a few pixels see no light"),
+        "saturation": Entry(
+            Domain.ELECTRONS,
+            "a pixel holds no more than its full well",
+            _CHARGE,
+            "charge of any origin fills a pixel",
+        ),
+        "dead_pixels": Entry(
+            Domain.ELECTRONS,
+            "a few pixels do not respond to light",
+            _CHARGE,
+            "dead pixels hold the same charge whatever is added",
+        ),
         "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
         "offset": Entry(Domain.COUNTS, "the digital bias"),
         "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or not quite straight"),
@@ -59,7 +108,15 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
 )
 
 
+def order_error(earlier: str, later: str) -> str:
+    """Why two effects of one domain cannot come in this order; empty where they can."""
+    entry = CATALOGUE.get(earlier)
+    if entry is None or later not in entry.follows:
+        return ""
+    return f"effect {later!r} must come before {earlier!r}: {entry.reason}"
+
+
 def load_effect(name: str) -> type[Any]:
-    """The class (see chain.AnyEffect) of an effect of the catalogue; only now is its module imported."""
+    """The class (see chain.AnyEffect) of an effect; this imports its module."""
     module = import_module(f"simulators.effects.{name}")
     return getattr(module, name.title().replace("_", ""))

@@ -1,4 +1,4 @@
-"""Chain: the order of effects from the moving sample to the counts, checked once when a scene is made."""
+"""Chain: a scene's effects in order, from the moving sample to the counts; the order is checked once."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.order import problem
+from simulators.effects.anomaly import Label
+from simulators.effects.catalogue import order_error
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Moments, Shot
 
 Watch: TypeAlias = Callable[[str], AbstractContextManager[object]]
-"""Entered around each step of an exposure with its name: what measures the cost of effects."""
+"""A context that is entered with the name of each step of an exposure, to measure its cost."""
 
 
 class Effect(Protocol):
     """An effect is a frozen dataclass of its parameters.
 
-    `name` is that of its module; `final` marks what ends its domain: photon noise, after which the photons are counted,
-    read noise, with which the charge is read, and the converter.
+    `name` is that of its module. `final` marks the last effect of its domain: photon noise for photons, read noise for
+    electrons and the converter for counts.
     """
 
     name: ClassVar[str]
@@ -34,48 +35,28 @@ class Effect(Protocol):
 @runtime_checkable
 class SamplingEffect(Effect, Protocol):
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        """When each row sees the sample, refined: a frame is the weighted mean over the moments."""
+        """More moments at which each row is exposed: a frame is the weighted mean over them."""
         ...
 
 
 @runtime_checkable
 class PoseEffect(Effect, Protocol):
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
-        """How the sample stands at `times` (float64 [row], s after the trigger), changed."""
+        """The changed pose of the sample at `times` (float64 [row], s after the trigger)."""
         ...
 
 
 @runtime_checkable
 class ImageEffect(Effect, Protocol):
     def apply(self, image: Image, shot: Shot) -> Image:
-        """The image float64 [row, col] in the effect's domain, changed. The image is the effect's own: it may write
-        over it and give it back."""
+        """The changed image, float64 [row, col] in the effect's domain. The effect may work in place."""
         ...
-
-
-SEEN = 1e-3
-"""Share of the light from which on a change counts as seen: where labels begin and end."""
-
-
-@dataclass(frozen=True)
-class Label:
-    """What a monitor should find in a frame.
-
-    Attributes:
-        kind: the anomaly's name.
-        region: (first row, row after the last, first column, column after the last) in pixels of the frame.
-        which: of several of one kind in a frame; it is the same in every frame.
-    """
-
-    kind: str
-    region: tuple[int, int, int, int]
-    which: int = 0
 
 
 @runtime_checkable
 class Anomaly(Effect, Protocol):
     def labels(self, shot: Shot) -> Sequence[Label]:
-        """Where the anomaly changes this frame, whatever other effects do to it; none where it does not."""
+        """Where the anomaly changes this frame, whatever other effects do; empty where it does not."""
         ...
 
 
@@ -84,14 +65,14 @@ AnyEffect: TypeAlias = SamplingEffect | PoseEffect | ImageEffect
 
 @dataclass(frozen=True)
 class Chain:
-    """Effects in an order that physics allows. Make one with `Chain.of`."""
+    """Effects in an order that physics allows. Created by `Chain.of`."""
 
     effects: tuple[AnyEffect, ...]
 
     @classmethod
     def of(cls, effects: Sequence[AnyEffect]) -> Chain:
         """Check the order: motion, optical depth, photons (noise last), electrons (the readout's noise last), counts,
-        and what order.py says of a domain's own; each effect once.
+        and what the catalogue states within a domain; each effect once.
 
         Raises:
             ValueError: in a sentence that names the two effects.
@@ -99,7 +80,7 @@ class Chain:
         for i, effect in enumerate(effects):
             for earlier in effects[:i]:
                 if earlier.name == effect.name:
-                    raise ValueError(f"effect {effect.name!r} is named twice; name it once")
+                    raise ValueError(f"effect {effect.name!r} is named twice")
                 if earlier.domain > effect.domain:
                     raise ValueError(
                         f"effect {effect.name!r} acts on {effect.domain.words} and cannot follow {earlier.name!r}, "
@@ -111,13 +92,13 @@ class Chain:
                         f"effect {effect.name!r} must come before {earlier.name!r}, which ends the "
                         f"{effect.domain.words}"
                     )
-                if wrong := problem(earlier.name, effect.name):
+                if wrong := order_error(earlier.name, effect.name):
                     raise ValueError(wrong)
         return cls(tuple(effects))
 
     @property
     def moves(self) -> bool:
-        """Whether a frame looks at other moments than the trigger."""
+        """Whether frames depend on other moments than the trigger."""
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
@@ -142,20 +123,13 @@ class Chain:
         return image
 
     def labels(self, shot: Shot) -> tuple[Label, ...]:
-        """The anomalies of a frame; one that turns with the sample, wherever it is while the frame looks."""
+        """The anomalies of a frame; the region of one that turns with the sample covers the whole exposure."""
         found: dict[tuple[str, int], Label] = {}
         for effect in self.effects:
             if isinstance(effect, Anomaly):
                 depth = effect.domain == Domain.OPTICAL_DEPTH and self.moves and shot.beam and shot.sample
-                looks = [shot.later(float(times[0])) for times in self.moments(shot).times] if depth else [shot]
-                for label in (label for look in looks for label in effect.labels(look)):
+                moments = [shot.later(float(times[0])) for times in self.moments(shot).times] if depth else [shot]
+                for label in (label for moment in moments for label in effect.labels(moment)):
                     key = label.kind, label.which
-                    found[key] = _around(found.get(key, label), label)
+                    found[key] = found.get(key, label).joined(label)
         return tuple(found.values())
-
-
-def _around(one: Label, other: Label) -> Label:
-    """One label around two of the same."""
-    (top, below, left, right), region = one.region, other.region
-    around = min(top, region[0]), max(below, region[1]), min(left, region[2]), max(right, region[3])
-    return Label(one.kind, around, one.which)

@@ -9,8 +9,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from simulators.effects.chain import SEEN, Label
-from simulators.effects.views import Views, check, within
+from simulators.effects.anomaly import VISIBLE, Label, Views, check_views, within
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot, lasting
 
@@ -20,7 +19,7 @@ MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
 
 @dataclass(frozen=True)
 class Crumb:
-    """A round Gaussian cloud as a frame shows it, cut off where it is thinner than SEEN.
+    """A round Gaussian cloud as a frame shows it, cut off where it is thinner than VISIBLE.
 
     Attributes:
         row, col: of its middle.
@@ -39,7 +38,7 @@ class Crumb:
         """(first row, row after the last, first column, column after the last); empty where it is not in the frame."""
         middle, size = np.array([self.row, self.col]), np.array(shape)
         aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # of a circle, the frame may have only a cap
-        reach = np.sqrt(np.maximum(2 * math.log(self.depth / SEEN) * self.sigma**2 - aside**2, 0.0))
+        reach = np.sqrt(np.maximum(2 * math.log(self.depth / VISIBLE) * self.sigma**2 - aside**2, 0.0))
         # Clipped first: close to a cone's source a crumb is beyond whole numbers.
         top, left = np.clip(np.ceil(middle - reach), 0, size).astype(int).tolist()
         below, right = np.clip(np.floor(middle + reach) + 1, 0, size).astype(int).tolist()
@@ -81,14 +80,15 @@ class Floaters:
     final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check(self.views)
+        check_views(self.views)
         if not (0 < self.distance[0] <= self.distance[1] and 0 < self.size[0] <= self.size[1]):
             raise ValueError(
                 f"distance and size must be [least, most] > 0 in mm, got {list(self.distance)} and {list(self.size)}"
             )
-        if not (self.count >= 1 and self.depth >= 4 * SEEN and self.speed > 0 and self.heights[0] <= self.heights[1]):
+        least = 4 * VISIBLE
+        if not (self.count >= 1 and self.depth >= least and self.speed > 0 and self.heights[0] <= self.heights[1]):
             raise ValueError(
-                f"count must be >= 1, depth >= {4 * SEEN}, speed positive in mm a view and heights [least, most], got "
+                f"count must be >= 1, depth >= {least}, speed positive in mm a view and heights [least, most], got "
                 f"{self.count}, {self.depth}, {self.speed} and {list(self.heights)}"
             )
         lengths = (*self.distance, *self.size, *map(abs, self.heights), self.speed)

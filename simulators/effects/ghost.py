@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import SEEN, Label
+from simulators.effects.anomaly import VISIBLE, Label
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot
 
@@ -54,7 +54,7 @@ class Ghost:
 
     def labels(self, shot: Shot) -> Sequence[Label]:
         first, change = self._change(shot)
-        seen = np.flatnonzero(np.abs(change) >= SEEN)
+        seen = np.flatnonzero(np.abs(change) >= VISIBLE)
         if not shot.beam or not seen.size:
             return []
         return [Label(self.name, (0, shot.detector.shape[0], first + int(seen[0]), first + int(seen[-1]) + 1))]

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Label
+from simulators.effects.anomaly import Label
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.effects.chain import Label
-from simulators.effects.views import Views, check, within
+from simulators.effects.anomaly import Label, Views, check_views, within
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot
 
@@ -31,7 +30,7 @@ class LostBeam:
     final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check(self.views)
+        check_views(self.views)
         if (self.views is None) == (self.seconds is None):
             raise ValueError("a lost beam needs either views or seconds, and not both")
         if self.seconds is not None and not self.seconds[0] < self.seconds[1]:

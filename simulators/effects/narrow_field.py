@@ -9,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import SEEN, Label
-from simulators.effects.penumbra import lit
+from simulators.effects.anomaly import VISIBLE, Label, lit_share
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot
 
@@ -56,7 +55,7 @@ class NarrowField:
 
     def labels(self, shot: Shot) -> Sequence[Label]:
         rows, cols = shot.detector.shape
-        (top, below), (left, right) = (_lit_fully(light, SEEN) for light in self._light(shot))
+        (top, below), (left, right) = (_lit_fully(light, VISIBLE) for light in self._light(shot))
         strips = [(0, rows, 0, left), (0, rows, right, cols), (0, top, 0, cols), (below, rows, 0, cols)]
         return [
             Label(self.name, strip, which)
@@ -74,7 +73,8 @@ class NarrowField:
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
         # What both edges leave of the source: they cover it from opposite ends.
-        return np.maximum(lit(width / 2 - place, self.penumbra) + lit(width / 2 + place, self.penumbra) - 1, 0.0)
+        one, other = (lit_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
+        return np.maximum(one + other - 1, 0.0)
 
 
 def _lit_fully(light: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:

@@ -40,14 +40,14 @@ class Cost:
         domain: what it acts on; None for the steps that every frame needs.
         ms: median.
         size: bytes of memory taken at most while it ran.
-        says: what happens.
+        summary: what happens.
     """
 
     name: str
     domain: Domain | None
     ms: float
     size: int
-    says: str
+    summary: str
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class Explained:
     Attributes:
         costs: in the order in which the steps run.
         ms: median of a whole frame.
-        not_called_for: effects of the catalogue that the scene does not name, with what they would do.
+        unused: effects of the catalogue that the scene does not name, with what they would do.
     """
 
     costs: tuple[Cost, ...]
     ms: float
-    not_called_for: tuple[tuple[str, str], ...]
+    unused: tuple[tuple[str, str], ...]
 
 
 def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explained:
@@ -88,14 +88,14 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explain
         if name in seconds:
             costs.append(_cost(name, seconds[name], sizes[name]))
     named = {effect.name for effect in scene.chain.effects}
-    left = tuple((name, entry.says) for name, entry in CATALOGUE.items() if name not in named)
+    left = tuple((name, entry.summary) for name, entry in CATALOGUE.items() if name not in named)
     return Explained(tuple(costs), statistics.median(each.whole[-1] for each in rounds) * 1e3, left)
 
 
 def _cost(name: str, seconds: float, size: int) -> Cost:
     if name in STEPS:
         return Cost(name, None, seconds * 1e3, size, STEPS[name])
-    return Cost(name, CATALOGUE[name].domain, seconds * 1e3, size, CATALOGUE[name].says)
+    return Cost(name, CATALOGUE[name].domain, seconds * 1e3, size, CATALOGUE[name].summary)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from beamline.cli import simulate as module
 from beamline.cli.main import main
 from beamline.simulate import figure, write
 from beamline.simulate.labels import read_labels
-from beamline.simulate.scene_file import begun, open_scene, shipped_scenes
+from beamline.simulate.scene_file import open_scene, scan_of, shipped_scenes
 from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -96,7 +96,7 @@ def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
 def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
     result = _beamline("simulate", "scene.yaml", "--explain")
     assert result.exit_code == 0, result.output
-    head, tail = result.stdout.split("Not called for")
+    head, tail = result.stdout.split("Not named by the scene")
     lines = [line.split()[0] for line in head.splitlines() if line]
     steps = ["line_integrals", "beer_lambert", "photon_noise", "read_noise", "offset", "digitise"]
     assert [line for line in lines if line in steps] == steps
@@ -196,11 +196,11 @@ def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> Non
 
 
 def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
-    scan = begun(open_scene("scene.yaml"), 0, 60, 0.0)
+    scan = scan_of(open_scene("scene.yaml"), 0, 60, 0.0)
     # A dark, a flat, the frames asked for, and the rest evenly: views 0, 15, 30, 44, 59 are frames 4, 19, 34, 48, 63.
     assert figure._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
     assert figure._chosen(scan, (9, 9, 8, 7, 6, 5, 63)) == [0, 2, 5, 6, 7, 8, 9, 63]  # six kinds of anomaly have room
-    assert figure._chosen(begun(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
+    assert figure._chosen(scan_of(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
 
 
 def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:

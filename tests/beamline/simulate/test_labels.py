@@ -9,7 +9,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.simulate.labels import LabelLog, Run, labels_path, read_labels, write_labels
-from simulators.effects.chain import Label
+from simulators.effects.anomaly import Label
 
 A, B, C = (0, 4, 0, 4), (1, 5, 1, 5), (2, 6, 2, 6)
 

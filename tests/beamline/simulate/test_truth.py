@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beamline.core.events import Event
 from beamline.projections.prepare import prepare
 from beamline.projections.selection import Selection
-from beamline.simulate.scene_file import begun, open_scene
+from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.simulate.truth import binning_of, truth_of
 from beamline.simulate.write import write_scan
 from beamline.storage.readers.open import open_scan
@@ -53,7 +53,7 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
     """With bins of 4 three of the 35 rows are left over, so that a parallel beam's z = 0 is 1.5 rows higher up."""
     (tmp_path / "scene.yaml").write_text(SCENE, encoding="utf-8")
     scene = open_scene(str(tmp_path / "scene.yaml"), overrides)
-    scan = begun(scene, 0, None, 0.0)
+    scan = scan_of(scene, 0, None, 0.0)
     write_scan(scene, scan, tmp_path / "scan.h5", _silent, SystemClock(), lambda: False)
     truth = truth_of(scan.scene.sample, scan.detector, binning)
     assert truth.names == ("ellipsoid",)

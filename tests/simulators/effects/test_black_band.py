@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from simulators.effects.anomaly import Label
 from simulators.effects.black_band import BlackBand
-from simulators.effects.chain import Label
 from tests.simulators import anomalies, shots
 
 BAND = {"kind": "black_band", "width": 0.08, "penumbra": 0.04, "share": 0.1, "views": [3, 6]}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.effects.chain import Chain, Label
+from simulators.effects.anomaly import Label
+from simulators.effects.chain import Chain
 from simulators.effects.motion_blur import MotionBlur
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot

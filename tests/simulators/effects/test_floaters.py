@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulators.effects.floaters import SEEN, Crumb, Floaters
+from simulators.effects.anomaly import VISIBLE
+from simulators.effects.floaters import Crumb, Floaters
 from simulators.frame.detector import Detector
 from simulators.frame.shot import Shot
 from tests.simulators import anomalies, shots
@@ -35,7 +36,7 @@ def test_within_half_a_turn_each_is_seen_for_one_stretch_of_views() -> None:
         assert begins.size == 2  # in a full turn: before the axis and behind it
         assert (begins[1] - begins[0]) == pytest.approx(VIEWS, abs=1)
         # |u| = 0.7 |cos| below 0.4 mm and the crumb's own reach: so many of the 360 degrees.
-        reach = 0.4 + 0.02 * math.sqrt(2 * math.log(next(effect.crumbs(_view(begins[0]))).depth / SEEN))
+        reach = 0.4 + 0.02 * math.sqrt(2 * math.log(next(effect.crumbs(_view(begins[0]))).depth / VISIBLE))
         assert seen.sum() == pytest.approx(4 * math.degrees(math.asin(reach / 0.7)), abs=4)
 
 
@@ -47,8 +48,8 @@ def test_it_turns_with_the_stage_and_weighs_what_a_gaussian_weighs() -> None:
         shot = _view(view, detector=Detector.centred((60, 200), 0.01))  # wide enough to follow it all the way
         depth = _depth(effect, shot)
         (crumb,) = effect.crumbs(shot)
-        # ∫∫ exp(-r²/2σ²) = 2πσ², less what is cut off where it is SEEN thick.
-        assert depth.sum() == pytest.approx(2 * math.pi * 2.0**2 * (crumb.depth - SEEN), rel=5e-3)
+        # ∫∫ exp(-r²/2σ²) = 2πσ², less what is cut off where it is VISIBLE thick.
+        assert depth.sum() == pytest.approx(2 * math.pi * 2.0**2 * (crumb.depth - VISIBLE), rel=5e-3)
         us.append((depth.sum(axis=0) @ shot.detector.u()) / depth.sum())
         vs.append((depth.sum(axis=1) @ shot.detector.v()) / depth.sum())
     angles = np.pi * np.arange(VIEWS) / VIEWS
@@ -119,7 +120,7 @@ def test_loose_ones_drift_through_from_either_side() -> None:
         np.testing.assert_allclose(np.abs(np.diff(list(cols.values()))), 5.0)  # 0.05 mm a view, pixels of 0.01 mm
         sides.add(np.sign(np.diff(list(cols.values()))[0]))
         assert 10 <= min(cols, key=lambda view: abs(cols[view] - 39.5)) <= 40
-        assert len(cols) == pytest.approx((80 + 2 * 2 * math.sqrt(2 * math.log(0.75 / SEEN))) / 5, abs=2)
+        assert len(cols) == pytest.approx((80 + 2 * 2 * math.sqrt(2 * math.log(0.75 / VISIBLE))) / 5, abs=2)
         turned = [next(effect.crumbs(shots.shot(view=min(cols), angle=angle))).col for angle in (0.0, 1.0)]
         assert turned[0] == turned[1]  # it does not turn
     assert sides == {-1.0, 1.0}
@@ -146,7 +147,7 @@ def test_blur_smears_it_and_the_label_follows() -> None:
     width = label.region[3] - label.region[2] - (sharp.region[3] - sharp.region[2])
     assert width == pytest.approx(0.7 * math.radians(10.0) / 0.01 * 23 / 24, abs=1.5)
     frames = [shots.frame(scene, shot, stage).astype(float) for scene in (blurred, shots.scene("motion_blur"))]
-    changed = np.flatnonzero((np.abs(frames[0] / np.maximum(frames[1], 1) - 1) > SEEN).any(axis=0))
+    changed = np.flatnonzero((np.abs(frames[0] / np.maximum(frames[1], 1) - 1) > VISIBLE).any(axis=0))
     assert label.region[2] <= changed.min() <= changed.max() < label.region[3]
     # One of so many moments thins the crumb's ends out by 2 px; a sharp one would be 15 px wide.
     assert np.ptp(changed) + 1 >= label.region[3] - label.region[2] - 6 > 18

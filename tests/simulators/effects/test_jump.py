@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Label
+from simulators.effects.anomaly import Label
 from simulators.effects.jump import Jump
 from simulators.frame.detector import Detector
 from simulators.frame.shot import Shot

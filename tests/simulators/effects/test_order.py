@@ -11,7 +11,6 @@ import pytest
 
 from simulators.effects.catalogue import CATALOGUE
 from simulators.effects.chain import Chain
-from simulators.effects.order import BEHIND
 from simulators.frame.mapping import SceneError
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
@@ -19,7 +18,7 @@ from tests.simulators import shots
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import PARAMETERS
 
-RULES = [(earlier, later) for later, behind in BEHIND.items() for earlier in sorted(behind.names)]
+RULES = [(earlier, later) for later, entry in CATALOGUE.items() for earlier in sorted(entry.follows)]
 TELLING: Mapping[str, Mapping[str, Any]] = {
     "jump": {"view": 0, "turn_deg": 40.0, "shift_um": [100.0, 0.0, 0.0]},
     "backlash": {"lost_motion_deg": 20.0},

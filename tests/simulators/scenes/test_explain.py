@@ -40,7 +40,7 @@ def test_steps_stand_in_the_order_in_which_they_run() -> None:
     domains = [cost.domain for cost in found.costs]
     assert domains[1] is Domain.MOTION
     assert domains[0] is domains[2] is domains[-1] is None
-    assert all(cost.says for cost in found.costs)
+    assert all(cost.summary for cost in found.costs)
 
 
 def test_costs_are_those_of_the_steps() -> None:
@@ -57,9 +57,9 @@ def test_costs_are_those_of_the_steps() -> None:
     assert size["offset"] < image
 
 
-def test_what_is_not_called_for_is_said() -> None:
+def test_what_is_unused_is_said() -> None:
     found = explain(_scene("offset"), shot(), _Ticks(), repeats=1)
-    assert {name for name, _ in found.not_called_for} == set(CATALOGUE) - {"offset"}
-    assert dict(found.not_called_for)["photon_noise"] == CATALOGUE["photon_noise"].says
+    assert {name for name, _ in found.unused} == set(CATALOGUE) - {"offset"}
+    assert dict(found.unused)["photon_noise"] == CATALOGUE["photon_noise"].summary
     bare = explain(_scene(), shot(), _Ticks(), repeats=1)
     assert [cost.name for cost in bare.costs] == ["ideal"]
