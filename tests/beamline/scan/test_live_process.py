@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 
 from beamline.core.events import Event
+from beamline.core.process import ChildProcess
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import run as module
 from beamline.scan.live_process import LiveReconstruction
@@ -67,7 +67,7 @@ def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: s
 def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
     assert ran.error is None
-    assert any("cannot be started" in event.data["message"] for event in ran.of("warning"))
+    assert any("could not be started" in event.data["message"] for event in ran.of("warning"))
     ran.assert_good_file(19, "complete")
 
 
@@ -80,13 +80,13 @@ def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
         live=script("import time; time.sleep(100)"),
     )
     assert type(ran.error) is ScanAborted
-    assert any("it was ended" in event.data["message"] for event in ran.of("warning"))
+    assert any("it was stopped" in event.data["message"] for event in ran.of("warning"))
 
 
 def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[subprocess.Popen[str]] = []
+    started: list[ChildProcess] = []
 
     class Kept(LiveReconstruction):
         def __init__(self, *args: Any) -> None:
@@ -101,7 +101,7 @@ def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
     monkeypatch.setattr(module, "Recorder", broken)
     ran = Ran(tmp_path, FakeInstrument(), live=script("import time; time.sleep(100)"))
     assert isinstance(ran.error, ZeroDivisionError)
-    assert [process.poll() is None for process in started] == [False]
+    assert [process.running for process in started] == [False]
 
 
 def test_a_stop_after_the_scan_ends_only_the_live_reconstruction(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ time.sleep(100)
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
 def test_a_live_reconstruction_that_is_ended_may_deliver_what_it_has(tmp_path: Path) -> None:
     live = _Live(tmp_path, DELIVERS)
-    done = live.process.finish(give_up=lambda: "progress" in live.said, hurry=lambda: False)
+    done = live.process.finish(stop=lambda: "progress" in live.said, hurry=lambda: False)
     assert done is not None
     assert done["output"] == str(tmp_path / "recon.h5")
     assert "warning" not in live.said
@@ -149,7 +149,7 @@ def test_a_live_reconstruction_that_is_ended_may_deliver_what_it_has(tmp_path: P
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
 def test_in_a_hurry_it_is_not_waited_for(tmp_path: Path) -> None:
     live = _Live(tmp_path, DELIVERS.replace("sys.exit(4)", "time.sleep(100)").replace('"done"', '"progress"'))
-    assert live.process.finish(give_up=lambda: "progress" in live.said, hurry=lambda: True) is None
+    assert live.process.finish(stop=lambda: "progress" in live.said, hurry=lambda: True) is None
     assert live.said[-1] == "warning"
 
 

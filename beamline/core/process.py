@@ -1,0 +1,163 @@
+"""Child processes: started in a group of their own, read line by line, ended in time."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from enum import Enum, auto
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+_POLL = 0.2  # real s between two questions whether the process should stop
+_LAST_LINES = 5.0  # real s to read what a killed process has left; a child of its own may hold the pipe open
+
+
+class Ending(Enum):
+    """Why a process ended."""
+
+    EXITED = auto()
+    STOPPED = auto()
+    SILENT = auto()
+    OUT_OF_TIME = auto()
+
+
+class ChildProcess:
+    """A running command. Each line that it writes to stdout is passed to `on_line`, in a thread of its own.
+
+    Ctrl-C at the terminal does not reach it: the caller decides when it ends. Use it as a context manager, which kills
+    a process that still runs.
+
+    Args:
+        command: program and arguments.
+        stderr: an open file for what it writes to stderr.
+        on_line: receives each line.
+        environment: of the process; None: as ours.
+        tether: give it a stdin that stays open as long as this process lives, so that it can notice when we die.
+
+    Raises:
+        OSError: the command cannot be started.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        stderr: TextIO,
+        on_line: Callable[[str], None],
+        environment: Mapping[str, str] | None = None,
+        *,
+        tether: bool = False,
+    ) -> None:
+        self._on_line = on_line
+        self._silent_since = time.monotonic()
+        self._process = subprocess.Popen(
+            list(command),
+            stdin=subprocess.PIPE if tether else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env=environment,
+            start_new_session=True,  # POSIX
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # Windows
+        )
+        self._reader = threading.Thread(target=self._read, name=f"output of process {self._process.pid}", daemon=True)
+        self._reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    @property
+    def code(self) -> int | None:
+        """The exit code; None while it runs."""
+        return self._process.poll()
+
+    def wait(
+        self,
+        *,
+        stop: Callable[[], bool] = lambda: False,
+        hurry: Callable[[], bool] = lambda: False,
+        seconds: float = math.inf,
+        silence: float = math.inf,
+        grace: float = 0.0,
+    ) -> Ending:
+        """Wait until the process has ended and all its lines have been passed on.
+
+        Args:
+            stop: polled a few times a second; True ends the process.
+            hurry: polled likewise while the process ends; True kills it at once.
+            seconds: real s after which it is killed.
+            silence: real s without a line, from now on, after which it is ended.
+            grace: real s between the request to end and the kill; 0 kills at once.
+        """
+        self._silent_since = time.monotonic()
+        ending, deadline = Ending.EXITED, self._silent_since + seconds
+        while self.running:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(max(0.0, min(_POLL, deadline - time.monotonic())))
+                break
+            now = time.monotonic()
+            if now >= deadline:
+                ending, grace = Ending.OUT_OF_TIME, 0.0
+            elif stop():
+                ending = Ending.STOPPED
+            elif now - self._silent_since > silence:
+                ending = Ending.SILENT
+            else:
+                continue
+            self._end(grace, hurry)
+        self._reader.join()
+        self._close_stdin()
+        return ending
+
+    def end(self, grace: float = 0.0) -> None:
+        """End the process if it still runs: it has `grace` real s before it is killed."""
+        if self.running:
+            self._end(grace, lambda: False)
+            self._reader.join(_LAST_LINES)
+        self._close_stdin()
+
+    def _end(self, grace: float, hurry: Callable[[], bool]) -> None:
+        if grace > 0:
+            self._process.terminate()
+            deadline = time.monotonic() + grace
+            while (left := deadline - time.monotonic()) > 0 and not hurry():
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(min(_POLL, left))
+                    return
+        self._process.kill()
+        self._process.wait()
+
+    def _close_stdin(self) -> None:
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                self._silent_since = time.monotonic()
+                self._on_line(line)
+
+
+def json_object(line: str) -> dict[str, Any] | None:
+    """The JSON object in a line of output; None for any other line, such as what a library prints."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,139 @@
+"""A child process: its lines arrive in order, and it has ended when it should have, however it takes that."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beamline.core.process import ChildProcess, Ending, json_object
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
+
+SLEEPS = "import time; print('begun', flush=True); time.sleep(100)"
+DELIVERS = """
+import signal, sys, time
+def deliver(*_):
+    print("delivered", flush=True)
+    sys.exit(4)
+signal.signal(signal.SIGTERM, deliver)
+print("begun", flush=True)
+time.sleep(100)
+"""
+IGNORES = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("begun", flush=True)
+time.sleep(100)
+"""
+CHATTERS = """
+import time
+for n in range(8):
+    print(n, flush=True)
+    time.sleep(0.1)
+"""
+
+
+class _Child:
+    def __init__(self, folder: Path, code: str, **options: Any) -> None:
+        self.lines: list[str] = []
+        self.log = folder / "stderr.txt"
+        with self.log.open("w", encoding="utf-8") as stderr:
+            self.process = ChildProcess([sys.executable, "-c", code], stderr, self._take, **options)
+
+    def _take(self, line: str) -> None:
+        self.lines.append(line.rstrip())
+
+    def begun(self) -> bool:
+        return bool(self.lines)
+
+
+def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
+    child = _Child(tmp_path, "import sys; print(1); print(2); sys.exit('no room')")
+    assert child.process.wait() is Ending.EXITED
+    assert (child.lines, child.process.code, child.process.running) == (["1", "2"], 1, False)
+    assert child.log.read_text(encoding="utf-8").strip() == "no room"
+
+
+def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
+    child, begin = _Child(tmp_path, IGNORES), time.monotonic()
+    assert child.process.wait(seconds=0.5, grace=100.0) is Ending.OUT_OF_TIME
+    assert 0.5 <= time.monotonic() - begin < 5.0
+    assert not child.process.running
+
+
+@posix
+def test_a_stopped_process_may_deliver_within_its_grace(tmp_path: Path) -> None:
+    child = _Child(tmp_path, DELIVERS)
+    assert child.process.wait(stop=child.begun, grace=30.0) is Ending.STOPPED
+    assert (child.lines, child.process.code) == (["begun", "delivered"], 4)
+
+
+@posix
+@pytest.mark.parametrize(("grace", "hurry"), [(0.5, False), (100.0, True)])
+def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hurry: bool) -> None:
+    child, begin = _Child(tmp_path, IGNORES), time.monotonic()
+    assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is Ending.STOPPED
+    assert time.monotonic() - begin < 10.0
+    assert child.process.code != 0
+
+
+def test_a_silent_process_is_ended_and_one_that_writes_is_not(tmp_path: Path) -> None:
+    assert _Child(tmp_path, SLEEPS).process.wait(silence=0.5) is Ending.SILENT
+    chatter = _Child(tmp_path, CHATTERS)
+    while not chatter.begun():  # the start of an interpreter is silent, too
+        time.sleep(0.01)
+    assert chatter.process.wait(silence=0.5) is Ending.EXITED
+    assert len(chatter.lines) == 8
+
+
+def test_silence_counts_from_the_wait(tmp_path: Path) -> None:
+    """Nobody waits for a process during a scan: it may be silent for as long as the scan takes."""
+    child = _Child(tmp_path, "import time; time.sleep(1.0)")
+    time.sleep(0.7)
+    assert child.process.wait(silence=0.6) is Ending.EXITED
+
+
+def test_leaving_the_context_kills_the_process(tmp_path: Path) -> None:
+    child = _Child(tmp_path, SLEEPS)
+    with pytest.raises(ZeroDivisionError), child.process:
+        raise ZeroDivisionError
+    assert not child.process.running
+
+
+def test_a_tethered_process_notices_that_its_parent_is_gone(tmp_path: Path) -> None:
+    notices = "import sys; sys.stdin.read(); open(sys.argv[1], 'w').close()"
+    parent = f"""
+import os, sys
+from beamline.core.process import ChildProcess
+ChildProcess([sys.executable, "-c", {notices!r}, sys.argv[1]], sys.stderr, print, tether=True)
+os._exit(0)
+"""
+    noticed = tmp_path / "noticed"
+    subprocess.run([sys.executable, "-c", parent, str(noticed)], check=True, timeout=60)
+    until = time.monotonic() + 30
+    while not noticed.exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert noticed.exists()
+
+
+def test_the_end_of_a_process_that_is_tethered_leaves_no_open_pipe(tmp_path: Path) -> None:
+    child = _Child(tmp_path, "import sys; print(sys.stdin.readline() == '')", tether=True)
+    assert child.process.wait(seconds=0.5) is Ending.OUT_OF_TIME  # stdin is open as long as we live
+    assert child.lines == []
+
+
+def test_a_program_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w") as stderr, pytest.raises(OSError, match="no such"):
+        ChildProcess([str(tmp_path / "no such program")], stderr, print)
+
+
+@pytest.mark.parametrize(
+    ("line", "found"), [('{"a": 1}\n', {"a": 1}), ("[1]", None), ("3", None), ("a library's print", None), ("", None)]
+)
+def test_only_objects_are_taken_from_lines(line: str, found: dict[str, Any] | None) -> None:
+    assert json_object(line) == found
