@@ -1,4 +1,4 @@
-"""ADC: a converter of fewer bits, or one that is not quite straight."""
+"""ADC: a converter of fewer bits, or a nonlinear one."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from simulators.frame.shot import CannotExposeError, Image, Shot
 
 @dataclass(frozen=True)
 class Adc:
-    """Counts in steps of 2^(16 - bits), from 0 to the last step: the codes stand at the upper end of 16 bits, so that
-    conversion factor and offset hold at every depth. Without this effect the converter is straight and has 16 bits;
-    photon numbers are resolved only so, for fewer bits have steps wider than an electron.
+    """Counts in steps of 2^(16 - bits), from 0 to the last step: the codes are the upper bits of 16, so that conversion
+    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits; photon numbers
+    can be resolved only then, since fewer bits have steps wider than an electron.
 
     Attributes:
         bits: of a code.
@@ -38,10 +38,10 @@ class Adc:
             raise ValueError(f"nonlinearity must lie in -0.25 ... 0.25 of the full range, got {self.nonlinearity}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where the camera resolves photon numbers with a converter that cannot."""
+        """Raises CannotExposeError in the photon number readout, unless the converter is linear and has 16 bits."""
         if shot.readout == "photon_number" and (self.bits, self.nonlinearity) != (BITS, 0):
             raise CannotExposeError(
-                f"adc: photon numbers need a straight converter of {BITS} bits, got {self.bits} bits and nonlinearity "
+                f"adc: photon numbers need a linear converter of {BITS} bits, got {self.bits} bits and nonlinearity "
                 f"{self.nonlinearity:g}; leave adc out, or choose the readout standard or ultra_quiet"
             )
         step, codes = 2.0 ** (BITS - self.bits), 2**self.bits - 1

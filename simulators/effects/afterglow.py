@@ -1,4 +1,4 @@
-"""Afterglow: the scintillator still glows from before, so that a frame holds a little of what was there earlier."""
+"""Afterglow: the scintillator still emits light of earlier moments, so that a frame contains a little of them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Reals = NDArray[np.float64]
 class Afterglow:
     """Light of time t is prompt by 1 - sum of shares; a share p comes from t - s, s exponential with its decay time.
 
-    The look-back of all components and of the moments that stand before (name it after motion_blur) is one law of
-    times; it is met by `samples` moments of the Gauss rule that has its first 2 x samples - 1 powers right (Golub &
-    Welsch 1969), so that the work grows by `samples` line integrals and no more. What moves by many pixels within a
-    decay time shows as so many ghosts in place of a trail.
+    The delays of all components and the moments of earlier effects (name it after motion_blur) form one distribution of
+    times. A Gauss rule of `samples` moments replaces it, exact for its powers up to 2 x samples - 1 (Golub & Welsch
+    1969), so that `samples` line integrals are added and no more. An edge that moves by many pixels within a decay time
+    appears as that many ghosts instead of a trail.
 
-    It assumes that shutter, sample and beam were as they are for the length of the look-back: the light that is missing
-    just after the shutter opens, and that of a dark just after it shuts, are not simulated. The weights sum to 1.
+    Shutter, sample and beam are assumed unchanged over the delays: the light that is missing just after the shutter
+    opens, and that of a dark just after it closes, are not simulated. The weights sum to 1.
 
     Figures: a maker's table (Crytur, scintillation materials) gives the light 6 ms after the X-rays as below 2 % for
     CsI:Tl and below 0.005 % for YAG:Ce, with decay constants of 900 ns and 70 ns of the prompt light (LuAG:Ce: 70 ns,
@@ -55,8 +55,8 @@ class Afterglow:
             raise ValueError(f"samples must lie in 1 ... 32, got {self.samples}")
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        """The moments given, dimmed, and those of the past; the rows' moments must be spread alike, as blur and
-        rolling shutter leave them."""
+        """The given moments with smaller weights, and those of the past. The moments of all rows must differ by shifts
+        only, as blur and rolling shutter leave them."""
         share = sum(self.shares)
         middle = moments.weights @ moments.times  # [row]
         spread = moments.times[:, 0] - middle[0]
@@ -73,8 +73,8 @@ class Afterglow:
 
 
 def gauss_rule(points: Reals, weights: Reals, n: int) -> tuple[Reals, Reals]:
-    """n points and weights with the same first 2n - 1 powers as the points and weights given (fewer where these have no
-    more), by Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
+    """n points and weights with the same moments up to order 2n - 1 as the given points and weights (fewer points where
+    fewer suffice), by Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
     scale = float(np.abs(points).max()) or 1.0
     basis = [np.sqrt(weights / weights.sum())]
     diagonal, beside = [], []

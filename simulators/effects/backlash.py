@@ -1,4 +1,4 @@
-"""Backlash: after the stage has turned backwards the sample lags behind by the lost motion."""
+"""Backlash: after turning backwards the stage lags behind its encoder by the lost motion."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from simulators.frame.pose import Pose
 from simulators.frame.shot import AngleAt, Shot
 
 STILL = 1e-9
-"""Radians: less is no motion."""
+"""Radians below which the stage does not move."""
 LOOK = 1e-3
-"""s before the frame at which the stage is first asked for, and to which the end of its last move is found."""
+"""s: first step back in time, and the precision to which the end of the last move is found."""
 HISTORY = 3600.0
-"""s before the frame up to which a move is looked for."""
+"""s before the frame within which a move is searched."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Backlash:
     """Lost motion of a gear (ISO 230-2:2014, reversal value) between the encoder, on the motor's side, and the sample.
 
     The stage's angles hold where it turns forwards (angles grow). Backwards the other flanks of the teeth push, and the
-    sample stands `lost_motion_deg` further than the stage says. Where the stage stands, its last move decides; where it
-    has not moved within an hour, it counts as having come forwards. How the lost motion itself is taken up, at the
-    beginning of a move, is not followed: a scan's first view is beyond it.
+    sample is `lost_motion_deg` ahead of the stage's angle. For a standing stage its last move decides; without a move
+    within an hour it is taken to have come forwards. How the lost motion is taken up at the beginning of a move is not
+    simulated: a scan's first view is beyond it.
     """
 
     lost_motion_deg: float
@@ -48,7 +48,7 @@ class Backlash:
 
 
 def came_forwards(angle_at: AngleAt, time: float) -> bool:
-    """Whether the stage turns forwards at `time` (s), or did so last before it."""
+    """Whether the stage turns forwards at `time` (s), or did so in its last move before."""
     here = angle_at(time)
 
     def elsewhere(ago: float) -> bool:
@@ -60,7 +60,7 @@ def came_forwards(angle_at: AngleAt, time: float) -> bool:
             return True
         ago *= 2
     stood = ago / 2 if ago > LOOK else 0.0
-    while ago - stood > LOOK:  # an earlier look may have met another move than the last
+    while ago - stood > LOOK:  # the step back may have skipped the last move
         middle = (stood + ago) / 2
         stood, ago = (stood, middle) if elsewhere(middle) else (middle, ago)
     return angle_at(time - ago) < here

@@ -1,4 +1,4 @@
-"""Beam hardening: the beam has several energies, and the sample takes the softer ones away first."""
+"""Beam hardening: the beam has several energies, and the sample absorbs the softer ones first."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from simulators.frame.shot import Image, Shot
 class BeamHardening:
     """exp(-d') = sum of w_k exp(-r_k d), with sum w_k = 1 and sum w_k r_k = 1, for a sample given by its attenuation.
 
-    The sample's attenuation is the mean over the spectrum, so that a thin sample is seen as it is (d' = d at d -> 0)
-    and a thick one as less. Costs one exponential of the image for each energy. A sample of materials has its true
-    attenuation at each energy in the beam's spectrum instead.
+    The sample's attenuation is the mean over the spectrum, so that d' = d for a thin sample and d' < d for a thick one.
+    The cost is one exponential of the image for each energy. For a sample of materials give the beam a spectrum
+    instead: then each material has its true attenuation at each energy.
 
     Attributes:
         weights: shares of the detected photons of the open beam; only their proportions count.
@@ -39,7 +39,7 @@ class BeamHardening:
         if given is None or (self.energies is not None and self.ratios is not None):
             raise ValueError(f"give either energies in keV or ratios of attenuations, got {self}")
         if len(given) != len(self.weights) or not self.weights:
-            raise ValueError(f"each weight needs an energy or a ratio and the other way round, got {self}")
+            raise ValueError(f"weights must be as many as energies or ratios, and one at least, got {self}")
         if not (min(given) > 0 and min(self.weights) >= 0 and sum(self.weights) > 0):
             raise ValueError(f"energies and ratios must be positive, weights >= 0 and one of them positive, got {self}")
 
@@ -53,7 +53,7 @@ class BeamHardening:
         return tuple((w, r) for r, w in sorted(seen))
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        # The most penetrating energy's exponential is taken out of the sum, so that no depth is too large.
+        # The most penetrating energy's exponential is factored out of the sum, so that large depths do not underflow.
         (weight, least), *others = self.terms()
         seen = np.full_like(image, weight)
         term = np.empty_like(image)

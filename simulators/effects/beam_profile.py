@@ -1,4 +1,4 @@
-"""Beam profile: the beam is bright in the middle, striped across and wanders, so that flats are not flat and age."""
+"""Beam profile: the beam is brightest in the middle, striped, and wanders, so that flats are uneven and age."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class BeamProfile:
     """A Gaussian of 1 in its middle times horizontal stripes, as a multilayer monochromator leaves them.
 
     The middle of the beam, stripes and all, is at centre + wander_speed t + wander sin(2 pi t / wander_period), t in s
-    since the camera was connected. Wander belongs here and is no shift of the image: the beam moves, and the sample and
-    the scintillator stay. Within an exposure the beam stands.
+    since the camera was connected. The wander does not shift the image: the beam moves, the sample and the scintillator
+    do not. Within an exposure the beam is constant.
 
     Attributes:
         sigma: (horizontal, vertical) in mm.

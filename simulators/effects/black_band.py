@@ -1,4 +1,4 @@
-"""Black band: a slit stands in the beam, and a band at the left side of the frame is dark."""
+"""Black band: a slit shadows a band at the left side of the frame."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class BlackBand:
     """The band's edge is soft by the penumbra of the source; flats have the band too.
 
     Attributes:
-        width: mm from the left edge of the frame, whatever the ROI, to where half of the light is there.
-        penumbra: mm over which the light goes from none to all.
+        width: mm from the left edge of the frame, for any ROI, to half of the light.
+        penumbra: mm over which the light rises from none to all.
         share: of the light that is left in the band.
-        views: [first, one after the last] in which the slit stands there; always, where not given.
+        views: [first, one after the last] in which the slit is in the beam; None: all.
     """
 
     width: float

@@ -40,8 +40,8 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
         "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
         "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
         "afterglow": Entry(Domain.MOTION, "the scintillator still emits light of earlier moments"),
-        "encoder_error": Entry(Domain.MOTION, "the stage is not quite at the angle that its encoder reads"),
-        "backlash": Entry(Domain.MOTION, "after the stage has turned backwards the sample lags behind"),
+        "encoder_error": Entry(Domain.MOTION, "the stage's angle differs from its encoder's reading"),
+        "backlash": Entry(Domain.MOTION, "after turning backwards the stage lags behind its encoder"),
         "stage_wobble": Entry(Domain.MOTION, "the rotation axis tilts as the stage turns"),
         "runout": Entry(Domain.MOTION, "the rotation axis wanders as the stage turns"),
         "jump": Entry(
@@ -50,16 +50,16 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
             frozenset({"encoder_error", "backlash", "stage_wobble", "runout"}),
             "errors of the stage depend on the stage's angle, and the sample slips on the stage",
         ),
-        "floaters": Entry(Domain.OPTICAL_DEPTH, "crumbs far from the axis come into view for a few views"),
-        "phase_fringes": Entry(Domain.OPTICAL_DEPTH, "edges get bright rims on the way to the detector"),
+        "floaters": Entry(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
+        "phase_fringes": Entry(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
         "harmonics": Entry(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
         "beam_hardening": Entry(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
         "beam_profile": Entry(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
         "ring_current": Entry(Domain.PHOTONS, "the ring current decays and is topped up"),
-        "ghost": Entry(Domain.PHOTONS, "something like fog crosses the frame in a few views"),
+        "ghost": Entry(Domain.PHOTONS, "a fog-like change of the light crosses the frame in a few views"),
         "black_band": Entry(Domain.PHOTONS, "a slit darkens a band at the left side"),
         "narrow_field": Entry(Domain.PHOTONS, "the beam is narrower than the sample"),
-        "lost_beam": Entry(Domain.PHOTONS, "for a while there is no light, or less of it"),
+        "lost_beam": Entry(Domain.PHOTONS, "for a time there is no light, or less of it"),
         "scatter": Entry(
             Domain.PHOTONS,
             "photons that the sample deflects arrive elsewhere",
@@ -86,7 +86,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
             "pixels differ in their response to light that is spread already",
         ),
         "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
-        "dark_current": Entry(Domain.ELECTRONS, "electrons without light"),
+        "dark_current": Entry(Domain.ELECTRONS, "electrons that arise without light"),
         "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
         "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
         "saturation": Entry(
@@ -103,7 +103,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
         ),
         "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
         "offset": Entry(Domain.COUNTS, "the digital bias"),
-        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or not quite straight"),
+        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
     }
 )
 

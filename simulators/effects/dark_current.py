@@ -1,4 +1,4 @@
-"""Dark current: electrons without light."""
+"""Dark current: electrons that arise without light."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from simulators.frame.shot import Image, Shot, draws
 from simulators.pixels.noise import poisson
 
 FEW = 1.0
-"""Electrons a pixel below which it is less work to scatter electrons than to ask every pixel."""
+"""Electrons a pixel below which placing single electrons is faster than drawing a number for every pixel."""
 
 
 @dataclass(frozen=True)
 class DarkCurrent:
     """Poisson around the dark current times the exposure.
 
-    Few electrons are scattered over the frame: their number is Poisson, and each falls on any pixel alike, which makes
+    A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely, which makes
     every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
 
     `rate`: electrons a second and sensor pixel.

@@ -1,4 +1,4 @@
-"""Dead pixels: a few sensor pixels hold the same charge whatever falls on them."""
+"""Dead pixels: a few sensor pixels hold a constant charge and do not respond to light."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from simulators.pixels.pattern import places
 
 @dataclass(frozen=True)
 class DeadPixels:
-    """Pixels that stay where they are on the sensor; named after all that makes charge, and before the read noise,
-    which they have like any other. A binned pixel loses the share of its dead ones.
+    """The same pixels of the sensor in every frame. Name it after all effects that add charge and before the read
+    noise, which dead pixels have like others. A binned pixel loses the share of its dead ones.
 
     Attributes:
         fraction: of the sensor's pixels.
-        charge: electrons that they hold: 0, or 7000 where they are stuck at full.
-        seed: which pixels.
+        charge: electrons that they hold: 0, or 7000 for pixels that are stuck at the full well.
+        seed: of their places.
     """
 
     fraction: float = 1e-4

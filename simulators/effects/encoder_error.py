@@ -1,4 +1,4 @@
-"""Encoder error: the stage is not quite at the angle that its encoder reads."""
+"""Encoder error: the stage's angle differs from its encoder's reading."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from simulators.frame.shot import Shot, draws
 
 @dataclass(frozen=True)
 class EncoderError:
-    """Angular positioning error: the sample stands at the angle of the trigger plus the error.
+    """Angular positioning error: the sample is at the angle of the trigger plus the error.
 
     Attributes:
-        harmonics: waves a turn, millidegrees, phase in degrees. A grating that is not centred gives 1 wave, a gear as
-            many as it has teeth, and interpolation between an encoder's lines as many as it has lines.
-        random_mdeg: standard deviation of the rest, drawn anew for each frame.
+        harmonics: waves a turn, millidegrees, phase in degrees. An eccentric grating gives 1 wave, a gear as many as it
+            has teeth, and interpolation between an encoder's lines as many as it has lines.
+        random_mdeg: standard deviation of the random part, drawn for each frame.
     """
 
     harmonics: tuple[Wave, ...] = ()

@@ -1,4 +1,4 @@
-"""Flat structure: dust and scratches on scintillator and optics, which stay where they are and make flats uneven."""
+"""Flat structure: dust and scratches on scintillator and optics, which make flats uneven; the same in all frames."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ REACH = 4.0
 
 @dataclass(frozen=True)
 class FlatStructure:
-    """Each speck and scratch takes light away by 1 - depth x Gaussian; where they cross, the factors multiply.
+    """Each speck and scratch multiplies the light by 1 - depth x Gaussian.
 
-    A flat divides them out, unless the light has moved (beam_profile) or been blurred after them: dust on the
-    scintillator comes before scintillator_blur, dust on the camera's window after it. They are worked out for each
-    sensor pixel and averaged over a binned one, so that the same ones are seen in any ROI and binning.
+    A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them: name dust on the
+    scintillator before scintillator_blur, dust on the camera's window after it. They are computed for sensor pixels and
+    averaged over binned ones, so that any ROI and binning shows the same ones.
 
     Attributes:
         specks: number of specks on the whole sensor.
@@ -33,7 +33,7 @@ class FlatStructure:
         scratch_length_um: mean of their lengths (exponentially distributed), um at the sample.
         scratch_width_um: sigma across them, um at the sample.
         scratch_depth: mean share of the light that is lost along a scratch; between 0 and twice this.
-        seed: which.
+        seed: of places, sizes and depths.
     """
 
     specks: int = 200
@@ -103,16 +103,16 @@ def _draw_speck(left: Reals, row: float, col: float, radius: float, depth: float
 def _draw_scratch(left: Reals, row: float, col: float, angle: float, length: float, width: float, depth: float) -> None:
     """Multiply a straight line with a Gaussian across it and at its ends into `left`; only pixels near it are touched.
 
-    The line is followed along the axis that it is nearer to, and drawn square to that axis at each pixel of it.
+    The line is followed along the axis that it is closer to, and drawn across that axis at each of its pixels.
     """
     if abs(np.sin(angle)) < abs(np.cos(angle)):
         left, row, col, angle = left.T, col, row, np.pi / 2 - angle
     along, beside = np.sin(angle), np.cos(angle)
     steps = _window(row, abs(along) * length / 2 + REACH * width, left.shape[0])
-    # Across a line at an angle, a width w is w / cos as seen along the axis: at most √2 w.
+    # Across an inclined line a width w is w / cos along the axis: √2 w at most.
     reach = int(np.ceil(REACH * width * np.sqrt(2)))
     middle = np.rint(col + (steps - row) * beside / along).astype(np.int64)
-    whole = 2 * reach >= left.shape[1]  # wider than the frame: then each of its columns, and no more
+    whole = 2 * reach >= left.shape[1]  # wider than the frame: each of its columns once
     at = np.arange(left.shape[1]) + 0 * middle[:, None] if whole else middle[:, None] + np.arange(-reach, reach + 1)
     dy, dx = (steps - row)[:, None], at - col
     t, s = dy * along + dx * beside, dx * along - dy * beside  # pixels along the line and across

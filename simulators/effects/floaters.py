@@ -1,4 +1,4 @@
-"""Floaters: crumbs far from the axis that come into view for a few views and are gone in the others."""
+"""Floaters: crumbs far from the axis that are in the field of view in a few views only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot, lasting
 
 MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
-"""Crumbs, mm and optical depth: beyond, a frame takes seconds, or its numbers are none."""
+"""Largest number of crumbs, length in mm and optical depth: above, a frame takes seconds or overflows."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Crumb:
         row, col: of its middle.
         sigma: pixels.
         depth: optical depth through its middle.
-        which: of the scene's crumbs.
+        which: number of the crumb in the scene.
     """
 
     row: float
@@ -37,9 +37,9 @@ class Crumb:
     def box(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
         """(first row, row after the last, first column, column after the last); empty where it is not in the frame."""
         middle, size = np.array([self.row, self.col]), np.array(shape)
-        aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # of a circle, the frame may have only a cap
+        aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # the frame may contain only a cap of the circle
         reach = np.sqrt(np.maximum(2 * math.log(self.depth / VISIBLE) * self.sigma**2 - aside**2, 0.0))
-        # Clipped first: close to a cone's source a crumb is beyond whole numbers.
+        # Clipped first: close to a cone's source positions exceed the range of integers.
         top, left = np.clip(np.ceil(middle - reach), 0, size).astype(int).tolist()
         below, right = np.clip(np.floor(middle + reach) + 1, 0, size).astype(int).tolist()
         return top, below, left, right
@@ -47,22 +47,22 @@ class Crumb:
 
 @dataclass(frozen=True)
 class Floaters:
-    """Crumbs on the can's outside or in the beam's way.
+    """Crumbs on the outside of the can or elsewhere in the beam.
 
-    Those that turn with the stage cross the frame twice a turn, before the axis and behind it, where they are farther
-    out than the frame reaches: within half a turn once, for a stretch of views and on one side of the rotation only.
-    Loose ones drift through at a speed of their own. Both are seen as at the time of the frame's first row.
+    Turning crumbs turn with the stage. Where they are farther from the axis than the frame is wide, they cross it twice
+    a turn, in front of the axis and behind it: once within half a turn, for a range of views and on one side of the
+    rotation only. Loose crumbs drift across at a speed of their own. Both are at their places of the first row's time.
 
     Attributes:
-        distance: [least, most] mm from the rotation axis; a loose one is there while it is no farther from it.
-        count: how many.
+        distance: [least, most] mm from the rotation axis; a loose crumb is visible while it is no farther away.
+        count: number of crumbs.
         size: [least, most] mm, standard deviation of the cloud.
-        depth: optical depth through the middle of the densest; others have from half of it on.
+        depth: largest optical depth through the middle of a crumb; the smallest is half of it.
         heights: [least, most] mm, down the rows from z = 0.
         motion: "turning" with the stage, or "loose".
-        speed: mm a view by which a loose one drifts, from either side to the other.
-        views: [first, one after the last] outside of which none is there; a loose one passes the axis between them.
-        seed: which crumbs.
+        speed: mm a view by which a loose crumb drifts, in either direction.
+        views: [first, one after the last] in which crumbs exist; a loose one passes the axis within it.
+        seed: of sizes, places and depths.
     """
 
     distance: tuple[float, float]
@@ -118,7 +118,7 @@ class Floaters:
         return [Label(self.name, crumb.box(shot.detector.shape), crumb.which) for crumb in self.crumbs(shot)]
 
     def crumbs(self, shot: Shot) -> Iterator[Crumb]:
-        """Those that the frame shows."""
+        """The crumbs in the frame."""
         loose = self.motion == "loose"
         if not (loose or within(self.views, shot)):
             return

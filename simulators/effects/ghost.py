@@ -1,4 +1,4 @@
-"""Ghost: something like fog crosses the frame from right to left in a few views and changes the light."""
+"""Ghost: a fog-like change of the light crosses the frame from right to left in a few views."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class Ghost:
-    """A smooth hump cos² of the light, as high as the frame. It is gone when the next flat is taken.
+    """A smooth change of the light by a cos², as high as the frame. Flats do not have it.
 
     An early data set of a battery has it: "fog" that crosses the frame in a few views, with intensities that no other
-    view has; what it was in the beam is not recorded. It may brighten (light scattered into the detector) or darken.
+    view has; its cause is not recorded. It may brighten (light scattered into the detector) or darken.
 
     Attributes:
-        view: the first in which it is seen, at the right edge.
-        width: mm of the hump at half its height; it ends `width` from its middle.
-        speed: mm by which it has moved on to the left in the next view.
-        gain: light that is added in its middle, as a share of the light that is there; negative where it is taken away.
+        view: the first in which it is visible, at the right edge.
+        width: mm, full width at half height; it ends `width` from its middle.
+        speed: mm to the left from one view to the next.
+        gain: relative change of the light in its middle; negative where it darkens.
     """
 
     view: int
@@ -60,7 +60,7 @@ class Ghost:
         return [Label(self.name, (0, shot.detector.shape[0], first + int(seen[0]), first + int(seen[-1]) + 1))]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
-        """The first column that the hump covers, and by what share it changes the light there and further right."""
+        """The first column that it covers, and the relative change of the light there and further right."""
         cols, pitch = shot.detector.shape[1], shot.detector.pitch
         if not shot.sample or shot.view < self.view:
             return 0, np.zeros(0)

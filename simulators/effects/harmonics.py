@@ -1,4 +1,4 @@
-"""Harmonics: a share of the photons that the monochromator lets through at three times the energy."""
+"""Harmonics: the monochromator also transmits a share of photons of three times the energy."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ PHOTOELECTRIC = 3.0**-3
 
 @dataclass(frozen=True)
 class Harmonics:
-    """exp(-d') = (1 - share) exp(-d) + share exp(-ratio d), for a sample that is given by its attenuation alone.
+    """exp(-d') = (1 - share) exp(-d) + share exp(-ratio d), for a sample given by its attenuation.
 
     A crystal that reflects E from its planes (111) reflects 3E from (333). Photoelectric absorption falls as E^-3
     between edges (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics, ch. 1.3), hence the ratio of 1/27.
-    A sample of materials has its true attenuation at both energies in the beam's spectrum instead.
+    For a sample of materials give the beam its harmonics instead: then each material has its true attenuation at both.
 
     Attributes:
         share: of the detected photons of the open beam, 0 ... 1.
@@ -41,7 +41,7 @@ class Harmonics:
     def apply(self, image: Image, shot: Shot) -> Image:
         if self.share == 0:
             return image
-        # The harmonic's exponential is taken out of the sum, so that no depth is too large.
+        # The harmonic's exponential is factored out of the sum, so that large depths do not underflow.
         seen = np.exp((self.ratio - 1) * image)
         seen *= 1 - self.share
         seen += self.share

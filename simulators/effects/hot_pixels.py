@@ -14,12 +14,12 @@ from simulators.pixels.pattern import places
 
 @dataclass(frozen=True)
 class HotPixels:
-    """Pixels that stay where they are on the sensor, whatever the ROI.
+    """The same pixels of the sensor in every frame, for any ROI.
 
     Attributes:
         fraction: of the sensor's pixels.
         rate: mean of their dark currents (exponentially distributed), electrons/s.
-        seed: which pixels.
+        seed: of their places and dark currents.
     """
 
     fraction: float = 1e-4

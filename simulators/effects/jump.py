@@ -1,4 +1,4 @@
-"""Jump: the sample slips on the stage once, and stays where it slipped to."""
+"""Jump: the sample slips on the stage once and stays at its new place."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot
 
 SEEN_PX = 0.01
-"""Pixels of a shift that a frame shows; one along the beam it does not."""
+"""Smallest shift in pixels that is labelled; a shift along the beam is invisible."""
 
 
 @dataclass(frozen=True)
 class Jump:
-    """From view `view` on the sample stands elsewhere on the stage: first turned, then shifted, and turning with it.
+    """From view `view` on the sample is at another place on the stage: first turned, then shifted.
 
-    Every view from the jump on is labelled, for none is what it would have been. Errors of the stage come before it in
-    a scene: they go by the stage's angle, not by the sample's.
+    Every view from the jump on is labelled, since it differs from what it would have been. Errors of the stage precede
+    the jump in a scene: they depend on the stage's angle, not on the sample's.
 
     Attributes:
-        view: the first that is seen after it.
+        view: the first after the jump.
         shift_um: micrometres along x, y (which turn with the stage) and z (along the axis).
         turn_deg: degrees about the axis, in the sense in which angles grow.
     """
@@ -53,7 +53,7 @@ class Jump:
         return pose.turned_by(math.radians(self.turn_deg)).shifted_by(self._shift(pose.angle))
 
     def labels(self, shot: Shot) -> Sequence[Label]:
-        """The columns that the sample sweeps; how high it is no shot says."""
+        """All rows of the columns that the sample can reach; its height is not known here."""
         if not (shot.beam and shot.sample and shot.view >= self.view):
             return []
         detector = shot.detector

@@ -1,4 +1,4 @@
-"""Lost beam: for a while there is no light, or less of it."""
+"""Lost beam: for a time there is no light, or less of it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class LostBeam:
-    """The beam is off for a stretch of views, or of time; a frame that is exposed partly in it loses its part.
+    """The beam is off for a range of views or of time; a frame that overlaps with it loses its part of the light.
 
     Attributes:
-        views: [first, one after the last]; flats taken just before one of them lose their light too.
+        views: [first, one after the last]; flats taken just before one of them lose their light, too.
         seconds: [from, to] since the camera was connected.
         share: of the light that is left.
     """
@@ -52,7 +52,7 @@ class LostBeam:
         """Share of the frame's light that is lost."""
         if self.seconds is None:
             return 1 - self.share if within(self.views, shot) else 0.0
-        # In seconds of this exposure, so that rounding takes no more light than there is.
+        # In seconds of this exposure, so that rounding cannot remove more light than there is.
         begin, end = (at - shot.elapsed for at in self.seconds)
         off = min(end, shot.exposure) - max(begin, 0.0)
         return (1 - self.share) * max(off, 0.0) / shot.exposure

@@ -13,21 +13,22 @@ from simulators.frame.domain import Domain
 from simulators.frame.shot import Moments, Shot
 
 LOOKS = 5
-"""Times of the exposure at which the stage is asked for, so that one that turns back within it is seen to move."""
+"""Times of the exposure at which the stage's angle is read, so that a reversal within it counts as motion."""
 
 
 @dataclass(frozen=True)
 class MotionBlur:
-    """Mean of the transmission over as many moments of the exposure as its blur needs: one where the stage stands.
+    """Mean of the transmission over as many moments of the exposure as the blur needs: one where the stage stands.
 
-    The moments are spread evenly (midpoint rule). Gauss and Legendre's take as many and are no better, for edges make
-    the transmission jump: of 1 px of blur of a battery, 1, 2, 4 and 8 moments leave 1.1, 0.38, 0.13 and 0.045 parts in
-    1000 of the beam (rms), theirs 1.1, 0.34, 0.14 and 0.066; of 8 px theirs leave up to 1.6 times as much.
+    The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are no better, since the
+    transmission jumps at edges: for 1 px of blur of a battery, 1, 2, 4 and 8 moments have errors of 1.1, 0.38, 0.13 and
+    0.045 in 1000 of the beam (rms), Gauss-Legendre 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to 1.6 times
+    larger.
 
     Attributes:
-        tolerance_px: pixels that the sample's rim may travel from one moment to the next. The whole rim counts, even
-            where it turns beyond the frame: in front of the axis and behind it, it crosses the middle of the frame.
-        max_samples: at most so many moments, each of which costs a frame's line integrals.
+        tolerance_px: pixels that the sample's rim may travel from one moment to the next. The rim counts even where it
+            is outside of the frame: in front of the axis and behind it, it crosses the middle of the frame.
+        max_samples: largest number of moments; each costs a frame's line integrals.
     """
 
     tolerance_px: float = 0.5
@@ -60,6 +61,6 @@ class MotionBlur:
 
 
 def _rim(shot: Shot) -> float:
-    """Pixels by which the sample's rim moves a radian, at most; in a cone most of all on the source's side."""
+    """Largest travel of the sample's rim in pixels a radian; in a cone that of the side towards the source."""
     reach, sod = shot.radius / shot.detector.pitch, shot.detector.sod
     return reach if math.isinf(sod) else reach / max(1 - shot.radius / sod, 0.05)

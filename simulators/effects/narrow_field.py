@@ -1,4 +1,4 @@
-"""Narrow field: the beam is narrower than the sample, and what stands beside it gets no light."""
+"""Narrow field: the beam is narrower than the sample, whose sides get no light."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from simulators.frame.shot import Image, Shot
 class NarrowField:
     """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
 
-    Flats are as narrow. What is not fully lit has a label for each side: left, right, above and below.
+    Flats are as narrow. The pixels without full light have a label for each side: left, right, above and below.
 
     Attributes:
-        width: mm of the rectangle across the beam, between the places where half of the light is there.
-        height: mm up and down; the whole frame where not given.
-        centre: mm of its middle, (across, down the rows) from where the rotation axis is seen and z = 0.
-        penumbra: mm over which the light goes from none to all.
+        width: mm of the rectangle across the beam, between the places with half of the light.
+        height: mm, vertically; None: the whole frame.
+        centre: mm of its middle, (across, down the rows) from the projected rotation axis and z = 0.
+        penumbra: mm over which the light rises from none to all.
     """
 
     width: float
@@ -72,12 +72,12 @@ class NarrowField:
         return self._between(detector.v() - self.centre[1], self.height), across
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-        # What both edges leave of the source: they cover it from opposite ends.
+        # The part of the source that neither edge covers: they cover it from opposite ends.
         one, other = (lit_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
         return np.maximum(one + other - 1, 0.0)
 
 
 def _lit_fully(light: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:
-    """First pixel with all the light but `less`, and the one after the last; the light falls off to both sides."""
+    """First pixel with at least 1 - `less` of the light and the one after the last; it falls off to both sides."""
     full = np.flatnonzero(light >= 1 - less)
     return (int(full[0]), int(full[-1]) + 1) if full.size else (light.size, light.size)

@@ -1,4 +1,4 @@
-"""Offset: the digital bias, which keeps the noise of a dark frame from being cut off at 0."""
+"""Offset: the digital bias, so that the noise of a dark frame is not clipped at 0."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from simulators.pixels.pattern import binned, normals
 
 @dataclass(frozen=True)
 class Offset:
-    """The same whatever is binned (to check on a camera); none where the camera resolves photon numbers.
+    """The same for any binning (to check on a camera); none in the photon number readout.
 
     Attributes:
-        spread: counts by which sensor pixels differ (standard deviation of a normal distribution), about 1 on an
-            ORCA-Quest; those of binned pixels add up.
-        seed: which pixel has how much.
+        spread: standard deviation between sensor pixels in counts (normal distribution), about 1 on an ORCA-Quest;
+            those of binned pixels add up.
+        seed: of the pixels' offsets.
     """
 
     spread: float = 0.0

@@ -1,4 +1,4 @@
-"""Phase fringes: on the way from sample to detector the wave interferes with itself, and edges get bright rims."""
+"""Phase fringes: the wave interferes with itself between sample and detector, and edges get bright rims."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from simulators.pixels.broad_blur import add_enlarged
 HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""
 DARKEST = 1e-30
-"""Transmission that stands for none, so that its depth is finite."""
+"""Smallest transmission, so that the depth is finite."""
 STEEPEST = math.pi / 2
-"""Radians between neighbouring pixels of the wave: its square has twice its band, and must not alias either."""
+"""Largest phase step in radians between neighbouring pixels of the wave: its square has twice the bandwidth and must
+not alias either."""
 
 
 @dataclass(frozen=True)
@@ -31,25 +32,25 @@ class PhaseFringes:
 
     With the refractive index 1 - delta + i beta and mu = 4 pi beta / wavelength, the depth d = mu t gives amplitude and
     phase. The wave's cosine transform is multiplied by exp(-i pi wavelength z f²) (Paganin 2006, Coherent X-Ray Optics,
-    ch. 1.4; f cycles/mm) and its square is the intensity: never negative, and in sum as before. The frame's edges are
+    ch. 1.4; f cycles/mm); its square is the intensity, never negative and of the same sum. The frame's edges are
     mirrors. To first order in z it is T - (z delta / mu) laplace T (Paganin et al. 2002, J. Microsc.
     206:33). The transforms are single precision: intensities are right to 1e-5 of the open beam.
 
-    In a cone the frame is that of a plane wave at the distance z / M, M = 1 + z / sod, seen in the sample's scale
-    (Fresnel scaling theorem, Paganin 2006, appendix B), which is that of the detector's pitch here. Fringes blurred by
-    source and detector: name scintillator_blur too.
+    In a cone the frame is that of a plane wave at the distance z / M, M = 1 + z / sod, at the sample's scale (Fresnel
+    scaling theorem, Paganin 2006, appendix B), to which the detector's pitch refers here. For the blur of fringes by
+    source and detector name scintillator_blur, too.
 
-    Edges of solids turn the phase by many radians a pixel, which a wave on the pixels cannot follow. Where the Fresnel
-    number of a pixel is 1 or more, so that fringes are finer than pixels, "transport" does in its place: the light that
-    the first order moves from pixel to pixel is moved, and no pixel gives more than it has.
+    Edges of solids turn the phase by many radians a pixel, which a wave sampled on the pixels cannot represent. Where
+    the Fresnel number of a pixel is 1 or more, so that fringes are finer than pixels, use "transport": it moves the
+    light of the first order from pixel to pixel, and no pixel gives more than it has.
 
     Attributes:
         delta_beta: ratio of delta to beta of the material at the energy.
         distance: mm from the sample to the detector; in a cone sdd - sod.
         energy: keV.
-        oversampling: pixels of the wave per pixel and axis, 1 ... 8; the depth is drawn straight between pixels and the
-            intensity averaged over each, which blurs by a variance of 1/4 pixel² as well. Work and memory grow as its
-            square. Of the wave alone.
+        oversampling: pixels of the wave per pixel and axis, 1 ... 8; the depth is interpolated linearly between pixels
+            and the intensity averaged over each, which adds a blur with a variance of 1/4 pixel². Work and memory grow
+            as its square. For the wave only.
         method: "wave" or, near the sample, "transport".
     """
 
@@ -71,7 +72,7 @@ class PhaseFringes:
         if self.method not in ("wave", "transport"):
             raise ValueError(f"method must be wave or transport, got {self.method!r}")
         if self.method == "transport" and self.oversampling != 1:
-            raise ValueError(f"oversampling is of the wave; with transport leave it out, got {self.oversampling}")
+            raise ValueError(f"oversampling is for the method wave only; leave it out, got {self.oversampling}")
 
     @property
     def wavelength(self) -> float:
@@ -112,7 +113,7 @@ class PhaseFringes:
     def _check_propagator(self, z: float, detector: Detector) -> None:
         """Critical sampling of N (finer) pixels p: wavelength z <= N p² (Voelz & Roggemann 2009, Appl. Opt. 48:6132).
 
-        There the finest fringes walk wavelength z / 2p, half the frame, and meet their mirrors.
+        At that limit the finest fringes travel wavelength z / 2p, half the frame, and meet their mirror images.
         """
         n, pitch = min(detector.shape), detector.pitch
         farthest = n * pitch**2 / self.oversampling / self.wavelength
@@ -140,9 +141,9 @@ class PhaseFringes:
 
 
 def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.float32]:
-    """Intensity float32 [row, col]; `area` is wavelength x distance over the pixel's area. `depth` stays as it is."""
+    """Intensity float32 [row, col]; `area` is wavelength x distance over the pixel's area. `depth` is not changed."""
     turns = depth * (-delta_beta / (4 * math.pi))
-    turns -= np.rint(turns)  # thousands of radians have no place in single precision
+    turns -= np.rint(turns)  # whole turns removed: single precision cannot hold thousands of radians
     phase = (2 * math.pi * turns).astype(np.float32)
     amplitude = np.exp(-0.5 * depth.astype(np.float32))
     rows, cols = (np.exp(-0.25j * np.pi * area * (np.arange(n) / n) ** 2).astype(np.complex64) for n in depth.shape)
@@ -161,7 +162,7 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
 
 def _transported(light: Image, share: float) -> Image:
     """light - share x its Laplacian (in pixels, edges are mirrors), as light moved from each pixel to its brighter
-    neighbours; a pixel that would give more than it has gives all, each neighbour its part."""
+    neighbours. A pixel that would give more than it has gives all of it, in the same proportions."""
     kept, out = np.empty_like(light), np.empty_like(light)
     share_rows(lambda first, end: _keep(first, end, light, share, kept), light.shape)
     share_rows(lambda first, end: _give(first, end, light, share, kept, out), light.shape)
@@ -170,7 +171,7 @@ def _transported(light: Image, share: float) -> Image:
 
 @njit(cache=True, nogil=True)
 def _keep(begin: int, end: int, light: Image, share: float, kept: Image) -> None:
-    """What part of the light that the pixels of rows begin ... end would give they have."""
+    """Factor by which the light given by the pixels of rows begin ... end is limited to what they have."""
     rows, cols = light.shape
     for j in range(begin, end):
         above, below = light[max(j - 1, 0)], light[min(j + 1, rows - 1)]
@@ -185,7 +186,7 @@ def _keep(begin: int, end: int, light: Image, share: float, kept: Image) -> None
 
 @njit(cache=True, nogil=True)
 def _give(begin: int, end: int, light: Image, share: float, kept: Image, out: Image) -> None:
-    """The light of the pixels of rows begin ... end once all have given and got."""
+    """The light of the pixels of rows begin ... end after the exchange."""
     rows, cols = light.shape
     for j in range(begin, end):
         above, below = max(j - 1, 0), min(j + 1, rows - 1)
@@ -197,11 +198,11 @@ def _give(begin: int, end: int, light: Image, share: float, kept: Image, out: Im
                 + _gain(light, kept, j, i, j, left)
                 + _gain(light, kept, j, i, j, right)
             )
-            out[j, i] = max(light[j, i] + share * gain, 0.0)  # rounding alone
+            out[j, i] = max(light[j, i] + share * gain, 0.0)  # negative by rounding only
 
 
 @njit(cache=True, nogil=True)
 def _gain(light: Image, kept: Image, j: int, i: int, k: int, m: int) -> float:
-    """What pixel (j, i) gets from its neighbour (k, m), or gives to it, for a share of 1."""
+    """Light that pixel (j, i) gets from its neighbour (k, m), negative where it gives, for a share of 1."""
     more = light[j, i] - light[k, m]
     return more * (kept[k, m] if more > 0 else kept[j, i])

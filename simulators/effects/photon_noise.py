@@ -12,12 +12,12 @@ from simulators.pixels.noise import poisson
 
 @dataclass(frozen=True)
 class PhotonNoise:
-    """Poisson around the expectation; the photons are whole numbers from here on.
+    """Poisson around the expectation; photons are whole numbers afterwards.
 
-    Each detected photon counts by itself, and pixels are independent. Behind a scintillator that is so where few of an
-    X-ray's photons reach one pixel; where g of them do, the variance is 1 + g times as much and spread by the blur
-    (Cunningham, Westmore & Fenster 1994, Med. Phys. 21:417), which is not simulated: photons_per_s divided by 1 + g has
-    the same signal to noise.
+    Detected photons and pixels are independent. Behind a scintillator this holds where few of an X-ray's photons reach
+    the same pixel; where g of them do, the variance is 1 + g times larger and correlated by the blur (Cunningham,
+    Westmore & Fenster 1994, Med. Phys. 21:417), which is not simulated: photons_per_s divided by 1 + g gives the same
+    signal-to-noise ratio.
     """
 
     name: ClassVar[str] = "photon_noise"

@@ -1,4 +1,4 @@
-"""PRNU, photo response non-uniformity: pixels differ in how much of the light they detect."""
+"""PRNU, photo response non-uniformity: pixels differ in the share of the light that they detect."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from simulators.pixels.pattern import binned, normals
 class Prnu:
     """The expected light times 1 + spread * a normal number of the sensor pixel, not below 0.
 
-    It acts on the light, so that photon noise around it stays Poisson, and belongs after all that blurs light.
+    It acts on the light, so that the photon noise stays Poisson. Name it after all effects that blur light.
 
     Attributes:
         spread: standard deviation as a share of the light; 1 % is typical of sensors (Janesick 2007, "Photon
             transfer"), and assumed here: ORCA-Quest's is not published.
-        seed: which pixel has how much.
+        seed: of the pixels' responses.
     """
 
     spread: float = 0.01

@@ -1,4 +1,4 @@
-"""Quantum efficiency: the sensor detects a share of the photons that arrive at it."""
+"""Quantum efficiency: the share of the arriving photons that the sensor detects."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ EFFICIENCY = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 
 
 @dataclass(frozen=True)
 class QuantumEfficiency:
-    """Thins the expectation before the photon noise, which is exact: thinned Poisson is Poisson (Kingman 1993, ch. 5).
+    """Scales the expectation before the photon noise, which is exact: thinned Poisson is Poisson (Kingman 1993, ch. 5).
 
     A scene's beam.photons_per_s are then photons of the scintillator's light that arrive at the sensor; without this
-    effect they are those detected. LuAG:Ce glows at 535 nm, CsI:Tl at 550 nm (Crytur, scintillation materials).
+    effect they are those detected. LuAG:Ce emits at 535 nm, CsI:Tl at 550 nm (Crytur, scintillation materials).
 
     Attributes:
         value: 0 ... 1, or
-        wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, drawn straight between its points.
+        wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, interpolated linearly.
     """
 
     value: float | None = None

@@ -1,4 +1,4 @@
-"""Read noise: noise of the readout, as the camera's mode has it."""
+"""Read noise: noise of the readout, by the camera's mode."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from simulators.pixels.pattern import binned, normals
 
 @dataclass(frozen=True)
 class ReadNoise:
-    """Gaussian; pixels summed by binning are read one by one, so that their variances add up.
+    """Gaussian. Binned pixels are read one by one, so that their variances add up.
 
     Attributes:
         rms: electrons of a sensor pixel, in place of the readout's.
-        spread: of the pixels' amplifiers: the standard deviation of ln(rms of a pixel), whose median stays.
-        seed: which pixel has how much.
+        spread: between pixels: standard deviation of ln(rms of a pixel); the median is rms.
+        seed: of the pixels' noise.
     """
 
     rms: float | None = None

@@ -1,4 +1,4 @@
-"""Ring current: it decays, is topped up, and the beam goes with it."""
+"""Ring current: it decays and is topped up, and the beam is proportional to it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ class RingCurrent:
     """Exponential decay exp(-t/lifetime), as a beam lifetime is defined, and back to full at each top-up. The ring is
     full when the camera is connected.
 
-    A frame gets the mean current over its exposure, in closed form: exposures that follow one another collect what one
-    long exposure would, whatever the ring does meanwhile.
+    A frame gets the mean current over its exposure, in closed form: consecutive exposures collect the same light as one
+    long exposure.
 
     Attributes:
         lifetime: s to fall to 1/e.
-        top_up_every: s from the start of one top-up to the start of the next; None: not by the clock.
+        top_up_every: s from the start of one top-up to the start of the next; None: not periodic.
         top_up_below: share of the full current at which a top-up starts; None: not by the current. Without either the
-            current only falls.
-        refill: s that a top-up takes, the current rising evenly; 0: none at all.
+            current only decays.
+        refill: s that a top-up takes, with a linearly rising current; 0: it is instantaneous.
     """
 
     lifetime: float
@@ -39,11 +39,11 @@ class RingCurrent:
         if not self.lifetime > 0:
             raise ValueError(f"lifetime must be positive, got {self.lifetime} s")
         if self.top_up_every is not None and self.top_up_below is not None:
-            raise ValueError("top_up_every and top_up_below are two ways of one thing; name one of them")
+            raise ValueError("top_up_every and top_up_below exclude each other; give one of them")
         if self.top_up_below is not None and not 0 < self.top_up_below < 1:
             raise ValueError(f"top_up_below must lie between 0 and 1, got {self.top_up_below}")
         if not self.refill >= 0 or (self.refill > 0 and not self.tops_up):
-            raise ValueError(f"refill must be >= 0 s, and 0 where nothing tops up, got {self.refill} s")
+            raise ValueError(f"refill must be >= 0 s, and 0 without top_up_every or top_up_below, got {self.refill} s")
         if self.top_up_every is not None and not self.top_up_every > self.refill:
             raise ValueError(f"top_up_every must be longer than refill, got {self.top_up_every} and {self.refill} s")
 
@@ -60,7 +60,7 @@ class RingCurrent:
         if not self.tops_up:
             x = duration / self.lifetime
             return math.exp(-start / self.lifetime) * (-math.expm1(-x) / x if x > 0 else 1.0)
-        start %= self._falls() + self.refill  # of its own cycle: differences of small numbers lose less
+        start %= self._falls() + self.refill  # within its cycle: differences of small numbers lose fewer digits
         return (self._charge(start + duration) - self._charge(start)) / duration
 
     def _charge(self, time: float) -> float:
@@ -77,7 +77,7 @@ class RingCurrent:
         """s of each cycle in which the current falls."""
         if self.top_up_below is not None:
             return -self.lifetime * math.log(self.top_up_below)
-        assert self.top_up_every is not None  # asked only of a ring that tops up
+        assert self.top_up_every is not None  # called only for a ring that is topped up
         return self.top_up_every - self.refill
 
     def _fallen(self, time: float) -> float:

@@ -1,4 +1,4 @@
-"""Rolling shutter: rows are exposed in pairs, each a little later than the one above, and see the sample further on."""
+"""Rolling shutter: pairs of rows are exposed one after the other, so that lower rows see the sample turned further."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class RollingShutter:
     """Sensor rows are read in pairs, one pair a line time, downwards from the frame's first row.
 
     A line time is two row periods of the sensor: 7.2 us in the standard readout and 172.8 us in ultra quiet (property
-    table of the C15550-20UP). A binned row begins with its first line. Every row is exposed as long as the others,
-    from its own start, as with an edge trigger that opens the rows one after the other; the modes in which all rows
-    look at once are not simulated: DELAYED, which waits for light until the last row is open, and GLOBALRESET, which
-    opens all rows together and closes them line by line.
+    table of the C15550-20UP). A binned row begins with its first line. Every row is exposed for the same time from its
+    own start, as with an edge trigger that opens the rows one after the other. The modes in which all rows are exposed
+    together are not simulated: DELAYED, which waits for light until the last row is open, and GLOBALRESET, which opens
+    all rows together and closes them line by line.
     """
 
     name: ClassVar[str] = "rolling_shutter"

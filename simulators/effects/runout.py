@@ -1,4 +1,4 @@
-"""Runout: the rotation axis wanders as the stage turns, sideways, along the beam, and up and down."""
+"""Runout: the rotation axis moves as the stage turns, across the beam, along it, and vertically."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Runout:
     """Radial and axial error motion (ISO 230-7:2015), synchronous (harmonics) and asynchronous (drawn for each frame).
 
     Attributes:
-        radial: waves a turn, micrometres, phase in degrees, of the axis' way across the beam and along it. 1 wave is
-            no more than a sample that stands beside the axis, and 0 an axis that is elsewhere; others are the
-            bearing's; a negative number goes round against the sample.
-        axial: the same, up and down.
-        radial_random_um: standard deviation of the rest across the beam, and along it.
-        axial_random_um: of the rest up and down.
+        radial: waves a turn, micrometres, phase in degrees, of the axis' motion across the beam and along it. 1 wave is
+            equivalent to a sample beside the axis, 0 to an axis at another place; others come from the bearing; a
+            negative number turns against the sample.
+        axial: the same, vertically.
+        radial_random_um: standard deviation of the random part across the beam, and along it.
+        axial_random_um: of the random part, vertically.
     """
 
     radial: tuple[Wave, ...] = ()

@@ -15,9 +15,9 @@ from simulators.frame.shot import Image, Shot
 @dataclass(frozen=True)
 class Saturation:
     """Charge x is clipped at the full well W; with a knee, charge above x0 = (1 - knee) W becomes
-    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))), which bends off smoothly and never quite fills the well.
+    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))), which bends smoothly and stays below the full well.
 
-    Named after all that makes charge, and before the read noise. Pixels that are summed share their light evenly.
+    Name it after all effects that add charge and before the read noise. Binned pixels share their light evenly.
 
     Attributes:
         full_well: electrons of a sensor pixel.

@@ -1,4 +1,4 @@
-"""Scatter: photons that the sample deflects arrive elsewhere, and stray light arrives whatever stands in the way."""
+"""Scatter: photons that the sample deflects arrive elsewhere, and stray light arrives everywhere."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
 @dataclass(frozen=True)
 class Scatter:
-    """Adds ratio x the transmitted image, levelled or broadly blurred, and a background.
+    """Adds ratio x the mean or a broad blur of the transmitted image, and a constant background.
 
-    The ratio is that of scattered to primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). Without the sample
-    (a flat) nothing scatters; the background is there as long as the shutter is open. Name it before the effects of the
-    scintillator.
+    The ratio is that of scattered to primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). A flat has no
+    scatter, but the background. Name it before the effects of the scintillator.
 
     Attributes:
         ratio: scattered photons over transmitted ones, both as means over the frame.
-        width_mm: standard deviation of the Gaussian by which the scattered image is blurred, mm at the sample; None
-            spreads it evenly. Light beyond the edges comes back as in a mirror.
+        width_mm: standard deviation of the Gaussian by which the scattered image is blurred, mm at the sample; None:
+            evenly spread. The frame's edges are mirrors.
         background: photons/s and unbinned sensor pixel; p x photons_per_s is a share p of the open beam.
     """
 

@@ -1,4 +1,4 @@
-"""Scintillator blur: scintillator and optics spread light over neighbours, and a little of it far away as glare."""
+"""Scintillator blur: scintillator and optics blur the light, and spread a little of it far away as glare."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, 
 
 TAILS = MappingProxyType({"exponential": exponential, "lorentzian": lorentzian})
 NEGLIGIBLE = 1e-9
-"""Share of a kernel's light beyond its last tap; it is given back by making the taps sum to 1."""
+"""Share of a kernel's light beyond its last tap; the taps are normalised to a sum of 1."""
 MAX_CORE = 64.0
-"""Pixels of the core's sigma; the work grows with it."""
+"""Largest sigma of the core in pixels; the work grows with it."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ScintillatorBlur:
 
     The core's taps go as exp(-b n²) with the b that gives the Gaussian's variance, however narrow (the discrete normal
     law, Kemp 1997, J. Stat. Plan. Inference 63:223); from 1 pixel of sigma on that is the Gaussian, with the transfer
-    exp(-2 (pi f sigma)²). Nothing is negative. Name it before what sits on the sensor's side of the optics.
+    exp(-2 (pi f sigma)²). No tap is negative. Name it before the effects behind the optics.
 
     Attributes:
         fwhm_um: full width at half maximum of the core, um at the sample.
@@ -56,13 +56,13 @@ class ScintillatorBlur:
             raise ValueError(f"tail must be one of {', '.join(TAILS)}, got {self.tail!r}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where the core is wider than MAX_CORE pixels: a slip of units."""
+        """Raises CannotExposeError where the core is wider than MAX_CORE pixels: wrong units, probably."""
         pixel_um = shot.detector.pitch * 1e3
         sigma = self.fwhm_um / pixel_um / math.sqrt(8 * math.log(2))
         if sigma > MAX_CORE:
             raise CannotExposeError(
                 f"scintillator_blur: a core of {self.fwhm_um:g} um FWHM is {sigma:.0f} pixels (sigma) of "
-                f"{pixel_um:g} um, more than the {MAX_CORE:g} that are worked out; give a wide blur as the tail"
+                f"{pixel_um:g} um, above the limit of {MAX_CORE:g}; give a wide blur as the tail"
             )
         blurred = np.empty_like(image)
         taps = discrete_gaussian(sigma**2)
@@ -83,7 +83,7 @@ def discrete_gaussian(variance: float) -> NDArray[np.float64]:
         return unscaled / (2 * unscaled.sum() - 1)
 
     steepness = 0.5 / variance
-    if variance < 1:  # narrower than the sampling: steeper than the continuous one, which would lose variance
+    if variance < 1:  # narrower than the sampling: steeper than the continuous law, which would lose variance
         steepness = brentq(lambda b: 2 * float(offsets**2 @ taps(b)) - variance, 0.4, 1 + math.log(2 / variance))
     kept = taps(steepness)
     beyond = 2 * np.cumsum(kept[::-1])[::-1]  # light at this tap or beyond
@@ -118,6 +118,6 @@ def _blur(begin: int, end: int, image: Image, taps: NDArray[np.float64], weight:
 
 @njit(cache=True, nogil=True)
 def _mirrored(index: int, n: int) -> int:
-    """Where a line of n pixels that is mirrored at both ends, again and again, has `index`."""
+    """Index in 0 ... n - 1 of a line of n pixels that is mirrored periodically at both ends."""
     within = index % (2 * n)
     return within if within < n else 2 * n - 1 - within

@@ -1,4 +1,4 @@
-"""Stage wobble: the rotation axis tilts a little as the stage turns."""
+"""Stage wobble: the rotation axis tilts slightly as the stage turns."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from simulators.frame.shot import Shot, draws
 
 @dataclass(frozen=True)
 class StageWobble:
-    """Tilt error motion of an axis of rotation (ISO 230-7:2015): a part that comes back every turn, and a random one.
+    """Tilt error motion of an axis of rotation (ISO 230-7:2015): a part that repeats every turn, and a random part.
 
     Attributes:
-        harmonics: tilt of the axis: waves a turn, microradians, phase in degrees. 0 waves: the axis leans always to the
-            same side: turned about u at phase 0, about b at -90. 1 wave: it leans with the sample, and is then no more
-            than a sample that stands askew. Others are the bearing's; a negative number goes round against the sample.
-        random_urad: standard deviation of the rest about u and about b, drawn anew for each frame.
+        harmonics: tilt of the axis: waves a turn, microradians, phase in degrees. 0 waves: a constant tilt, about u at
+            phase 0, about b at -90. 1 wave: the tilt turns with the sample, equivalent to a tilted sample. Others come
+            from the bearing; a negative number turns against the sample.
+        random_urad: standard deviation of the random part about u and about b, drawn for each frame.
     """
 
     harmonics: tuple[Wave, ...] = ()

@@ -1,4 +1,4 @@
-"""Zingers: stray X-rays and muons hit the sensor itself and leave bright pixels in one frame only."""
+"""Zingers: stray X-rays and muons hit the sensor directly and leave bright pixels in a single frame."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from simulators.frame.domain import Domain
 from simulators.frame.shot import CannotExposeError, Image, Shot, draws
 
 DROPS = 200
-"""Parts of a charge that spreads."""
+"""Number of parts into which a spread charge is split."""
 MOST = 100_000
-"""Zingers in a frame; the work grows with them."""
+"""Largest number of zingers in a frame; the work grows with it."""
 
 
 @dataclass(frozen=True)
 class Zingers:
-    """Bright pixels at random places; some may be tracks, and charge may spread.
+    """Bright pixels at random places; some may be tracks, and their charge may be spread.
 
     Attributes:
         rate: mean number a second in the frame.
-        charge: mean electrons of one (exponentially distributed).
-        tracks: share of them that run along the sensor, in any direction.
+        charge: mean electrons of a zinger (exponentially distributed).
+        tracks: share of zingers that run along the sensor, in any direction.
         length: mean length of a track (exponentially distributed), pixels of the frame.
         radius: standard deviation of the charge around its point or track, pixels of the frame; 0: a single pixel.
     """
@@ -45,13 +45,13 @@ class Zingers:
             raise ValueError(f"tracks must lie in 0 ... 1, length be positive and radius >= 0, got {self}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where a frame has more than MOST: a slip of units."""
+        """Raises CannotExposeError where a frame has more than MOST: wrong units, probably."""
         rng = draws(self.name, shot)
         expected = self.rate * shot.exposure
         if expected > MOST:
             raise CannotExposeError(
-                f"zingers: {self.rate:g} a second are {expected:.3g} in a frame of {shot.exposure:g} s, more than the "
-                f"{MOST} that are worked out; a rate counts the zingers of the whole frame"
+                f"zingers: {self.rate:g} a second are {expected:.3g} in a frame of {shot.exposure:g} s, above the "
+                f"limit of {MOST}; a rate counts the zingers of the whole frame"
             )
         n = int(rng.poisson(expected))
         where = np.array(np.unravel_index(rng.integers(image.size, size=n), image.shape), dtype=np.float64)

@@ -62,8 +62,8 @@ def test_one_energy_is_beer_lambert_and_no_depth_is_too_large() -> None:
     [
         ({"weights": (1.0,)}, "give either energies in keV or ratios"),
         ({"weights": (1.0,), "energies": (20.0,), "ratios": (1.0,)}, "give either energies in keV or ratios"),
-        ({"weights": (1.0, 2.0), "energies": (20.0,)}, "each weight needs an energy or a ratio"),
-        ({"weights": (), "energies": ()}, "each weight needs an energy or a ratio"),
+        ({"weights": (1.0, 2.0), "energies": (20.0,)}, "weights must be as many as energies or ratios"),
+        ({"weights": (), "energies": ()}, "weights must be as many as energies or ratios"),
         ({"weights": (1.0,), "energies": (0.0,)}, "energies and ratios must be positive"),
         ({"weights": (0.0,), "ratios": (1.0,)}, "weights >= 0 and one of them positive"),
         ({"weights": (-1.0, 2.0), "ratios": (1.0, 2.0)}, "weights >= 0 and one of them positive"),

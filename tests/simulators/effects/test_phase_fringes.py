@@ -231,7 +231,7 @@ def test_a_propagator_that_would_alias_is_refused() -> None:
         ({"distance": math.nan}, "must be >= 0 and energy"),
         ({"energy": 0.0}, r"energy \(keV\) positive"),
         ({"method": "ray"}, "method must be wave or transport, got 'ray'"),
-        ({"method": "transport", "oversampling": 2}, "oversampling is of the wave"),
+        ({"method": "transport", "oversampling": 2}, "oversampling is for the method wave"),
         ({"oversampling": 9}, "oversampling must lie in 1 ... 8, got 9"),
     ],
 )

@@ -77,9 +77,9 @@ def test_top_ups_start_and_end_when_they_are_said_to() -> None:
     ("wrong", "words"),
     [
         ({"lifetime": 0.0}, "lifetime must be positive, got 0.0 s"),
-        ({"lifetime": 9.0, "top_up_every": 5.0, "top_up_below": 0.9}, "two ways of one thing"),
+        ({"lifetime": 9.0, "top_up_every": 5.0, "top_up_below": 0.9}, "exclude each other"),
         ({"lifetime": 9.0, "top_up_below": 1.0}, "between 0 and 1, got 1.0"),
-        ({"lifetime": 9.0, "refill": 1.0}, "0 where nothing tops up, got 1.0 s"),
+        ({"lifetime": 9.0, "refill": 1.0}, "0 without top_up_every or top_up_below, got 1.0 s"),
         ({"lifetime": 9.0, "top_up_below": 0.9, "refill": -1.0}, "refill must be >= 0"),
         ({"lifetime": 9.0, "top_up_every": 2.0, "refill": 2.0}, "longer than refill, got 2.0 and 2.0 s"),
     ],
