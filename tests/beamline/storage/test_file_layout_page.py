@@ -1,0 +1,159 @@
+"""docs/file_layout.md names every path, file and key that is written, and none that is not."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import pytest
+from click.testing import CliRunner
+
+from beamline.cli.main import main
+from beamline.core.events import Event
+from beamline.monitor.checks import ALARM_SHIFT, CHECKS
+from beamline.monitor.digest import digest
+from beamline.simulate.labels import Run, write_labels
+from beamline.storage.ingest import ingest
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.frame import FrameKind
+from drivers.protocols import BeamReading
+from tests.beamline.fakes import FakeInstrument, Faults
+from tests.beamline.ran import Ran
+from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
+from tests.beamline.storage.conftest import StandingClock
+
+PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encoding="utf-8")
+SCAN = TwoCylinders(shape=(4, 40), pixel_size_mm=0.5)
+NOT_OF_EVERY_RUN = {"scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.log", "report.html"}
+"""Of simulated scans and of the live reconstruction, whose own tests name them."""
+
+
+def rows(title: str) -> list[list[str]]:
+    """Cells of the tables in a section of the page, without the heads."""
+    section = re.split(r"^#+ ", PAGE, flags=re.M)
+    (text,) = [part for part in section if part.startswith(f"{title}\n")]
+    lines = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+
+
+def names(title: str) -> list[str]:
+    return [row[0].strip("` ") for row in rows(title)]
+
+
+def unmatched(found: Iterable[str], named: Iterable[str]) -> tuple[set[str], set[str]]:
+    """What was found and is not on the page, and what the page names and was not found."""
+    found, pattern = set(found), {}
+    for name in named:
+        pattern[name] = re.compile(re.sub(r"<[^>]*>", "[^/]+", re.escape(name).replace(r"\ ", " ")) + r"\Z")
+    return (
+        {path for path in found if not any(p.match(path) for p in pattern.values())},
+        {name for name, p in pattern.items() if not any(p.match(path) for path in found)},
+    )
+
+
+def paths(*files: Path) -> set[str]:
+    """Every dataset in HDF5 files, by every name that leads to it."""
+    found: set[str] = set()
+
+    def walk(group: h5py.Group) -> None:
+        for name, item in group.items():
+            if isinstance(item, h5py.Group):
+                walk(item)
+            else:
+                found.add(f"{group.name.rstrip('/')}/{name}")
+
+    for path in files:
+        with h5py.File(path) as file:
+            walk(file)
+    return found
+
+
+@pytest.fixture
+def whole_scan(tmp_path: Path) -> list[Path]:
+    """A scan with all that a scan file can have but a no-data value, and an ingested one that has that."""
+    info = ScanInfo(
+        "s", pixel_size_mm=0.5, energy_kev=20.0, distance_mm=900.0, exposure=0.1, period=0.2, axis_col=20.7,
+        source_distance_mm=1e4, devices={"stage": {"model": "m"}}, beam_unit="A",
+    )  # fmt: skip
+    frames = frames_of(SCAN)
+    frames.append(replace(frames[-1], index=len(frames), kind=FrameKind.ALIGNMENT))
+    writer = NXtomoWriter(tmp_path / "scan.h5", info, SCAN.shape, clock=StandingClock())
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    writer.close(beam=[BeamReading(1.0, "A", 1.8e9)])
+    assert writer.remarks == []
+    ingested = ingest(write_exchange(tmp_path / "exchange.h5", SCAN), tmp_path / "ingested.h5", no_data=0.0)
+    return [writer.path, ingested.path]
+
+
+def test_scan_files(whole_scan: list[Path]) -> None:
+    assert unmatched(paths(*whole_scan), names("Scan file")) == (set(), set())
+
+
+def test_shapes_and_types_of_a_scan_file(whole_scan: list[Path]) -> None:
+    """Types as they are written, one axis in the shape for each of the dataset."""
+    with h5py.File(whole_scan[0]) as file:
+        for path, said, unit, *_ in rows("Scan file"):
+            item = None if "<" in path else file.get(path.strip("`"))
+            if item is None or said == "link":
+                continue
+            kind, _, shape = said.partition(" [")
+            assert len(shape.split(",")) * bool(shape) == item.ndim, path
+            if re.fullmatch("[iuf][1248]", kind):
+                assert item.dtype.str.lstrip("<|") == kind, path
+            if unit in ("s", "mm", "keV", "degree", "deg", "bit", "pixel"):
+                assert item.attrs["units"] == unit, path
+
+
+def test_the_flags() -> None:
+    assert rows("Flags") == [[check.name, str(check.bit), check.unit, check.meaning] for check in CHECKS]
+    assert f"`{ALARM_SHIFT} + b`" in PAGE
+
+
+def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "exchange.h5", SCAN)
+    events: list[dict[str, object]] = []
+    fit = ["--method", "r2", "--steps", "20", "--gaussians", "300", "--checkpoint", str(tmp_path / "checkpoint.h5")]
+    for name, options in (("fbp", ["--method", "fbp"]), ("r2", fit)):
+        words = ["recon", str(path), *options, "-o", str(tmp_path / f"{name}.h5"), "--no-report", "--json"]
+        done = CliRunner().invoke(main, words, catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        events += [json.loads(line) for line in done.stdout.splitlines()]
+    assert unmatched(paths(tmp_path / "fbp.h5", tmp_path / "r2.h5"), names("Volume file")) == (set(), set())
+    assert unmatched(paths(tmp_path / "checkpoint.h5"), names("Checkpoint")) == (set(), set())
+    assert_on_the_page(events)
+
+
+def test_labels(tmp_path: Path) -> None:
+    write_labels(tmp_path / "s.labels.json", [Run("floaters", 2, ((0, 1, 2, 3),))], 9)
+    labels = json.loads((tmp_path / "s.labels.json").read_text(encoding="utf-8"))
+    found = {*labels, *(f"anomalies.{key}" for key in labels["anomalies"][0])}
+    assert unmatched(found, names("Labels")) == (set(), set())
+
+
+def test_run_folder_and_events_of_a_scan(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
+    assert ran.folder is not None
+    found = {path.name for path in ran.folder.iterdir()}
+    assert unmatched(found, names("Run folder")) == (set(), NOT_OF_EVERY_RUN)
+    events = [json.loads(line) for line in (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert {"state", "run_started", "frame", "flag", "scan_done", "done"} <= {event["event"] for event in events}
+    assert_on_the_page(events)
+
+
+def assert_on_the_page(events: Iterable[dict[str, object]]) -> None:
+    """Every event has the keys that the page names, and no other unless the page leaves the list open."""
+    named = {row[0].strip("`"): row[1] for row in rows("Events")}
+    for event in events:
+        said = named[str(event["event"])]
+        keys, expected = set(event) - {"event", "time"}, set(re.findall("`([a-z_]+)`", said))
+        assert keys >= expected if said.endswith("...") else keys == expected, event
+
+
+def test_the_page_knows_the_vocabulary_of_a_scan() -> None:
+    vocabulary = re.findall(r"\w+", (Event.__doc__ or "").split("Vocabulary:")[1].split("\n\n")[0])
+    assert set(names("Events")) <= set(vocabulary)
