@@ -1,1 +1,1 @@
-"""Devices: their Protocols, and drivers for real ones."""
+"""Devices: their Protocols, and the drivers of real devices."""

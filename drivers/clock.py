@@ -1,4 +1,4 @@
-"""Clock: the time that devices and waits run on; it comes in as an argument so that simulations can bend it."""
+"""Clock: the time of devices and waits; an argument of every driver, so that a simulation can use its own."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """Wall-clock time that never goes back: epoch at start plus a steady counter, so that frames stay in order.
+    """Wall-clock time that never goes back: the epoch time at the start plus a monotonic counter.
 
-    The counter is the performance counter: Windows advances the other one (time.monotonic) in steps of 16 ms.
+    The counter is time.perf_counter: Windows advances time.monotonic in steps of 16 ms.
     """
 
     def __init__(self) -> None:

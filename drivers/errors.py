@@ -1,4 +1,4 @@
-"""DeviceError: what a device was asked, what it answered, what was expected, what to do, and what has (not) moved."""
+"""DeviceError: the request, the reply, what was expected, what to do, and in which state the device was left."""
 
 from __future__ import annotations
 
@@ -6,7 +6,17 @@ from __future__ import annotations
 class DeviceError(Exception):
     """A device did not do what it was asked.
 
-    The message is one readable paragraph; the parts stay available for machines. `wire`: what last went over its line.
+    The message is one readable paragraph; its parts are attributes.
+
+    Attributes:
+        device: name of the device.
+        problem: what happened.
+        request: what was sent to the device.
+        reply: what it answered.
+        expected: what a good reply would have been.
+        advice: what to do.
+        state: what was changed or moved, and what was not.
+        wire: the last lines sent and received.
     """
 
     def __init__(
@@ -39,8 +49,8 @@ class DeviceError(Exception):
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
 
-class DeviceTimeout(DeviceError):  # noqa: N818 - it is the name operators know
-    """A device did not answer, or a frame did not come, in the time allowed."""
+class DeviceTimeout(DeviceError):  # noqa: N818 - the name that operators know
+    """A device did not answer, or no frame arrived, in the time allowed."""
 
 
 class DeviceRefused(DeviceError):  # noqa: N818

@@ -1,4 +1,4 @@
-"""Frame: one detector image and what is known about it. A camera, a simulator and a file all yield Frames."""
+"""Frame: one detector image with its metadata; cameras, simulators and files all yield Frames."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class FrameKind(IntEnum):
-    """What a frame shows. The values are NXtomo's image_key (ALIGNMENT is ESRF's extension)."""
+    """Kind of image. The values are those of NXtomo's image_key (ALIGNMENT is an extension by the ESRF)."""
 
     PROJECTION = 0
     FLAT = 1
@@ -21,15 +21,15 @@ class FrameKind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image. It owns its memory: the one copy out of the camera's ring.
+    """One image with its metadata. It owns its memory, which is the only copy made of the camera's ring buffer.
 
     Attributes:
         counts: uint16 [row, col].
-        kind: what it shows.
+        kind: projection, flat, dark, ...
         index: row in the file, counted over all frames of the scan from 0.
         trigger: index of the trigger pulse that exposed it, counted within its block of frames from 0.
-        framestamp: the camera's own counter, -1 where there is none.
-        angle: radians, the stage position at the trigger; NaN for no stage position (a dark with the stage anywhere).
+        framestamp: the camera's own counter, -1 without one.
+        angle: radians, the stage position at the trigger; NaN where the position does not matter (a dark).
         time: s since the Unix epoch, at the trigger.
         exposure: s.
     """

@@ -1,16 +1,19 @@
-"""Manual shutter and sample mover: an operator does the work when asked, and the driver remembers what was done."""
+"""Manual shutter and sample mover: the driver asks an operator to act and keeps the state that was confirmed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Ask = Callable[[str], None]
-"""Puts a request to the operator and returns once it is done; raises whatever the caller uses for "not done"."""
+"""Shows the operator a request and returns once it is confirmed; raises the caller's own error otherwise."""
 
 
 class ManualShutter:
-    """Implements `drivers.protocols.Shutter`. What the beamline's shutter does at the start is not known, so `open` and
-    `close` always ask the first time; a state that is already there is not asked for again."""
+    """Implements `drivers.protocols.Shutter` by asking the operator.
+
+    The state of the shutter at the start is not known, so the first `open` or `close` always asks; later ones ask only
+    where the state changes.
+    """
 
     def __init__(self, ask: Ask, name: str = "shutter") -> None:
         self.name = name
@@ -28,12 +31,12 @@ class ManualShutter:
             self._open = False
 
     def is_open(self) -> bool:
-        """What was last confirmed; False before that, so that nobody counts on beam."""
+        """The state last confirmed; False before the first confirmation, the safe assumption for a measurement."""
         return self._open is True
 
 
 class ManualSampleMover:
-    """Implements `drivers.protocols.SampleMover`. The sample is taken to be in the beam at the start."""
+    """Implements `drivers.protocols.SampleMover` by asking the operator; the sample starts in the beam."""
 
     def __init__(self, ask: Ask, name: str = "sample mover") -> None:
         self.name = name

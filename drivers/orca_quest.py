@@ -1,7 +1,7 @@
-"""ORCA-Quest figures: what the data sheet says about settings and timing, for planning where no camera may be asked.
+"""ORCA-Quest data sheet: limits of settings and timing, for planning without a camera.
 
-C15550-20UP: limits and line times from the vendor's property table; a real camera's own answer always goes before
-these. Two rows are read together in one line time, so row r starts r / 2 line times after row 0.
+C15550-20UP: limits and line times from the vendor's property table; where a camera is connected, its own values take
+precedence. Two rows are read together in one line time, so row r starts r / 2 line times after row 0.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ BITS = 16
 ROI_STEP = 4
 BINNINGS = (1, 2, 4)
 LINE_TIME = MappingProxyType({"standard": 7.2e-6, "ultra_quiet": 172.8e-6, "photon_number": 172.8e-6})
-"""s for two rows; also the shortest exposure. The camera resolves photon numbers at the pace of ultra quiet."""
+"""s for two rows; also the shortest exposure. Photon number resolving reads as slowly as ultra quiet."""
 MAX_EXPOSURE = 1800.0
 FRAME_OVERHEAD_LINES = 5
-"""Line times between frames: with 1152 lines they make the 120 frames/s of the standard mode."""
+"""Line times between two frames: with the 1152 lines of a frame they give the standard mode's 120 frames/s."""
 LINK_BYTES_PER_S = MappingProxyType({"usb3": 4096 * 2304 * 2 * 17.6996, "coaxpress": 4096 * 2304 * 2 * 120.04})
-"""From the full-frame 16-bit rates of the two interfaces."""
+"""Computed from the full-frame 16-bit frame rates of the two interfaces."""
 
 
 def refusal(settings: CameraSettings) -> str:
-    """Why the camera would refuse the settings, with the legal values; empty where it would not."""
+    """Reason for which the camera would refuse the settings, with the legal values; "" if it takes them."""
     if settings.readout not in LINE_TIME:
         return f"readout {settings.readout!r} is unknown; legal: {', '.join(LINE_TIME)}"
     if settings.binning not in BINNINGS:
@@ -45,9 +45,9 @@ def refusal(settings: CameraSettings) -> str:
 
 
 def timing(settings: CameraSettings, link: str = "usb3") -> CameraTiming:
-    """Frame shape and times under external or software triggers, where readout does not overlap the next exposure.
+    """Frame shape and timing under external or software triggers: readout does not overlap the next exposure.
 
-    The least period is exposure + readout, or the time the link takes for a frame where that is longer.
+    The shortest period is exposure + readout, or the transfer time of a frame where that is longer.
 
     Raises:
         ValueError: the camera would refuse the settings.

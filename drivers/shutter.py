@@ -1,4 +1,4 @@
-"""Shutter on a digital output: any controller's output opens and closes it, with time to travel and a look back."""
+"""Shutter on a digital output of any controller: set the output, wait for the blade, read the output back."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ class DigitalOutput(Protocol):
     name: str
 
     def set(self, high: bool) -> None:
-        """Put the line to high or low. Raises DeviceError where the controller does not take it."""
+        """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
         ...
 
     def get(self) -> bool | None:
-        """The line is high, as the controller says; None where it does not tell."""
+        """Whether the line is high; None if the controller cannot read it back."""
         ...
 
 
 class OutputShutter:
     """Implements `drivers.protocols.Shutter` on a controller's output.
 
-    The look back is at the output, which is not the blade: whether the shutter obeyed, only the beam can say. Closing
-    always sends, whatever is known: a beam that is off twice harms nobody.
+    Reading back checks the output, not the blade: only the beam shows whether the shutter moved. `close` always sends
+    its command, also where the shutter is known to be closed.
 
     Args:
-        output: the line that the shutter's driver listens to.
-        open_high: a high line opens (else a low one does: then a controller without power opens the shutter).
-        settle: s that the blade travels; `open` and `close` return after it.
+        output: the line that drives the shutter.
+        open_high: a high line opens the shutter. With False a low line does, and so does a controller without power.
+        settle: travel time of the blade, s; `open` and `close` wait for it.
 
     Raises:
-        DeviceRefused: a settling time that is no time.
+        DeviceRefused: a settling time that is negative or not finite.
     """
 
     def __init__(
@@ -49,22 +49,24 @@ class OutputShutter:
     ) -> None:
         self.name = name
         if not (math.isfinite(settle) and settle >= 0):
-            raise DeviceRefused(name, f"a settling time of {settle} s is none", expected="0 or more seconds")
+            raise DeviceRefused(name, f"the settling time of {settle} s is not valid", expected="0 or more seconds")
         self._output, self._clock, self._open_high, self._settle = output, clock, open_high, settle
         self._open: bool | None = None  # as last sent; None before that, and after a failure
 
     def open(self) -> None:
-        """Open and wait for the blade. Raises DeviceError: the output did not take it, or does not hold it."""
+        """Open and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
         if self._open is None or not self.is_open():
             self._put(True)
 
     def close(self) -> None:
-        """Close and wait for the blade. Raises DeviceError: the output did not take it, or does not hold it."""
+        """Close and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
         self._put(False)
 
     def is_open(self) -> bool:
-        """What the output says; where it does not tell, what was last sent: False before, so that nobody counts on
-        beam. Raises DeviceError."""
+        """Whether the output holds the open level; without read-back, whether `open` was the last command sent.
+
+        False before the first command. Raises DeviceError.
+        """
         level = self._output.get()
         return self._open is True if level is None else level is self._open_high
 
@@ -76,11 +78,11 @@ class OutputShutter:
             self._clock.sleep(self._settle)
             held = self._output.get()
         except DeviceError as cause:
-            raise self._unheard(opened, level, cause) from cause
+            raise self._not_set(opened, level, cause) from cause
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
-                f"the output {self._output.name} does not hold what it was told",
+                f"the output {self._output.name} does not hold the level that was set",
                 request="high" if level else "low",
                 reply="high" if held else "low",
                 expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",
@@ -89,8 +91,8 @@ class OutputShutter:
             )
         self._open = opened
 
-    def _unheard(self, opened: bool, level: bool, cause: DeviceError) -> DeviceError:
-        """The output's own failure does not say that a shutter hangs on it."""
+    def _not_set(self, opened: bool, level: bool, cause: DeviceError) -> DeviceError:
+        """The error of the output as an error of the shutter."""
         return DeviceError(
             self.name,
             f"it could not be {'opened' if opened else 'closed'}: {cause.device}: {cause.problem}",

@@ -1,4 +1,4 @@
-"""USB preflight: is the camera on the bus, and on a SuperSpeed link? Only descriptors are read, nothing is claimed."""
+"""USB check before a camera is opened: is it connected, and on a SuperSpeed link? Only descriptors are read."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _LINKS = {1: "1.5 Mbit/s", 2: "12 Mbit/s", 3: "480 Mbit/s", 4: "5 Gbit/s", 5: "1
 
 class Verdict(StrEnum):
     READY = "ready"
-    SLOW = "slow"  # it would work, at a fraction of its frame rate
+    SLOW = "slow"  # the camera works, at a fraction of its frame rate
     ABSENT = "absent"
     AMBIGUOUS = "ambiguous"
-    UNKNOWN = "unknown"  # this machine cannot tell
+    UNKNOWN = "unknown"  # this machine cannot check
 
 
 @dataclass(frozen=True)
 class UsbDevice:
-    """What a device tells without being claimed. Texts that may not be read are empty; speed is libusb's number."""
+    """Descriptors of one USB device. Texts without read permission are empty; `speed` is libusb's number."""
 
     vendor: int
     product: int
@@ -41,7 +41,7 @@ class UsbDevice:
 
 @dataclass(frozen=True)
 class Preflight:
-    """The verdict, one sentence for the operator, and the devices that it rests on."""
+    """The verdict, one sentence for the operator, and the devices found."""
 
     verdict: Verdict
     message: str
@@ -51,11 +51,11 @@ class Preflight:
 def preflight(
     vendor: int = HAMAMATSU, product: int | None = None, serial: str | None = None, backend: Any = None
 ) -> Preflight:
-    """Look for one camera on USB; never raises for what it finds or cannot find.
+    """Look for one camera on USB; every outcome is a verdict, none an exception.
 
     Args:
-        vendor, product: USB ids. A vendor makes other things too: give the product id once it is known.
-        serial: tells several cameras apart.
+        vendor, product: USB ids; without the product id other devices of the vendor match too.
+        serial: serial number, needed with several cameras of one kind.
         backend: a pyusb backend; None takes the installed libusb.
     """
     fields = {"idVendor": vendor} if product is None else {"idVendor": vendor, "idProduct": product}
@@ -66,7 +66,7 @@ def preflight(
         return Preflight(Verdict.UNKNOWN, "USB cannot be checked: libusb is not installed on this machine.")
     except usb.core.USBError as error:
         return Preflight(Verdict.UNKNOWN, f"USB cannot be checked: {error}.")
-    # A device whose serial number may not be read might be the one.
+    # A device whose serial number cannot be read may be the one wanted.
     devices = tuple(device for device in found if not (serial and device.serial and device.serial != serial))
     if not devices:
         which = f"{wanted} with serial number {serial}" if serial else wanted
@@ -91,7 +91,7 @@ def _describe(device: Any) -> UsbDevice:
     for index in (device.iProduct, device.iSerialNumber):
         try:
             texts.append(usb.util.get_string(device, index) or "")
-        except (usb.core.USBError, ValueError, NotImplementedError):  # no permission, or no language: it has no name
+        except (usb.core.USBError, ValueError, NotImplementedError):  # no permission, or no language: no name
             texts.append("")
     usb.util.dispose_resources(device)  # so that the vendor's driver can open it
     name, serial = (text.strip("\0 ") for text in texts)

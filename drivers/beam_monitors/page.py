@@ -1,4 +1,4 @@
-"""Beam monitor's page: the text of a web page or a file, as facilities publish their ring current."""
+"""PageSource: a beam monitor's text from a web page or a file, as facilities publish their ring current."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 
 MOST_BYTES = 1 << 20
-"""Of a page that are read: the number stands before."""
+"""Bytes of a page that are read at most; the number must stand within them."""
 _PIECE = 1 << 14
 
 
 class PageSource:
-    """Implements `drivers.beam_monitors.reading.TextSource` over http, https or file. Proxies are passed by: the page
-    is the facility's own.
+    """Implements `drivers.beam_monitors.reading.TextSource` over http, https or file.
+
+    No proxy is used: the page is in the facility's own network.
 
     Args:
         url: http://..., https://... or file:///...
-        timeout: s for the whole page, and for each wait on the network.
+        timeout: s, for the whole page and for each wait on the network.
 
     Raises:
-        DeviceRefused: another kind of address.
+        DeviceRefused: the URL is of another kind.
     """
 
     def __init__(self, url: str, clock: Clock, *, timeout: float = 2.0, name: str = "beam monitor") -> None:
@@ -35,13 +36,13 @@ class PageSource:
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
     def text(self) -> str:
-        """The page, as far as MOST_BYTES. Raises DeviceTimeout, DeviceError."""
+        """The text of the page, at most MOST_BYTES of it. Raises DeviceTimeout, DeviceError."""
         deadline = self._clock.now() + self._timeout
         try:
             with self._opener.open(self.request, timeout=self._timeout) as page:
                 charset = page.headers.get_content_charset() or "utf-8"
                 data = bytearray()
-                # read1: what has come so far. A server that drips would keep `read` for ever.
+                # read1 returns the bytes received so far; `read` would wait for ever on a server that sends slowly.
                 while len(data) < MOST_BYTES and (piece := getattr(page, "read1", page.read)(_PIECE)):
                     data += piece
                     if self._clock.now() > deadline:
@@ -59,7 +60,7 @@ class PageSource:
             raise self._error(DeviceError, f"the page cannot be read ({error or type(error).__name__})") from error
         try:
             return data.decode(charset, errors="replace")
-        except LookupError:  # a charset that Python does not know; numbers are ASCII in nearly all
+        except LookupError:  # a charset unknown to Python: digits are ASCII in nearly every charset
             return data.decode("ascii", errors="replace")
 
     def close(self) -> None:
@@ -75,7 +76,7 @@ class PageSource:
 
 
 def url_problem(url: str) -> str:
-    """Why an address cannot be asked; empty where it can."""
+    """Reason for which a URL cannot be read; "" if it can."""
     try:
         parts = urlsplit(url)
         legal = parts.scheme == "file" or (parts.scheme in ("http", "https") and bool(parts.hostname))

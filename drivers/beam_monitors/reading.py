@@ -1,4 +1,4 @@
-"""Beam monitor: how much beam there is, as the number that a pattern finds in what a source says."""
+"""TextBeamMonitor: reads the beam intensity as the number that a regular expression finds in a text."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import BeamReading
 
 OVERFLOW = 9.9e37
-"""SCPI instruments answer this for "over range" and 9.91e37 for "not a number" (SCPI-99, section 7.2.1)."""
+"""SCPI instruments send 9.9e37 for "over range" and 9.91e37 for "not a number" (SCPI-99, section 7.2.1)."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_TOLD = 200
-"""Characters of a source's text that an error shows."""
+_SHOWN = 200
+"""Characters of the text that an error shows."""
 
 
 class TextSource(Protocol):
-    """Whatever can be asked for a text that holds the number: an instrument, a page."""
+    """A source of a text that holds the number: an instrument or a web page."""
 
     request: str
-    """What is asked, for errors."""
+    """The query or URL, for error messages."""
 
     def text(self) -> str:
-        """The present text. Raises DeviceTimeout, DeviceError."""
+        """The current text. Raises DeviceTimeout, DeviceError."""
         ...
 
     def close(self) -> None: ...
@@ -34,12 +34,12 @@ class TextBeamMonitor:
     """Implements `drivers.protocols.BeamMonitor` over a source of text.
 
     Args:
-        pattern: regular expression; its first group is the number, wherever it first stands in the text.
-        unit: of the reading, for the record.
-        scale: what the number is multiplied by to be in `unit`.
+        pattern: regular expression, searched in the text; its first group is the number.
+        unit: of the reading, written to the file.
+        scale: factor from the number to `unit`.
 
     Raises:
-        DeviceRefused: a pattern without a group, or a scale that is none.
+        DeviceRefused: a pattern without a group, or a scale that is 0 or not finite.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class TextBeamMonitor:
         if problem := pattern_problem(pattern):
             raise DeviceRefused(name, problem, state="Nothing was asked")
         if not math.isfinite(scale) or scale == 0:
-            raise DeviceRefused(name, f"a scale of {scale} is none", expected="a number that is not zero")
+            raise DeviceRefused(name, f"the scale {scale} is not valid", expected="a number that is not zero")
         self._source, self._clock, self._unit, self._scale = source, clock, unit, scale
         self._pattern = re.compile(pattern)
 
     def reading(self) -> BeamReading:
-        """Ask the source. Raises DeviceTimeout, or DeviceError: no number, over range, or not finite."""
+        """Read the source once. Raises DeviceTimeout, or DeviceError: no number, or over range."""
         text = self._source.text()
         time = self._clock.now()
         match = self._pattern.search(text)
@@ -81,21 +81,21 @@ class TextBeamMonitor:
             self.name,
             problem,
             request=self._source.request,
-            reply=text[:_TOLD].strip(),
+            reply=text[:_SHOWN].strip(),
             expected=f"a number where {self._pattern.pattern!r} has its group",
             advice="Check the instrument's range and state, and the pattern in the configuration",
         )
 
 
 def pattern_problem(pattern: str) -> str:
-    """Why a pattern cannot be used; empty where it can."""
+    """Reason for which a pattern cannot be used; "" if it can."""
     try:
         groups = re.compile(within_a_line(pattern)).groups
     except re.error as error:
-        return f"the pattern {pattern!r} is no regular expression ({error})"
+        return f"the pattern {pattern!r} is not a regular expression ({error})"
     return "" if groups else f"the pattern {pattern!r} has no group (...) around the number"
 
 
 def within_a_line(pattern: str) -> str:
-    """The form of a whole line that holds what `pattern` finds."""
+    """A pattern for a whole line that contains a match of `pattern`."""
     return f".*?(?:{pattern}).*"

@@ -1,8 +1,8 @@
-"""Beam monitor's electrometer: an instrument on a serial line that answers a query with a line that holds a number.
+"""SerialSource: a beam monitor's text from an electrometer on a serial line, one line in reply to a query.
 
-Confirmed on no instrument. The defaults follow the Keithley 6485 picoammeter as remembered (`READ?` answers
-`+1.0427E-12A,+2.345E+02,+0.000E+00`: current, time, status; 9600 baud; the line's end is set on its panel): check them
-on yours.
+Not tested on an instrument. The defaults are meant for the Keithley 6485 picoammeter (`READ?` answers
+`+1.0427E-12A,+2.345E+02,+0.000E+00`: current, time, status; 9600 baud; line end as set on its front panel) and were
+not checked against its manual: check them on yours.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ class SerialSource:
     """Implements `drivers.beam_monitors.reading.TextSource` over a serial line.
 
     Args:
-        url: what pyserial opens.
-        query: asks for a reading; it must be harmless, since it also finds the line's step again.
-        pattern: what every answer holds; another answer is taken for a disturbed line.
-        setup: commands without a reply that are sent once, before the first query.
-        line_end: of commands and answers.
+        url: pyserial URL.
+        query: command that asks for a reading; it must have no side effects, since it is also the line's probe (see
+            `SerialLine`).
+        pattern: regular expression that every reply contains; any other reply counts as a disturbed line.
+        setup: commands without a reply, sent once before the first query.
+        line_end: of commands and replies.
         transcript: see `SerialLine`.
 
     Raises:
@@ -52,7 +53,7 @@ class SerialSource:
         self.request = query
         self._form = within_a_line(pattern)
         if not query:
-            raise DeviceRefused(name, "an empty query asks for nothing", state="Nothing was sent")
+            raise DeviceRefused(name, "the query is empty", state="Nothing was sent")
         self._line = SerialLine(
             url,
             device=name,
@@ -71,7 +72,7 @@ class SerialSource:
             raise
 
     def text(self) -> str:
-        """The answer to the query. Raises DeviceTimeout, DeviceError."""
+        """The reply to the query. Raises DeviceTimeout, DeviceError."""
         return self._line.query(self.request, self._form, "a line with a number")[0]
 
     def close(self) -> None:

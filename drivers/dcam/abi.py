@@ -1,4 +1,4 @@
-"""The DCAM-API v4 through ctypes: its library, and one Python method for each call that we use."""
+"""The DCAM-API v4 through ctypes: the library, with one Python method for each function that this driver calls."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ ARGUMENTS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
         "dcamwait_start": (c_void_p, POINTER(WaitStart)),
     }
 )
-"""Every function that this driver calls, and the types of what it takes; all answer with an int32."""
+"""Every function that this driver calls, with its argument types; all return an int32."""
 
 _ADVICE: Mapping[int, str] = MappingProxyType(
     {
@@ -96,11 +96,11 @@ _STATE: Mapping[str, str] = MappingProxyType(
         "dcamcap_firetrigger": "No frame was exposed",
     }
 )
-"""What a call that failed leaves behind; the others only ask."""
+"""State after a call that failed; calls that are not listed only read."""
 
 
 class DcamError(DeviceError):
-    """A DCAM call answered with an error; `code` is one of codes.Error (or an unknown number)."""
+    """A DCAM call returned an error; `code` is one of `codes.Error`, or an unknown number."""
 
     def __init__(self, device: str, call: str, code: int) -> None:
         self.code = code & 0xFFFFFFFF
@@ -116,21 +116,21 @@ class DcamError(DeviceError):
 
 
 def installed_library(platform: str) -> str:
-    """The name under which the vendor's runtime installs the library; `platform` as sys.platform has it."""
+    """File name of the library that the vendor's runtime installs; `platform` is a value of sys.platform."""
     return "dcamapi.dll" if platform == "win32" else "libdcamapi.so"
 
 
 class Dcam:
-    """A loaded DCAM library. Handles are plain integers; every method raises DcamError where the library answers so.
+    """A loaded DCAM library. Handles are plain integers; every method raises DcamError if the library returns an error.
 
-    Waiting calls release Python's global lock.
+    Calls that wait release Python's global interpreter lock.
 
     Args:
-        library: path of the library; None asks the system for the installed one.
-        device: the name that errors carry.
+        library: path of the library; None: the installed one.
+        device: name of the camera in error messages.
 
     Raises:
-        DeviceError: there is no such library, or it lacks a function.
+        DeviceError: the library cannot be loaded, or lacks a function.
     """
 
     def __init__(self, library: Path | None, device: str) -> None:
@@ -160,17 +160,17 @@ class Dcam:
             raise DcamError(self._device, f"{call} {detail}".rstrip(), code)
 
     def api_init(self) -> int:
-        """Start the session (seconds on real hardware); the number of cameras found."""
+        """Start the session (takes seconds with a real camera); returns the number of cameras found."""
         init = ApiInit(size=sizeof(ApiInit))
         self._call("dcamapi_init", byref(init))
         return int(init.device_count)
 
     def api_uninit(self) -> None:
-        """End the session; closes everything that is open."""
+        """End the session; this closes all that is open."""
         self._call("dcamapi_uninit")
 
     def dev_open(self, index: int) -> int:
-        """The handle of camera `index`."""
+        """Open camera `index`; returns its handle."""
         opened = DevOpen(size=sizeof(DevOpen), index=index)
         self._call("dcamdev_open", byref(opened), detail=f"index {index}")
         return int(opened.camera)
@@ -179,7 +179,7 @@ class Dcam:
         self._call("dcamdev_close", camera)
 
     def dev_getcapability(self, camera: int) -> Capability:
-        """Which stamps frames carry, as the library says."""
+        """Which stamps (count, time) frames carry, according to the library."""
         capability = DevCapability(size=sizeof(DevCapability))  # domain 0: functions
         self._call("dcamdev_getcapability", camera, byref(capability))
         return Capability(capability.flags)
@@ -191,7 +191,7 @@ class Dcam:
         return buffer.value.decode("ascii", errors="replace")
 
     def prop_getattr(self, camera: int, prop: Property) -> PropAttr:
-        """Range, step and access of a property in the camera's present state."""
+        """Range, step and access of a property in the camera's current state."""
         attribute = PropAttr(size=sizeof(PropAttr), prop=prop)
         self._call("dcamprop_getattr", camera, byref(attribute), detail=prop.name)
         return attribute
@@ -205,20 +205,20 @@ class Dcam:
         self._call("dcamprop_setvalue", camera, prop, value, detail=f"{prop.name} = {value:g}")
 
     def prop_queryvalue(self, camera: int, prop: Property, value: float, option: int) -> float:
-        """The legal value that stands to `value` as `option` says; an error where there is none."""
+        """The legal value next to `value` (`option`: in which direction); an error if there is none."""
         answer = c_double(value)
         self._call("dcamprop_queryvalue", camera, prop, byref(answer), option, detail=prop.name)
         return answer.value
 
     def buf_alloc(self, camera: int, frames: int) -> None:
-        """A ring of `frames` in the library's memory; the properties that shape frames are locked until release."""
+        """Allocate a ring in the library's memory; until release, properties that change the frame size are locked."""
         self._call("dcambuf_alloc", camera, frames, detail=f"{frames} frames")
 
     def buf_release(self, camera: int) -> None:
         self._call("dcambuf_release", camera, 0)
 
     def buf_lockframe(self, camera: int, slot: int) -> BufFrame:
-        """Where a slot's pixels lie, until the ring overwrites them. There is no unlock call."""
+        """Address and stamps of a slot's frame, valid until the ring overwrites it; DCAM has no unlock call."""
         frame = BufFrame(size=sizeof(BufFrame), index=slot)
         self._call("dcambuf_lockframe", camera, byref(frame), detail=f"slot {slot}")
         return frame
@@ -236,7 +236,7 @@ class Dcam:
         try:
             return CaptureState(status.value)
         except ValueError:
-            problem = f"its capture is in a state {status.value} that DCAM-API version 4 does not have"
+            problem = f"its capture status is {status.value}, which DCAM-API version 4 does not define"
             raise DeviceError(
                 self._device,
                 problem,
@@ -248,7 +248,7 @@ class Dcam:
             ) from None
 
     def cap_transferinfo(self, camera: int) -> int:
-        """Frames put into the ring since the start; never blocks."""
+        """Number of frames written to the ring since the start; never blocks."""
         info = TransferInfo(size=sizeof(TransferInfo))
         self._call("dcamcap_transferinfo", camera, byref(info))
         return int(info.count)
@@ -257,7 +257,7 @@ class Dcam:
         self._call("dcamcap_firetrigger", camera, 0)
 
     def wait_open(self, camera: int) -> tuple[int, int]:
-        """A wait handle, and the events that this camera can signal."""
+        """Open a wait handle; returns it and the events that this camera can signal."""
         opened = WaitOpen(size=sizeof(WaitOpen), camera=camera)
         self._call("dcamwait_open", byref(opened))
         return int(opened.wait), int(opened.supported)
@@ -266,11 +266,11 @@ class Dcam:
         self._call("dcamwait_close", wait)
 
     def wait_abort(self, wait: int) -> None:
-        """End the wait of another thread; nothing where none waits."""
+        """End the wait of another thread; does nothing if none waits."""
         self._call("dcamwait_abort", wait)
 
     def wait_start(self, wait: int, mask: int, timeout_ms: int) -> None:
-        """Block until an event of `mask`. Several may fold into one: it is a hint, the transfer count is the truth.
+        """Block until an event of `mask`. Events may be merged, so the transfer count says how many frames arrived.
 
         Raises:
             DcamError: also TIMEOUT, ABORT, LOSTFRAME and MISSINGFRAME_TROUBLE.

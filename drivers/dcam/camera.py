@@ -1,4 +1,4 @@
-"""DcamCamera: a Hamamatsu camera over the DCAM-API; a ring of buffers, one copy out per frame, losses kept visible."""
+"""DcamCamera: a Hamamatsu camera over the DCAM-API, with a ring of buffers, one copy a frame and a check for losses."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 
-_WAIT_SLICE = 0.1  # s; an event may fall between looking and waiting, so that no single wait may be long
-_LEAST_SLOTS = 16  # where memory allows: the camera may run on beyond the frames asked for while the host stalls
+_WAIT_SLICE = 0.1  # s; short, since an event between looking and waiting is missed
+_LEAST_SLOTS = 16  # if memory allows: the camera may take more frames than asked for while the host is busy
 _TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 
 
 class DcamCamera:
     """A triggered Hamamatsu camera (ORCA-Quest); implements drivers.protocols.Camera.
 
-    A lost frame stays visible: framestamps are the camera's own count, so that a frame lost anywhere leaves a gap. A
-    ring that was overrun is an error besides, and `describe` says how many frames it cost and how often the transport
-    reported a loss. Triggers that come too early leave nothing at all: only times tell. So it is with the loss of a
-    first frame where framestamps go on over captures, which is found out at the start. One thread takes frames;
-    `disarm` and `close` may be called from another one and end its wait.
+    Framestamps are counted by the camera, so a frame that is lost anywhere leaves a gap. An overrun of the ring is also
+    an error, and `describe` returns how many frames were overwritten and how many losses the transport reported. Two
+    losses leave no gap and show in the times only: a trigger that comes too early, and the first frame of a run with a
+    camera whose framestamps continue over captures (the constructor tests for that). One thread takes frames; another
+    may call `disarm` or `close`, which end its wait.
 
     Args:
-        library: path of the DCAM-API library; None takes the installed one. A process can have one session with it.
-        index: which camera, where DCAM finds several.
-        name: what errors call it.
-        clock: dates the first frame of a run when it is fetched; the camera's clock gives the differences after it.
-        options: how it takes triggers, what it does to its counts, and the memory of its ring.
+        library: path of the DCAM-API library; None: the installed one. A process can have one session with it.
+        index: number of the camera among those that DCAM finds, from 0.
+        name: its name in error messages.
+        clock: gives the time of the first frame of a run; the camera's own clock gives the differences after it.
+        options: response to triggers, correction of counts, memory of the ring.
 
     Raises:
-        DeviceError: no library, no camera, or it does not deliver two test frames that it counts.
+        DeviceError: no library, no camera, or no two test frames with counts and times.
     """
 
     def __init__(
@@ -56,20 +56,20 @@ class DcamCamera:
     ) -> None:
         self.name = name
         self._clock, self._options = clock or SystemClock(), options or DcamOptions()
-        self._inside = threading.Lock()  # held by whoever takes a frame: close() waits for it
+        self._inside = threading.Lock()  # held while a frame is taken: close() waits for it
         self._ring_lock = threading.Lock()  # held while slots are read or freed
-        self._ring: Ring | None = None  # armed
-        self._held: Ring | None = None  # in the library's memory, also one that could not be freed
+        self._ring: Ring | None = None  # set while armed
+        self._held: Ring | None = None  # allocated in the library, also if it could not be freed
         self._clock_offset: float | None = None  # s, host time minus the camera's, in this run
-        self._origin: int | None = None  # framestamp of this run's first trigger; None until a frame tells
+        self._origin: int | None = None  # framestamp of this run's first trigger; None until known from a frame
         self._overwritten, self._transport_losses = 0, 0
         self._closed = False
         self._session = Session(library, index, name)
         try:
             self._dcam, self._camera = self._session.dcam, self._session.camera
             self._properties = Properties(self._dcam, self._camera, name)
-            self._apply(_TEST_SETTINGS)  # another program may have left anything
-            stamps = self._stamp_of_a_first_frame(), self._stamp_of_a_first_frame()
+            self._apply(_TEST_SETTINGS)  # another program may have left any settings
+            stamps = self._first_framestamp(), self._first_framestamp()
             self._first_stamp = stamps[0] if stamps[0] == stamps[1] else None
         except BaseException:
             with suppress(DcamError):
@@ -77,14 +77,14 @@ class DcamCamera:
             raise
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Apply and read back: the exposure as the camera rounded it, all else as asked.
+        """Apply settings and read them back; only the exposure may differ, by the camera's rounding.
 
         Raises:
-            DeviceRefused: the camera cannot, or it is armed; it has the settings that it had.
+            DeviceRefused: the camera refuses a setting, or is armed; the earlier settings stay.
         """
         self._require_open()
         if self._ring is not None:
-            raise DeviceRefused(self.name, "it is armed and takes no settings", advice="disarm() it first")
+            raise DeviceRefused(self.name, "it is armed and cannot be configured", advice="disarm() it first")
         before = self._settings
         try:
             self._apply(settings)
@@ -99,7 +99,7 @@ class DcamCamera:
         return read_timing(self._properties, self._settings.trigger, self._options)
 
     def arm(self, n_frames: int) -> None:
-        """Allocate the ring and start; when it returns, the camera takes triggers.
+        """Allocate the ring and start the capture; when this returns, the camera accepts triggers.
 
         Raises:
             DeviceRefused: it is armed already, or n_frames < 1.
@@ -109,7 +109,7 @@ class DcamCamera:
             raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
         if n_frames < 1:
             raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
-        self.disarm()  # a ring that could not be freed
+        self.disarm()  # frees a ring that could not be freed before
         if self._options.trigger_mode is TriggerMode.START:
             apply_trigger_source(self._properties, self._settings.trigger)
         # One slot more than frames: the oldest slot of a full ring may be half overwritten at any moment.
@@ -123,15 +123,15 @@ class DcamCamera:
     def software_trigger(self) -> None:
         if self._ring is None or self._settings.trigger is not TriggerSource.SOFTWARE:
             armed = "not armed" if self._ring is None else "armed"
-            problem = f"it takes no software trigger ({armed}, trigger {self._settings.trigger})"
+            problem = f"it accepts no software trigger ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
         self._dcam.cap_firetrigger(self._camera)
 
     def next_frame(self, timeout: float) -> CameraFrame:
-        """The oldest frame not yet taken, in memory of its own.
+        """The oldest frame not yet taken, as a copy.
 
         Raises:
-            DeviceTimeout: none came within `timeout` s.
+            DeviceTimeout: no frame arrived within `timeout` s.
             DeviceRefused: not armed, or disarmed while waiting.
             DeviceError: the ring was overrun (later frames can still be taken), the camera is unplugged, or the capture
                 ended by itself.
@@ -145,36 +145,36 @@ class DcamCamera:
                 left = deadline - self._clock.now()
                 if left <= 0:
                     problem = f"no frame came within {timeout:g} s of waiting for a trigger ({self._settings.trigger})"
-                    advice = "Check that triggers arrive, and no closer together than the camera's least period"
+                    advice = "Check that triggers arrive, and are no closer together than the camera's shortest period"
                     raise DeviceTimeout(self.name, problem, advice=advice, state="It is still armed")
                 self._await_event(min(left, _WAIT_SLICE))
 
     def disarm(self) -> None:
-        """Stop and free the ring; legal in every state, and another thread's wait for a frame ends.
+        """Stop the capture and free the ring; legal in every state. It ends the wait of another thread for a frame.
 
         Raises:
-            DcamError: the library cannot; calling again tries again.
+            DcamError: the library failed; a second call tries again.
         """
         if not self._closed:
             self._free()
 
     def wait_until_cold(self, timeout: float, progress: cooling.Progress = lambda celsius, status: None) -> float:
-        """Wait until the sensor has the temperature that the cooler holds; °C.
+        """Wait until the sensor has its final temperature; returns it in °C.
 
         Args:
             timeout: s.
-            progress: takes the temperature and the cooler's status, once a second.
+            progress: called once a second with the temperature and the cooler's status.
 
         Raises:
             DeviceRefused: the cooler is off.
             DeviceTimeout: it was not cold in time.
-            DeviceError: the cooler reports trouble.
+            DeviceError: the cooler reports a fault.
         """
         self._require_open()
         return cooling.wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
 
     def describe(self) -> dict[str, str | int | float]:
-        """Identity, what the camera reports of its state, and the losses of the present or last run."""
+        """Identity and state of the camera, and the frames lost in the current or last run."""
         self._require_open()
         return {
             **description(self._session, self._properties, self._settings, self._options),
@@ -184,10 +184,10 @@ class DcamCamera:
         }
 
     def close(self) -> None:
-        """Free everything, also after a failure; may be called again.
+        """Free all resources, also after a failure; may be called again.
 
         Raises:
-            DcamError: the first thing that failed. A camera that is not connected any more is let go without complaint.
+            DcamError: the first failure. A camera that is no longer connected is not one.
         """
         if self._closed:
             return
@@ -214,7 +214,7 @@ class DcamCamera:
             self._session.close()
 
     def _start(self, slots: int, mode: CaptureMode) -> Ring:
-        """A ring that captures; it is held until `_free`, also after an error."""
+        """Allocate a ring and start a capture; it stays allocated until `_free`, also after an error."""
         ring = self._held = Ring(self._dcam, self._camera, self.name, slots)
         try:
             ring.start(mode, self._clock)
@@ -224,8 +224,8 @@ class DcamCamera:
             raise
         return ring
 
-    def _stamp_of_a_first_frame(self) -> int:
-        """0 or 1, as the model has it: without it, the loss of a run's first frame could not be seen."""
+    def _first_framestamp(self) -> int:
+        """Framestamp of the first frame of a capture, 0 or 1 by model; it reveals a lost first frame of a run."""
         ring = self._start(2, CaptureMode.SNAP)
         deadline = self._clock.now() + START_TIMEOUT
         while ring.arrived() < 2:
@@ -244,23 +244,23 @@ class DcamCamera:
         return int(first.framestamp)
 
     def _await_event(self, seconds: float) -> None:
-        """Wait for a reason to look into the ring again; what there is to see, the ring itself says."""
+        """Wait until something may have changed in the ring; `_look` then reads what it is."""
         try:
             self._dcam.wait_start(self._session.wait, self._session.events, max(1, round(seconds * 1000)))
         except DcamError as error:
             if error.code in (Error.LOSTFRAME, Error.MISSINGFRAME_TROUBLE):
-                self._transport_losses += 1  # capture goes on; the framestamps show which frame is missing
+                self._transport_losses += 1  # the capture continues; the framestamps show which frame is missing
             elif error.code not in (Error.TIMEOUT, Error.ABORT):
                 raise
 
     def _look(self) -> CameraFrame | None:
-        """The next frame of the ring, or None where there is none yet."""
+        """The next frame of the ring; None if none has arrived."""
         self._require_open()
         with self._ring_lock:
             ring = self._ring
             if ring is None:
                 raise DeviceRefused(self.name, "it is not armed, so no frame will come", advice="arm() it first")
-            state = ring.state()  # before looking into the ring, so that no last frame is missed
+            state = ring.state()  # read before the ring, so that the last frame is not missed
             try:
                 taken = ring.take()
             finally:
@@ -284,7 +284,11 @@ class DcamCamera:
         return None
 
     def _trigger_time(self, frame: BufFrame) -> float:
-        """Camera clocks start anywhere: the first frame is dated by the host, less its exposure and readout."""
+        """Time of the trigger, s since the Unix epoch.
+
+        The camera's clock has its own epoch: the offset is the host's time at the first frame of the run, less its
+        exposure and readout.
+        """
         stamp = seconds_of(frame)
         if self._clock_offset is None:
             delay = self._settings.exposure + self._properties.get(Property.TIMING_READOUTTIME)

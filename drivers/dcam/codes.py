@@ -1,6 +1,6 @@
-"""Numbers of the DCAM-API v4 that this driver speaks: error codes, strings, states, properties and their values.
+"""Constants of the DCAM-API v4: error codes, strings, states, properties and their values.
 
-They are interface facts of the vendor's 2021 headers, checked against independent public bindings.
+The numbers are those of the vendor's 2021 headers, checked against independent public bindings.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 
 class Error(IntEnum):
-    """DCAMERR: a call failed when its int32 answer is negative; these are the same 32 bits unsigned."""
+    """DCAMERR: a call failed if the int32 it returns is negative; these are the same 32 bits, unsigned."""
 
     BUSY = 0x80000101
     ABORT = 0x80000102
@@ -118,7 +118,7 @@ class Error(IntEnum):
 
 
 def error_name(code: int) -> str:
-    """`TIMEOUT (0x80000106)` for either sign of the code; the bare number where the table has no name."""
+    """`TIMEOUT (0x80000106)` for a signed or unsigned code; only the number if the code is unknown."""
     unsigned = code & 0xFFFFFFFF
     try:
         return f"{Error(unsigned).name} (0x{unsigned:08X})"
@@ -137,7 +137,7 @@ class CaptureState(IntEnum):
 
 
 class CaptureMode(IntEnum):
-    """DCAMCAP_START: fill the ring over and over, or once."""
+    """DCAMCAP_START: fill the ring repeatedly (SEQUENCE) or once (SNAP)."""
 
     SEQUENCE = -1
     SNAP = 0
@@ -151,7 +151,7 @@ class Event(IntFlag):
 
 
 class Capability(IntFlag):
-    """DCAMDEV_CAPFLAG in the domain of functions: what frames carry."""
+    """DCAMDEV_CAPFLAG, domain of functions: the stamps that frames carry."""
 
     FRAMESTAMP = 0x0001
     TIMESTAMP = 0x0002
@@ -159,7 +159,7 @@ class Capability(IntFlag):
 
 
 class Cooler(IntEnum):
-    """SENSORCOOLERSTATUS; below 0 it reports trouble. A number that is not known says no more than NONE."""
+    """SENSORCOOLERSTATUS; negative values are faults. An unknown positive number counts as NONE."""
 
     ERROR4 = -4
     ERROR3 = -3
@@ -178,7 +178,7 @@ class Cooler(IntEnum):
 
 
 class Text(IntEnum):
-    """DCAM_IDSTR: what dcamdev_getstring can tell."""
+    """DCAM_IDSTR: the strings of dcamdev_getstring."""
 
     BUS = 0x04000101
     CAMERAID = 0x04000102
@@ -191,7 +191,7 @@ class Text(IntEnum):
 
 
 class Property(IntEnum):
-    """DCAM_IDPROP. All values travel as double."""
+    """DCAM_IDPROP. All values are passed as double."""
 
     TRIGGERSOURCE = 0x00100110
     TRIGGERACTIVE = 0x00100120
@@ -248,4 +248,4 @@ READOUTSPEED_ULTRA_QUIET, READOUTSPEED_STANDARD = 1, 2  # on the ORCA-Quest
 HOTPIXEL_STANDARD, HOTPIXEL_MINIMUM, HOTPIXEL_AGGRESSIVE = 1, 2, 3
 PIXELTYPE_MONO16 = 2
 PRODUCERS = MappingProxyType({1: "nobody", 2: "the library", 3: "the driver", 4: "the interface", 5: "the camera"})
-"""Who makes time- and framestamps."""
+"""Who produces time- and framestamps, by the value of the producer properties."""

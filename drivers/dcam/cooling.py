@@ -1,4 +1,4 @@
-"""Cooling: wait until the sensor is as cold as it will be, since dark counts taken before do not hold for the scan."""
+"""Cooling: waits until the sensor has its final temperature, on which the dark counts of the scan depend."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from drivers.dcam.properties import Properties
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 
 Progress = Callable[[float, str], None]
-"""Takes the sensor's temperature in °C and what the cooler says of itself."""
+"""Called with the sensor's temperature in °C and the cooler's status."""
 
 POLL = 1.0  # s
 STEADY_BAND, STEADY_FOR = 0.5, 60.0
-"""°C and s: where the cooler does not say that it is done, a temperature this steady for so long counts as reached."""
+"""°C and s: with a cooler that reports no READY, a temperature within this band for this time counts as final."""
 
 
 def wait_until_cold(
     properties: Properties, device: str, clock: Clock, timeout: float, progress: Progress = lambda celsius, status: None
 ) -> float:
-    """Wait for the cooler to be ready; the sensor's temperature in °C.
+    """Wait until the cooler is ready; returns the sensor's temperature in °C.
 
     Raises:
         DeviceRefused: the cooler is off.
         DeviceTimeout: it was not ready within `timeout` s.
-        DeviceError: the cooler reports trouble.
+        DeviceError: the cooler reports a fault.
     """
     deadline = clock.now() + timeout
     history: list[tuple[float, float]] = []
@@ -76,6 +76,6 @@ def _target(properties: Properties) -> str:
 
 
 def _steady(history: list[tuple[float, float]]) -> bool:
-    """The temperatures span the time asked for, and little else."""
+    """Whether the temperatures cover STEADY_FOR s and stay within STEADY_BAND °C."""
     values = [value for _, value in history]
     return history[-1][0] - history[0][0] >= STEADY_FOR and max(values) - min(values) <= STEADY_BAND

@@ -1,4 +1,4 @@
-"""Description of a DCAM camera: who it is, how it is set and what its counts mean, for the file's metadata."""
+"""Description of a DCAM camera for the file's metadata: identity, settings, and the meaning of its counts."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from drivers.dcam.properties import Properties
 from drivers.dcam.session import Session
 from drivers.protocols import CameraSettings
 
-_NOT_TOLD = (Error.NOTSUPPORT, Error.NOTIMPLEMENT, Error.UNKNOWNSTRID, Error.INVALIDPARAM)
-_WHERE_THERE = MappingProxyType(
+_NOT_AVAILABLE = (Error.NOTSUPPORT, Error.NOTIMPLEMENT, Error.UNKNOWNSTRID, Error.INVALIDPARAM)
+_OPTIONAL = MappingProxyType(
     {
         "sensor_temperature_c": Property.SENSORTEMPERATURE,
         "conversion_factor": Property.CONVERSIONFACTOR_COEFF,
@@ -25,10 +25,10 @@ _WHERE_THERE = MappingProxyType(
 def description(
     session: Session, properties: Properties, settings: CameraSettings, options: DcamOptions
 ) -> dict[str, str | int | float]:
-    """What the camera itself says, as far as this model can say it.
+    """Everything that this camera model reports of itself, by name.
 
-    An electron number is (count - conversion_offset) * conversion_factor; both depend on the readout, and a camera that
-    does not tell them has neither.
+    Number of electrons = (count - conversion_offset) * conversion_factor. Both depend on the readout; the entries are
+    missing for a camera that does not report them.
     """
     cooler = properties.find(Property.SENSORCOOLERSTATUS)
     repairs = properties.find(Property.DEFECTCORRECT_MODE) == codes.ON
@@ -56,7 +56,7 @@ def description(
         "defect_correction": "on" if repairs else "off",
         "hot_pixels": str(options.hot_pixels) if repairs and options.hot_pixels else "as measured",
         **producers,
-        **{name: value for name, prop in _WHERE_THERE.items() if (value := properties.find(prop)) is not None},
+        **{name: value for name, prop in _OPTIONAL.items() if (value := properties.find(prop)) is not None},
     }
 
 
@@ -64,15 +64,15 @@ def _capabilities(session: Session) -> str:
     try:
         return str(session.dcam.dev_getcapability(session.camera).name or "none").lower()
     except DcamError as error:
-        if error.code not in _NOT_TOLD:
+        if error.code not in _NOT_AVAILABLE:
             raise
-        return "not told"
+        return "not reported"
 
 
 def _text(session: Session, which: Text) -> str:
     try:
         return session.dcam.dev_getstring(session.camera, which)
     except DcamError as error:
-        if error.code not in _NOT_TOLD:
+        if error.code not in _NOT_AVAILABLE:
             raise
         return ""

@@ -1,6 +1,6 @@
-"""Options of a DCAM camera: how it takes triggers and what it does to its counts, beyond what every camera is asked.
+"""Options of a DCAM camera beyond CameraSettings: response to trigger pulses, and correction of counts.
 
-They hold for the life of a driver. The defaults are those of a fly scan whose stage gives a short rising pulse a view.
+They are fixed for the life of a driver. The defaults suit a fly scan whose stage sends one short rising pulse a view.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from enum import StrEnum
 
 
 class TriggerActive(StrEnum):
-    """What of an external pulse counts.
+    """How an external pulse controls the exposure.
 
-    EDGE begins an exposure of the set length. LEVEL exposes while the pulse lasts. SYNC_READOUT ends one exposure and
-    begins the next, without dead time: the first pulse only begins, so that n pulses give n - 1 frames.
+    EDGE starts an exposure of the set length. LEVEL exposes for as long as the pulse lasts. SYNC_READOUT ends one
+    exposure and starts the next without dead time: the first pulse only starts one, so n pulses give n - 1 frames.
     """
 
     EDGE = "edge"
@@ -23,24 +23,24 @@ class TriggerActive(StrEnum):
 
 
 class TriggerMode(StrEnum):
-    """NORMAL: a pulse is a frame. START: the first pulse begins a free run, and the later ones do nothing."""
+    """NORMAL: one frame a pulse. START: the first pulse starts a free run, later pulses have no effect."""
 
     NORMAL = "normal"
     START = "start"
 
 
 class TriggerPolarity(StrEnum):
-    """The edge (or level) that counts. A camera that was just switched on takes NEGATIVE."""
+    """The active edge (or level). A camera that was just switched on is set to NEGATIVE."""
 
     POSITIVE = "positive"
     NEGATIVE = "negative"
 
 
 class GlobalExposure(StrEnum):
-    """Which rows a pulse begins to expose.
+    """When rows start to expose after a pulse.
 
-    DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all at once, and as they are read one after the other,
-    later rows expose longer unless the light is cut.
+    DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all at once; since they are read one after the other,
+    later rows are exposed for longer unless the light is shut off.
     """
 
     DELAYED = "delayed"
@@ -48,7 +48,7 @@ class GlobalExposure(StrEnum):
 
 
 class HotPixels(StrEnum):
-    """How much the correction of defects takes for a hot pixel."""
+    """Sensitivity of the camera's own correction of hot pixels."""
 
     MINIMUM = "minimum"
     STANDARD = "standard"
@@ -57,19 +57,19 @@ class HotPixels(StrEnum):
 
 @dataclass(frozen=True)
 class DcamOptions:
-    """What a DcamCamera is made with.
+    """Options of a `DcamCamera`.
 
-    What says how pulses are taken (active, mode, times, delay) holds for external triggers; a software trigger is
-    always one frame of the set exposure. With LEVEL or SYNC_READOUT pulses make the exposure: set the camera's exposure
-    to their length (or distance) all the same, for the first frame of a run is dated by it.
+    trigger_active, _mode, _times and _delay apply to external triggers; a software trigger always gives one frame of
+    the set exposure. With LEVEL or SYNC_READOUT the pulses set the exposure; the exposure in CameraSettings must still
+    equal their length (or distance), since the time of the first frame of a run is computed from it.
 
     Attributes:
-        trigger_active, trigger_mode, trigger_polarity, global_exposure: see there.
-        trigger_times: every so many pulses make one frame (1: each; up to 10 000).
-        trigger_delay: s from a pulse to the exposure (0 to 10, in steps of 1 us); frames keep the time of the pulse.
-        hot_pixels: None takes counts as they are measured; else the camera repairs defects, with this sensitivity.
-        exposure_tolerance: fraction (besides one line time) by which the camera may change an exposure.
-        ring_bytes: most memory for the ring; a full 16-bit frame of an ORCA-Quest has 18.9 MB.
+        trigger_active, trigger_mode, trigger_polarity, global_exposure: see the types.
+        trigger_times: number of pulses for one frame, 1 to 10 000.
+        trigger_delay: s from a pulse to the exposure, 0 to 10 in steps of 1 us; frames carry the time of the pulse.
+        hot_pixels: None: counts as measured; else the camera corrects hot pixels with this sensitivity.
+        exposure_tolerance: fraction of the exposure, added to one line time, by which the camera may round it.
+        ring_bytes: most memory for the ring of frames; one full 16-bit frame of an ORCA-Quest takes 18.9 MB.
 
     Raises:
         ValueError: a number outside its range.

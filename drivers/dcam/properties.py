@@ -1,4 +1,4 @@
-"""Properties of one DCAM camera: set, read back and compared; what is refused comes with the legal values."""
+"""Properties of one DCAM camera: set, read back and compare; a refusal lists the legal values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from drivers.dcam.structures import PropAttr
 from drivers.errors import DeviceRefused
 
 _UNKNOWN = frozenset((Error.NOTSUPPORT, Error.INVALIDPROPERTYID))
-"""What a camera answers to a property that it does not have."""
+"""Errors that a camera returns for a property that it does not have."""
 
 _ILLEGAL = frozenset((Error.INVALIDPARAM, Error.INVALIDVALUE, Error.OUTOFRANGE, Error.WRONGPROPERTYVALUE))
 
@@ -19,8 +19,8 @@ _REFUSALS = frozenset(
         *(Error.NOTWRITABLE, Error.ACCESSDENY, Error.NOTSTABLE, Error.BUSY),
     )
 )
-"""What it answers to a value that it cannot take, or not now; the vendor's manuals disagree on which it will be."""
-_AS_BEFORE = "It takes no frames with it; what was taken before is good"
+"""Errors for a value that a camera refuses, always or for now; the vendor's manuals disagree on which one comes."""
+_STATE = "No frame was taken with it; earlier frames are good"
 
 
 class Properties:
@@ -29,7 +29,7 @@ class Properties:
     Args:
         dcam: the library.
         camera: the open camera's handle.
-        device: what errors call it.
+        device: name of the camera in error messages.
     """
 
     def __init__(self, dcam: Dcam, camera: int, device: str) -> None:
@@ -39,7 +39,7 @@ class Properties:
         return self._dcam.prop_getvalue(self._camera, prop)
 
     def find(self, prop: Property) -> float | None:
-        """Its value; None where this camera has no such property."""
+        """Its value; None if this camera has no such property."""
         try:
             return self.get(prop)
         except DcamError as error:
@@ -51,14 +51,14 @@ class Properties:
         return self._limits(prop).maximum
 
     def set(self, prop: Property, value: float) -> float:
-        """Set within the property's range; what the camera made of it, for it may round to a value that it has.
+        """Set a value within the property's range; returns the value that the camera accepted, which may be rounded.
 
         Raises:
-            DeviceRefused: out of range, or not now.
+            DeviceRefused: the value is out of range, or the camera does not accept it now.
         """
         limits = self._limits(prop)
         if limits.attribute & codes.ATTRIBUTE_HASRANGE and not limits.minimum <= value <= limits.maximum:
-            # Left to itself, a property that rounds would take the nearest limit without a word.
+            # The camera itself may silently take the nearest limit instead.
             raise self._refused(f"{prop.name} = {value:g} is out of range", prop, value)
         try:
             self._dcam.prop_setvalue(self._camera, prop, value)
@@ -70,28 +70,28 @@ class Properties:
         return self.get(prop)
 
     def set_exactly(self, prop: Property, value: float) -> None:
-        """Set, read back, and refuse a value that the camera has rounded or ignored."""
+        """Set and read back; DeviceRefused if the camera rounded or ignored the value."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > 1e-9 * abs(value):
-            raise self._refused(f"it made {prop.name} = {accepted:g} of {value:g}", prop, value, f"{accepted:g}")
+            raise self._refused(f"it set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}")
 
-    def set_if_there(self, prop: Property, value: float) -> None:
-        """Like set_exactly, for a value that a camera without the property has anyway."""
+    def set_if_available(self, prop: Property, value: float) -> None:
+        """`set_exactly`, if the camera has the property; one without it behaves as if it had this value."""
         if self.find(prop) is not None:
             self.set_exactly(prop, value)
 
     def set_nearly(self, prop: Property, value: float, tolerance: float) -> None:
-        """Set, read back, and refuse what differs by more than `tolerance`."""
+        """Set and read back; DeviceRefused if the result differs by more than `tolerance`."""
         accepted = self.set(prop, value)
         if abs(accepted - value) > tolerance:
             raise DeviceRefused(
                 self._device,
-                f"it made {prop.name} = {accepted:g} of {value:g}",
+                f"it set {prop.name} = {accepted:g} instead of {value:g}",
                 request=f"{prop.name} = {value:g}",
                 reply=f"{accepted:g}",
                 expected=f"{value:g} within {tolerance:g}",
                 advice="Ask for a value that the camera has, or allow a larger exposure_tolerance",
-                state=_AS_BEFORE,
+                state=_STATE,
             )
 
     def _limits(self, prop: Property) -> PropAttr:
@@ -107,11 +107,11 @@ class Properties:
                 reply=codes.error_name(error.code),
                 expected="an ORCA-Quest, or a camera with the same properties",
                 advice="Check that index names the right camera, and its firmware",
-                state=_AS_BEFORE,
+                state=_STATE,
             ) from error
 
     def _refused(self, problem: str, prop: Property, value: float, reply: str = "") -> DeviceRefused:
-        """With what would have been legal."""
+        """The error for a refused value, with the legal values."""
         return DeviceRefused(
             self._device,
             problem,
@@ -119,21 +119,21 @@ class Properties:
             reply=reply,
             expected=f"another value, legal: {self._legal(prop)}",
             advice="Choose one of them in the configuration",
-            state=_AS_BEFORE,
+            state=_STATE,
         )
 
     def _legal(self, prop: Property) -> str:
-        """What a property can be, in words."""
+        """Legal values of a property, in words."""
         limits = self._limits(prop)
         if limits.attribute & codes.ATTRIBUTE_TYPE_MASK != codes.ATTRIBUTE_TYPE_MODE:
             unit = " s" if limits.unit == codes.UNIT_SECOND else ""
             return f"{limits.minimum:g} to {limits.maximum:g}{unit} in steps of {limits.step:g}{unit}"
         values = [limits.minimum]
         try:
-            # One that stays where it is would go on for ever.
+            # Stop if the value does not grow, which would repeat for ever.
             while (value := self._dcam.prop_queryvalue(self._camera, prop, values[-1], codes.QUERY_NEXT)) > values[-1]:
                 values.append(value)
         except DcamError as error:
-            if error.code not in _UNKNOWN | _ILLEGAL:  # these are how the list ends
+            if error.code not in _UNKNOWN | _ILLEGAL:  # these errors mark the end of the list
                 raise
         return ", ".join(f"{value:g}" for value in values)

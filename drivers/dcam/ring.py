@@ -1,4 +1,4 @@
-"""Ring: the library's ring of buffers during one capture, from its start, drained in order with one copy a frame."""
+"""Ring: the library's ring of frame buffers during one capture; frames are taken in order, with one copy each."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceTimeout
 
 START_TIMEOUT = 5.0
-"""s that a camera may take to begin a capture."""
+"""s that a camera may take to start a capture."""
 
 
 class Ring:
-    """Allocated once made, until `free`. Not safe from several threads.
+    """A ring of frame buffers, allocated by the constructor and released by `free`. Not safe from several threads.
 
     Args:
-        slots: frames that it holds; while it runs, the oldest one may be half overwritten at any moment.
+        slots: number of frames that it holds; during a capture the oldest may be half overwritten at any moment.
 
     Raises:
-        DcamError: there is no memory.
+        DcamError: the memory cannot be allocated.
 
     Attributes:
         overwritten: frames that were overwritten before they were taken.
@@ -33,21 +33,21 @@ class Ring:
 
     def __init__(self, dcam: Dcam, camera: int, device: str, slots: int) -> None:
         self._dcam, self._camera, self._device, self._slots = dcam, camera, device, slots
-        self._next = 0  # number, from 0 in the order of arrival, of the frame to hand out next
-        self._count = 0  # frames that had arrived when it was last looked at
-        self._told = False  # an overrun was reported, and no frame was handed out since
+        self._next = 0  # number of the next frame to take, counted from 0 in the order of arrival
+        self._count = 0  # frames that had arrived at the last look
+        self._overrun_reported = False  # and no frame was taken since
         self.overwritten = 0
         dcam.buf_alloc(camera, slots)
 
     def start(self, mode: CaptureMode, clock: Clock) -> None:
-        """Begin to capture; when it returns, triggers are taken.
+        """Start the capture; when this returns, the camera accepts triggers.
 
         Raises:
-            DeviceTimeout: the camera did not begin.
+            DeviceTimeout: the camera did not start.
         """
         deadline = clock.now() + START_TIMEOUT
         self._dcam.cap_start(self._camera, mode)
-        # Triggers that come before BUSY are lost. A SNAP may be over already.
+        # Triggers before BUSY are lost. A SNAP may already have ended.
         while mode is CaptureMode.SEQUENCE and self.state() is not CaptureState.BUSY:
             if clock.now() > deadline:
                 raise DeviceTimeout(
@@ -65,10 +65,10 @@ class Ring:
         return self._dcam.cap_status(self._camera)
 
     def arrived(self) -> int:
-        """Frames put into it so far.
+        """Number of frames that have arrived since the start.
 
         Raises:
-            DeviceError: fewer than before. The count has 32 bits; one that was set back would be waited for in vain.
+            DeviceError: the count went back; waiting for it to grow again would be in vain.
         """
         before, self._count = self._count, self._dcam.cap_transferinfo(self._camera)
         if self._count < before:
@@ -83,17 +83,17 @@ class Ring:
         return self._count
 
     def stamps(self, slot: int) -> BufFrame:
-        """What is known of the frame in a slot, without its pixels."""
+        """Stamps and layout of the frame in a slot; its pixels are not copied."""
         return self._dcam.buf_lockframe(self._camera, slot)
 
     def take(self) -> tuple[NDArray[np.uint16], BufFrame] | None:
-        """The next frame, in memory of its own, and its stamps; None where there is none yet.
+        """A copy of the next frame, and its stamps; None if none has arrived yet.
 
         Raises:
-            DeviceError: it was overrun. Said once until a later frame is taken, so that taking goes on.
+            DeviceError: the ring was overrun. Raised once; the next call continues with the frames still there.
         """
         while True:
-            # The ring overwrites without asking. Frames older than its slots are gone, and the oldest one may go.
+            # The ring overwrites frames that were not taken: the oldest slot may change at any moment.
             count = self.arrived()
             self._skip(count - self._slots + 1)
             if self._next >= count:
@@ -101,13 +101,13 @@ class Ring:
             frame = self._dcam.buf_lockframe(self._camera, self._next % self._slots)
             counts = self._copy(frame)
             if self.arrived() - self._slots >= self._next:
-                continue  # it may have been overwritten while it was copied
+                continue  # the frame may have been overwritten during the copy
             self._next += 1
-            self._told = False
+            self._overrun_reported = False
             return counts, frame
 
     def free(self) -> None:
-        """Stop and release, the second even where the first fails: an unplugged camera still has memory to free."""
+        """Stop the capture and release the memory, also if stopping fails: an unplugged camera still holds memory."""
         run_all(lambda: self._dcam.cap_stop(self._camera), lambda: self._dcam.buf_release(self._camera))
 
     def _skip(self, oldest: int) -> None:
@@ -116,22 +116,22 @@ class Ring:
             return
         self._next = oldest
         self.overwritten += lost
-        if not self._told:
-            self._told = True
+        if not self._overrun_reported:
+            self._overrun_reported = True
             raise DeviceError(
                 self._device,
                 f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers {first} to "
                 f"{oldest - 1} of this run in the order of arrival",
-                expected="frames taken before the ring comes round",
-                advice="Take frames faster, trigger slower or give the ring more memory",
+                expected="every frame to be taken before the ring overwrites it",
+                advice="Take frames faster, trigger more slowly or give the ring more memory",
                 state="Later frames can still be taken",
             )
 
     def _copy(self, frame: BufFrame) -> NDArray[np.uint16]:
-        """uint16 [row, col] out of the ring; its rows may be padded."""
+        """Copy a frame, uint16 [row, col], out of the ring, where rows may be padded."""
         rows, cols, stride = int(frame.height), int(frame.width), int(frame.row_bytes)
         if not frame.buffer or rows < 1 or cols < 1 or stride < 2 * cols:
-            problem = f"it gives a frame that cannot be: {rows} x {cols} pixels, {stride} bytes a row"
+            problem = f"it returns a frame with an impossible layout: {rows} x {cols} pixels, {stride} bytes a row"
             raise DeviceError(
                 self._device,
                 problem,

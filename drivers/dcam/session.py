@@ -1,4 +1,4 @@
-"""Session: the library started, one camera and its wait handle opened, and all of it let go again in order."""
+"""Session: starts the library, opens one camera and its wait handle, and closes them in reverse order."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from drivers.errors import DeviceError
 
 
 class Session:
-    """What a camera needs of the library. A process can have one at a time.
+    """One open camera in the library. A process can have one session at a time.
 
     Args:
-        library: path of the DCAM-API library; None takes the installed one.
-        index: which camera, where DCAM finds several.
-        device: what errors call it.
+        library: path of the DCAM-API library; None: the installed one.
+        index: number of the camera among those that DCAM finds, from 0.
+        device: name of the camera in error messages.
 
     Raises:
         DeviceError: no library, or no camera; nothing stays open.
@@ -28,19 +28,19 @@ class Session:
     def __init__(self, library: Path | None, index: int, device: str) -> None:
         self.dcam = Dcam(library, device)
         self._device = device
-        self._steps: list[Callable[[], None]] = []  # to undo, last first
+        self._steps: list[Callable[[], None]] = []  # that close what was opened, run last first
         try:
             found = self._start()
             if index >= found:
                 raise DeviceError(
                     device,
                     f"there is no camera {index}",
-                    expected=f"an index below {found}, as DCAM found",
+                    expected=f"an index below {found}, the number of cameras that DCAM found",
                     advice="Correct the camera's index in the configuration",
                     state="Nothing was changed",
                 )
             self.camera = self.dcam.dev_open(index)
-            self._steps.append(lambda: self.dcam.dev_close(self.camera))  # ends a capture and frees the ring, too
+            self._steps.append(lambda: self.dcam.dev_close(self.camera))  # also ends a capture and frees the ring
             self.wait, supported = self.dcam.wait_open(self.camera)
             self._steps.append(lambda: self.dcam.wait_close(self.wait))
             self.events = (Event.FRAMEREADY | Event.STOPPED) & supported
@@ -50,21 +50,21 @@ class Session:
             raise
 
     def close(self) -> None:
-        """Let go of everything, also where a step fails; may be called again.
+        """Close all that was opened, also if a step fails; may be called again.
 
         Raises:
-            DcamError: the first failure. That a camera is not connected any more is none.
+            DcamError: the first failure. A camera that is no longer connected is not a failure.
         """
         steps, self._steps = self._steps[::-1], []
         run_all(*steps)
 
     def _start(self) -> int:
-        self._steps.append(self._end)  # a session that failed to start must be ended too
+        self._steps.append(self._end)  # also a session that failed to start must be ended
         try:
             return self.dcam.api_init()
         except DcamError as error:
             if error.code in (Error.BUSY, Error.EXCLUDED):
-                self._steps.clear()  # to end it would end that of another camera in this process
+                self._steps.clear()  # ending it would end the session of another camera in this process
             if error.code != Error.NOCAMERA:
                 raise
             raise DeviceError(
@@ -72,7 +72,7 @@ class Session:
                 "DCAM finds no camera",
                 request=error.request,
                 reply=codes.error_name(error.code),
-                expected="a camera that is switched on and started",
+                expected="a camera that is switched on and has started",
                 advice=f"Switch the camera on and check its cable. {usb.preflight().message}",
                 state="Nothing was changed",
             ) from error
@@ -81,7 +81,7 @@ class Session:
         try:
             self.dcam.api_uninit()
         except DcamError:
-            # A session that stays would keep this process from ever having another one.
+            # Try once more: a session left open would block every later one in this process.
             self.dcam.api_uninit()
             raise
 
@@ -90,7 +90,7 @@ def run_all(*steps: Callable[[], None]) -> None:
     """Run every step, also after one that failed.
 
     Raises:
-        DcamError: the first failure. That a camera is not connected any more is none: there is nothing left to undo.
+        DcamError: the first failure. A camera that is no longer connected is not one: nothing is left to undo.
     """
     first: DcamError | None = None
     for step in steps:

@@ -1,4 +1,4 @@
-"""Settings of a DCAM camera: CameraSettings, DcamOptions and CameraTiming in terms of its properties."""
+"""Settings of a DCAM camera: translates CameraSettings, DcamOptions and CameraTiming to its properties."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ _READOUTS = MappingProxyType(
     {
         "standard": (codes.SENSORMODE_AREA, codes.READOUTSPEED_STANDARD),
         "ultra_quiet": (codes.SENSORMODE_AREA, codes.READOUTSPEED_ULTRA_QUIET),
-        PHOTON_NUMBER: (codes.SENSORMODE_PHOTONNUMBERRESOLVING, None),  # its speed cannot be chosen
+        PHOTON_NUMBER: (codes.SENSORMODE_PHOTONNUMBERRESOLVING, None),  # has one speed only
     }
 )
-"""Sensor mode and readout speed. With photon_number, the camera itself makes photoelectrons of a pixel's charge."""
+"""Sensor mode and readout speed. With photon_number the camera converts a pixel's charge to photoelectrons itself."""
 _PLAIN = DcamOptions()
 
 
 def apply_settings(properties: Properties, device: str, settings: CameraSettings, options: DcamOptions) -> None:
-    """Write everything that a triggered scan depends on and compare it with what the camera has then.
+    """Set every property that a triggered scan depends on, and compare it with the value read back.
 
     Only the exposure may be rounded.
 
     Raises:
-        DeviceRefused: at the first thing that the camera cannot do; those before it are set.
+        DeviceRefused: at the first property that the camera refuses; those before it are set.
     """
     if settings.readout not in _READOUTS:
         problem = f"there is no readout {settings.readout!r}"
@@ -72,7 +72,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
             problem,
             expected=f"another one, legal: {', '.join(_READOUTS)}",
             advice="Choose one of them in the configuration",
-            state="Its settings are as they were",
+            state="Its settings were not changed",
         )
     # Sensor mode and speed first: they change the ranges of what follows.
     mode, speed = _READOUTS[settings.readout]
@@ -80,18 +80,16 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     if speed is not None:
         properties.set_exactly(Property.READOUTSPEED, speed)
     properties.set_exactly(Property.IMAGE_PIXELTYPE, codes.PIXELTYPE_MONO16)
-    properties.set_if_there(Property.BITSPERCHANNEL, 16)
+    properties.set_if_available(Property.BITSPERCHANNEL, 16)
     if options.hot_pixels is None:
-        properties.set_if_there(Property.DEFECTCORRECT_MODE, codes.OFF)
+        properties.set_if_available(Property.DEFECTCORRECT_MODE, codes.OFF)
     else:
         properties.set_exactly(Property.DEFECTCORRECT_MODE, codes.ON)
         properties.set_exactly(Property.HOTPIXELCORRECT_LEVEL, _HOT_PIXELS[options.hot_pixels])
     properties.set_exactly(Property.BINNING, settings.binning)
     _apply_roi(properties, device, settings.roi)
     if properties.find(Property.FRAMEBUNDLE_MODE) == codes.ON:
-        problem = (
-            "the camera bundles several frames of this size into one transfer, which this driver cannot take apart"
-        )
+        problem = "the camera bundles several frames of this size into one transfer, which this driver cannot separate"
         raise DeviceRefused(
             device,
             problem,
@@ -104,7 +102,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     tolerance = options.exposure_tolerance * settings.exposure + line
     properties.set_nearly(Property.EXPOSURETIME, settings.exposure, tolerance)
     apply_trigger_source(properties, settings.trigger)
-    # How pulses are taken must not reach software triggers: each of those is one frame of the set exposure.
+    # Pulse options do not apply to software triggers: each of these gives one frame of the set exposure.
     pulses = options if settings.trigger is TriggerSource.EXTERNAL else _PLAIN
     properties.set_exactly(Property.TRIGGER_MODE, _MODES[pulses.trigger_mode])
     properties.set_exactly(Property.TRIGGERACTIVE, _ACTIVE[pulses.trigger_active])
@@ -115,12 +113,12 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
 
 
 def apply_trigger_source(properties: Properties, source: TriggerSource) -> None:
-    """Set it. A camera in START mode forgets it with the first pulse: before each run it must be said again."""
+    """Set the trigger source. In START mode the first pulse resets it, so that it must be set before each run."""
     properties.set_exactly(Property.TRIGGERSOURCE, _TRIGGERS[source])
 
 
 def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSettings:
-    """The camera's present settings, as `apply_settings` left them."""
+    """The settings that the camera has, after `apply_settings`."""
     mode, speed = (round(properties.get(prop)) for prop in (Property.SENSORMODE, Property.READOUTSPEED))
     readouts = {numbers: name for name, numbers in _READOUTS.items()}
     subarray = (Property.SUBARRAYVPOS, Property.SUBARRAYHPOS, Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE)
@@ -135,14 +133,14 @@ def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSetti
 
 
 def read_timing(properties: Properties, trigger: TriggerSource, options: DcamOptions) -> CameraTiming:
-    """The least period follows the vendor's rule for external triggers (DCAM property reference):
+    """Frame shape and timing that the camera reports, with the shortest trigger period.
 
-    with exposure Tx, cyclic trigger period Tc and minimum blanking Tb, triggers are at least max(Tc, Tx + Tb) apart,
-    and never closer than the minimum trigger interval. Where pulses make the exposure, Tx is theirs and does not count;
-    where every n-th pulse makes a frame, pulses may be n times as close.
+    The vendor's rule for external triggers (DCAM property reference): with exposure Tx, cyclic trigger period Tc and
+    minimum blanking Tb, triggers are at least max(Tc, Tx + Tb) apart, and not closer than the minimum trigger interval.
+    Tx is left out where the pulses set the exposure; where n pulses give one frame, pulses may be n times as close.
 
-    Frames of a set exposure are also never closer than in free run: there the camera reckons with the link, which at
-    full frames over USB takes 56 ms where the sensor needs 8.
+    Frames of a set exposure are also not closer than in free run, where the camera allows for the link: a full frame
+    takes 56 ms over USB and 8 ms on the sensor.
     """
     get = properties.get
     rows, cols = round(get(Property.IMAGE_HEIGHT)), round(get(Property.IMAGE_WIDTH))
@@ -169,7 +167,7 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     if roi is None:
         return
     row0, col0, rows, cols = roi
-    # Positions to 0 first: position + size must stay within the sensor at every step, and ranges may follow that.
+    # Positions to 0 first: position + size must stay within the sensor at every step, also in the reported ranges.
     properties.set_exactly(Property.SUBARRAYVPOS, 0)
     properties.set_exactly(Property.SUBARRAYHPOS, 0)
     height, width = (properties.maximum(prop) for prop in (Property.SUBARRAYVSIZE, Property.SUBARRAYHSIZE))
@@ -190,5 +188,5 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
 
 
 def _sensor_rows(properties: Properties, settings: CameraSettings) -> float:
-    """Rows that are read, before binning."""
+    """Number of sensor rows that are read, before binning."""
     return properties.get(Property.IMAGE_HEIGHT) * settings.binning

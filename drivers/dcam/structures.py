@@ -1,7 +1,7 @@
-"""Structures of the DCAM-API v4 as ctypes has them.
+"""Structures of the DCAM-API v4 in ctypes.
 
-Natural alignment equals the vendor's 8-byte packing on 64-bit machines. Each begins with its own size in bytes, which
-the caller must set.
+On 64-bit machines natural alignment equals the vendor's 8-byte packing. Each structure begins with its size in bytes,
+which the caller must set.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class PropAttr(ctypes.Structure):
 
 
 class TimeStamp(ctypes.Structure):
-    """DCAM_TIMESTAMP, from an epoch of the camera's own: only differences mean anything."""
+    """DCAM_TIMESTAMP, from an epoch of the camera's own: only differences have a meaning."""
 
     _fields_ = (("seconds", c_uint32), ("microseconds", c_int32))
 

@@ -1,8 +1,9 @@
-"""Serial line: one request and its reply at a time over any pyserial URL: a port, socket://, or a simulator's sim://.
+"""SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or a simulator's sim://.
 
-Rules that keep it in step with the device: one request at a time, a finite timeout, every reply compared with the form
-it must have. After a timeout or a reply of the wrong form nothing that arrives is believed until a harmless probe has
-been answered and the line has fallen quiet. Commands without a reply wait for nobody: a stop goes out at once.
+Three rules keep requests and replies in step: one request at a time, a finite timeout, and every reply must match the
+form expected. After a timeout or a reply of another form, received data are discarded until the device has answered a
+probe without side effects and the line is silent. Commands without a reply are sent at once, so that a stop does not
+wait.
 """
 
 from __future__ import annotations
@@ -24,36 +25,38 @@ from drivers.serial.ports import open_port
 from drivers.serial.transcript import Transcript
 
 QUIET = 0.05
-"""s without a byte after which a line counts as quiet."""
+"""s without a byte after which a line counts as silent."""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A query without side effects, and the form of its one-line reply, by which the line finds its step again."""
+    """A query without side effects and the form of its one-line reply; it brings the line into step again."""
 
     request: str
     reply: str
 
 
-def _sound(line: str) -> str:
-    """A line without a checksum has nothing to say of itself."""
+def _no_checksum(line: str) -> str:
+    """The check of a device whose lines carry no checksum: nothing is wrong."""
     return ""
 
 
 class SerialLine:
-    """A device that talks ASCII lines, 8 bits, no parity, 1 stop bit. Safe from several threads.
+    """A device that talks in ASCII lines; 8 data bits, no parity, 1 stop bit. Safe from several threads.
 
     Args:
-        url: what pyserial opens: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
-        device: the name that errors carry.
+        url: pyserial URL: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
+        device: its name in error messages.
         probe: see `Probe`.
         timeout: s for a whole reply, more than 0.
-        unsolicited: form of lines that the device may send unasked; they are noted and passed over.
-        check: what is wrong with a received line, "" where nothing is; for checksums.
-        transcript: file to which every byte sent and received is appended with its time; None keeps none.
+        unsolicited: regular expression of lines that the device may send without a request; they are skipped and
+            recorded.
+        check: returns what is wrong with a received line, "" if nothing is; for checksums.
+        transcript: log file to which every byte sent and received is appended with its time; None: no file.
 
     Raises:
-        DeviceError: the port or the transcript cannot be opened. DeviceRefused: a timeout that is none.
+        DeviceError: the port or the transcript cannot be opened. DeviceRefused: the timeout is not positive
+            and finite.
     """
 
     def __init__(
@@ -67,7 +70,7 @@ class SerialLine:
         baudrate: int,
         unsolicited: str = r"(?!)",
         framing: Framing = CRLF,
-        check: Callable[[str], str] = _sound,
+        check: Callable[[str], str] = _no_checksum,
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
@@ -76,7 +79,7 @@ class SerialLine:
         if not 0 < timeout < math.inf:
             raise DeviceRefused(
                 device,
-                f"no reply comes within a timeout of {timeout} s, or it is waited for without end",
+                f"the timeout of {timeout} s is not valid",
                 expected="a positive number of seconds",
                 state="Nothing was sent",
             )
@@ -105,16 +108,15 @@ class SerialLine:
         self._reader = LineReader(self._port, clock, self._transcript, framing, unsolicited, check)
 
     def send(self, command: str) -> None:
-        """Send a command that has no reply. It goes out even where the line is out of step or another thread waits for
-        its reply: a stop must not wait.
+        """Send a command without a reply, at once: also while another thread waits for a reply, or out of step.
 
         Raises:
-            DeviceError: the port is gone. DeviceTimeout: the device does not take bytes.
+            DeviceError: the port failed. DeviceTimeout: the device accepts no bytes.
         """
         self._write(command.encode("ascii") + self._framing.command_end, command or "an empty line")
 
     def send_raw(self, data: bytes) -> None:
-        """`send` for bytes without an end, such as one control character."""
+        """`send` for bytes without a line end, such as one control character."""
         self._write(data, readable(data))
 
     def query(self, request: str, reply: str, meaning: str, state: str = "") -> re.Match[str]:
@@ -122,34 +124,34 @@ class SerialLine:
 
         Args:
             reply: regular expression that the whole reply must match.
-            meaning: the expected reply in words, for the error.
-            state: what has (not) moved, for the error.
+            meaning: the expected reply in words, for error messages.
+            state: what has moved and what has not, for error messages.
 
         Raises:
-            DeviceTimeout: no whole reply within the timeout. DeviceError: a reply of another form, or the port is gone.
+            DeviceTimeout: no whole reply within the timeout. DeviceError: a reply of another form, or the port failed.
         """
         return self._query(request.encode("ascii") + self._framing.command_end, request, reply, meaning, state)
 
     def query_raw(self, data: bytes, reply: str, meaning: str, state: str = "") -> re.Match[str]:
-        """`query` for bytes without an end, such as one control character."""
+        """`query` for bytes without a line end, such as one control character."""
         return self._query(data, readable(data), reply, meaning, state)
 
     def close(self) -> None:
-        """Free the port, once a request of another thread is through; a second time does nothing."""
+        """Close the port once a request of another thread has ended; calling again does nothing."""
         with self._asking, self._writing:
             self._closed = True
-            with contextlib.suppress(OSError):  # a port that is gone has nothing to free
+            with contextlib.suppress(OSError):  # a failed port has nothing left to close
                 self._port.close()
             self._transcript.close()
 
     def _query(self, data: bytes, request: str, reply: str, meaning: str, state: str) -> re.Match[str]:
         with self._asking:
             self._refuse_if_closed(request)
-            with self._port_may_go(request):
+            with self._port_errors(request):
                 if not self._in_step:
-                    self._find_step(request, state)
+                    self._resynchronise(request, state)
                 self._in_step = False
-                self._reader.pass_over_what_came_before()
+                self._reader.discard_lines()
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
             if text is None:
@@ -157,9 +159,9 @@ class SerialLine:
                     DeviceTimeout,
                     f"no whole reply within {self._timeout:g} s",
                     request=request,
-                    reply=self._reader.begun[:80],
+                    reply=self._reader.incomplete[:80],
                     expected=meaning,
-                    advice="Check power, cable and baud rate; the next request will first find the line's step again",
+                    advice="Check power, cable and baud rate; the next request first brings the line into step again",
                     state=state,
                 )
             if isinstance(text, Damaged):
@@ -180,15 +182,15 @@ class SerialLine:
                     request=request,
                     reply=text,
                     expected=meaning,
-                    advice="The line may be disturbed or the device be another model",
+                    advice="The line may be disturbed, or the device may be another model",
                     state=state,
                 )
             self._in_step = True
             return match
 
-    def _find_step(self, request: str, state: str) -> None:
-        """Throw away what is on the line, probe, pass over late replies until the probe's own, wait for quiet."""
-        self._transcript.tell("!", "out of step: probing")
+    def _resynchronise(self, request: str, state: str) -> None:
+        """Discard what arrives, send the probe, skip late replies until its own, and wait for silence."""
+        self._transcript.add_line("!", "out of step: probing")
         self._wait_for_quiet(request, state)
         self._write(self._probe.request.encode("ascii") + self._framing.command_end, self._probe.request)
         deadline = self._clock.now() + self._timeout
@@ -206,15 +208,15 @@ class SerialLine:
             )
         self._wait_for_quiet(request, state)
         self._in_step = True
-        self._transcript.tell("!", "in step again")
+        self._transcript.add_line("!", "in step again")
 
     def _wait_for_quiet(self, request: str, state: str) -> None:
         if not self._reader.drain(self._clock.now() + max(self._timeout, 10 * QUIET)):
             raise self._error(
                 DeviceTimeout,
-                "it sends without pause and was not asked",
+                "it sends without pause and without a request",
                 request=request,
-                expected="a quiet line before the next request",
+                expected="a silent line before the next request",
                 advice="Check the baud rate and that the port is this device's",
                 state=state,
             )
@@ -222,15 +224,15 @@ class SerialLine:
     def _write(self, data: bytes, text: str) -> None:
         with self._writing:
             self._refuse_if_closed(text)
-            self._transcript.tell(">", text)
-            self._transcript.keep(">", data)
-            with self._port_may_go(text):
+            self._transcript.add_line(">", text)
+            self._transcript.log_bytes(">", data)
+            with self._port_errors(text):
                 self._port.write(data)
 
     @contextlib.contextmanager
-    def _port_may_go(self, request: str) -> Iterator[None]:
-        """What the port raises, in the words of the device."""
-        state = "What the device was doing it may still be doing"
+    def _port_errors(self, request: str) -> Iterator[None]:
+        """Turn errors of the port into errors of the device."""
+        state = "The device may still be doing what it did before"
         try:
             yield
         except serial.SerialTimeoutException as problem:
@@ -247,17 +249,17 @@ class SerialLine:
                 DeviceError,
                 f"the port failed: {problem}",
                 request=request,
-                expected="a port that stays there",
+                expected="a port that stays open",
                 advice="Check that the cable or adapter is still plugged in, then start again",
                 state=state,
             ) from problem
 
     def _refuse_if_closed(self, request: str) -> None:
-        """What a closed port itself raises differs from system to system."""
+        """Raise DeviceError if the line is closed: what a closed port raises differs between operating systems."""
         if self._closed:
             raise DeviceError(
                 self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
             )
 
     def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
-        return kind(self._device, problem, wire=self._transcript.told(), **parts)
+        return kind(self._device, problem, wire=self._transcript.recent(), **parts)

@@ -1,4 +1,4 @@
-"""Line reader: bytes from a port to lines and replies by a deadline; what nobody asked for is told and passed over."""
+"""LineReader: bytes of a port to lines and replies, with a deadline; skips and records unsolicited lines."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from drivers.serial.transcript import Transcript
 
 LONGEST_LINE = 1024
 LONGEST_REPLY = 1 << 16
-"""Characters of a reply of several lines."""
+"""Characters of a reply of several lines, at most."""
 
 
 @dataclass(frozen=True)
 class Framing:
-    """How lines end: commands with `command_end`, what the device sends with `line_end`.
+    """Line ends of a device.
 
-    `continued`: text at the end of a line that says that another line follows; "" where every reply is one line. The
-    reply is then its lines without that text, joined by newlines.
+    Attributes:
+        command_end: end of each command sent.
+        line_end: end of each line received.
+        continued: end of a line that is followed by another line of the same reply; "" if every reply is one line.
+            Such a reply is its lines without that text, joined by newlines.
     """
 
     command_end: bytes = b"\r\n"
@@ -33,22 +36,22 @@ CRLF = Framing()
 
 @dataclass(frozen=True)
 class Damaged:
-    """A line that is not what the device sent, as its checksum says."""
+    """A line whose checksum is wrong, and the reason."""
 
     text: str
     why: str
 
 
 class LineReader:
-    """What has been received and not been read yet. For one thread at a time.
+    """Reads lines from a port and holds the bytes of an incomplete one. For one thread at a time.
 
     Args:
-        port: pyserial's; its read ends after a short quiet.
-        unsolicited: form of lines that the device may send unasked.
-        check: what is wrong with a received line, "" where nothing is.
+        port: a pyserial port whose read ends after a short silence.
+        unsolicited: regular expression of lines that the device may send without a request.
+        check: returns what is wrong with a received line, "" if nothing is.
 
     Raises (in all methods):
-        OSError: the port is gone.
+        OSError: the port failed.
     """
 
     def __init__(
@@ -65,12 +68,12 @@ class LineReader:
         self._received = bytearray()
 
     @property
-    def begun(self) -> str:
-        """The line that is not whole yet, in readable form."""
+    def incomplete(self) -> str:
+        """The line that has not ended yet, in readable form."""
         return readable(self._received)
 
     def reply(self, deadline: float) -> str | Damaged | None:
-        """The lines of a reply, joined; None where they are not whole by `deadline` or never end."""
+        """The lines of a reply, joined; None if it is not complete by `deadline` or is too long."""
         continued = self._framing.continued
         lines: list[str] = []
         while sum(map(len, lines)) <= LONGEST_REPLY:
@@ -83,13 +86,13 @@ class LineReader:
         return None
 
     def line(self, deadline: float) -> str | Damaged | None:
-        """The next line that the device was asked for; None where none is whole by `deadline`."""
+        """The next line that is not unsolicited; None if none is complete by `deadline`."""
         while True:
             while self._framing.line_end in self._received:
                 line, _, rest = bytes(self._received).partition(self._framing.line_end)
                 self._received = bytearray(rest)
                 text = readable(line)
-                self._transcript.tell("<", text)
+                self._transcript.add_line("<", text)
                 if why := self._check(text):
                     return Damaged(text, why)
                 if not self._unsolicited.fullmatch(text):
@@ -99,29 +102,33 @@ class LineReader:
             self._received += self._read()
 
     def drain(self, deadline: float) -> bool:
-        """Throw away what comes until nothing does; whether that was so by `deadline`."""
+        """Discard bytes until the line is silent; returns whether it was silent by `deadline`."""
         while (junk := self._read()) or self._received:
-            self._transcript.tell("!", f"passed over {readable(self._received + junk)}")
+            self._transcript.add_line("!", f"discarded {readable(self._received + junk)}")
             self._received.clear()
             if self._clock.now() > deadline:
                 return False
         return True
 
-    def pass_over_what_came_before(self) -> None:
-        """Whole lines that are here before the request cannot be its reply. The rest may begin a line sent unasked."""
+    def discard_lines(self) -> None:
+        """Discard the complete lines received so far: they cannot be the reply to a request not yet sent.
+
+        The rest stays: it may be the beginning of an unsolicited line.
+        """
         while len(self._received) <= LONGEST_LINE and self._port.in_waiting:
             self._received += self._read()
         old, end, rest = bytes(self._received).rpartition(self._framing.line_end)
         if end:
-            self._transcript.tell("!", f"passed over {readable(old)}")
+            self._transcript.add_line("!", f"discarded {readable(old)}")
             self._received = bytearray(rest)
 
     def _read(self) -> bytes:
-        """What is there (over TCP a byte of it), or what comes first; nothing where the line is quiet."""
+        """The bytes that have arrived (over TCP one of them), or the first to arrive; b"" if the line stays silent."""
         data = bytes(self._port.read(max(1, int(self._port.in_waiting))))
-        self._transcript.keep("<", data)
+        self._transcript.log_bytes("<", data)
         return data
 
 
 def readable(data: bytes | bytearray) -> str:
+    """Bytes as ASCII text, others as backslash escapes."""
     return bytes(data).decode("ascii", errors="backslashreplace")

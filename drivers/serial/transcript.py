@@ -1,4 +1,4 @@
-"""Transcript: what went over a line and when; the last of it for errors, and on request every byte in a file."""
+"""Transcript: the last lines sent and received, for error messages; optionally a log file of every byte."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from pathlib import Path
 
 from drivers.clock import Clock
 
-TOLD_LINES = 6
-"""Lines that last went over the wire, for errors."""
-TOLD_CHARACTERS = 40
-"""Of each of these lines."""
+RECENT_LINES = 6
+"""Lines that error messages quote."""
+RECENT_CHARACTERS = 40
+"""Characters of each of these lines."""
 
 
 class Transcript:
-    """Safe from several threads. A file that fails later is given up: keeping it must not end a scan.
+    """Record of one serial line. Safe from several threads.
 
-    Each line of the file is: s since the epoch, a mark, and the bytes as a Python literal. Marks: ">" sent, "<"
-    received, "!" what the driver did.
+    A log file that fails later is closed and not written any more: a full disk must not end a scan. Each line of the
+    file holds the time in s since the epoch, a mark and the bytes as a Python literal. Marks: ">" sent, "<" received,
+    "!" done by the driver.
 
     Args:
-        path: the file that is appended to; None keeps none.
+        path: log file, appended to; None: no file.
 
     Raises:
         OSError: the file does not open.
@@ -31,29 +32,29 @@ class Transcript:
 
     def __init__(self, clock: Clock, path: Path | None = None) -> None:
         self._clock = clock
-        self._last: deque[tuple[float, str, str]] = deque(maxlen=TOLD_LINES)  # time, mark, text
+        self._last: deque[tuple[float, str, str]] = deque(maxlen=RECENT_LINES)  # time, mark, text
         self._lock = threading.Lock()
-        # Without a buffer, so that what led to a crash is in it.
+        # Unbuffered, so that the bytes before a crash are in the file.
         self._file: FileIO | None = None if path is None else path.open("ab", buffering=0)
 
-    def tell(self, mark: str, text: str) -> None:
-        """A line for errors to tell."""
+    def add_line(self, mark: str, text: str) -> None:
+        """Add a line to those that error messages quote."""
         with self._lock:
             self._last.append((self._clock.now(), mark, text))
 
-    def keep(self, mark: str, data: bytes) -> None:
-        """Bytes for the file."""
+    def log_bytes(self, mark: str, data: bytes) -> None:
+        """Append bytes to the log file."""
         with self._lock:
             if self._file is None or not data:
                 return
             try:
                 self._file.write(f"{self._clock.now():.6f} {mark} {data!r}\n".encode("ascii"))
             except OSError as problem:
-                self._last.append((self._clock.now(), "!", f"transcript given up: {problem}"))
+                self._last.append((self._clock.now(), "!", f"transcript closed: {problem}"))
                 self._give_up()
 
-    def told(self) -> str:
-        """The last lines and how long ago they went."""
+    def recent(self) -> str:
+        """The last lines with their age, in one string."""
         with self._lock:
             now, last = self._clock.now(), list(self._last)
         return ", ".join(f"{mark} {_cut(text)} ({now - time:.2f} s ago)" for time, mark, text in last)
@@ -64,11 +65,11 @@ class Transcript:
 
     def _give_up(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # a disk that is full or gone may say so once more
+            with contextlib.suppress(OSError):  # a full or missing disk may fail again
                 self._file.close()
             self._file = None
 
 
 def _cut(text: str) -> str:
     shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return shown if len(shown) <= TOLD_CHARACTERS else shown[:TOLD_CHARACTERS] + "..."
+    return shown if len(shown) <= RECENT_CHARACTERS else shown[:RECENT_CHARACTERS] + "..."

@@ -81,7 +81,8 @@ def test_a_long_page_is_told_in_part() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pattern", "problem"), [("(", "no regular expression"), ("(?i)(x)", "no regular expression"), ("mA", "no group")]
+    ("pattern", "problem"),
+    [("(", "a regular expression"), ("(?i)(x)", "a regular expression"), ("mA", "no group")],
 )
 def test_patterns_that_find_nothing(pattern: str, problem: str) -> None:
     with pytest.raises(DeviceRefused, match=problem):

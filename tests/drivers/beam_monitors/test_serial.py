@@ -1,4 +1,4 @@
-"""The electrometer over its simulated wire: values, faults, and a line that finds its step again."""
+"""The electrometer over its simulated wire: values, faults, and a line that a probe brings into step again."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_over_range() -> None:
 
 
 def test_an_empty_query() -> None:
-    with pytest.raises(DeviceRefused, match="empty query"):
+    with pytest.raises(DeviceRefused, match="query is empty"):
         over(ElectrometerWire(VirtualClock()), query="")
 
 

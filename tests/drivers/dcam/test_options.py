@@ -60,7 +60,10 @@ def test_an_option_reaches_the_camera_and_one_that_it_ignores_is_noticed(
     world.reset()
     stuck = world.value(prop) if world.value(prop) != value else value + 1
     world.override(prop, stuck)
-    with pytest.raises(DeviceRefused, match=f"made {prop.name} = {stuck:g} of {value:g}"), connected(world, **option):
+    with (
+        pytest.raises(DeviceRefused, match=f"set {prop.name} = {stuck:g} instead of {value:g}"),
+        connected(world, **option),
+    ):
         pass
     assert world.live == 0
 
@@ -203,7 +206,7 @@ def test_an_exposure_may_be_rounded_but_not_ignored(world: World, accepted: floa
     with connected(world) as camera:
         world.override(Property.EXPOSURETIME, accepted)
         if refused:
-            with pytest.raises(DeviceRefused, match=r"made EXPOSURETIME = .* of 0\.001\..* Expected 0\.001 within"):
+            with pytest.raises(DeviceRefused, match=r"EXPOSURETIME = .* instead of 0\.001\..* Expected 0\.001 within"):
                 camera.configure(EXTERNAL)
         else:
             assert camera.configure(EXTERNAL).exposure == accepted
@@ -237,7 +240,7 @@ def test_what_a_model_does_not_have_is_not_missed(world: World, absent: int) -> 
 def test_a_library_that_does_not_tell_what_frames_carry_is_none_the_less_described(world: World) -> None:
     with connected(world) as camera:
         world.fail("dcamdev_getcapability", Error.NOTSUPPORT)
-        assert camera.describe()["capabilities"] == "not told"
+        assert camera.describe()["capabilities"] == "not reported"
 
 
 def test_what_it_must_have_is_missed_by_name(world: World) -> None:

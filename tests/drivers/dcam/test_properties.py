@@ -40,7 +40,7 @@ def test_exposure_is_what_the_camera_rounded_it_to(camera: DcamCamera) -> None:
             {"binning": 3},
             r"refuses BINNING = 3\..* 'INVALIDVALUE \(0x80000821\)'.* legal: 1, 2, 4",
         ),
-        ({"roi": (0, 0, 30, 40)}, r"made SUBARRAYVSIZE = 32 of 30\..* legal: 4 to 48 in steps of 4"),
+        ({"roi": (0, 0, 30, 40)}, r"set SUBARRAYVSIZE = 32 instead of 30\..* legal: 4 to 48 in steps of 4"),
         (
             {"roi": (32, 0, 32, 40)},
             r"region \(32, 0, 32, 40\) .* does not lie on the sensor\. Expected a region within 48 x 72",
@@ -60,7 +60,7 @@ def test_a_refusal_says_why_and_leaves_the_settings(camera: DcamCamera, wrong: d
 
 def test_a_value_the_camera_ignores_is_noticed(camera: DcamCamera, world) -> None:
     world.override(Property.TRIGGERPOLARITY, 1)
-    with pytest.raises(DeviceRefused, match="made TRIGGERPOLARITY = 1 of 2"):
+    with pytest.raises(DeviceRefused, match="set TRIGGERPOLARITY = 1 instead of 2"):
         camera.configure(EXTERNAL)
 
 

@@ -23,7 +23,7 @@ import serial
 
 from beamline.config.load import Config, config_folder, load
 from beamline.core.events import Event
-from beamline.instrument.connect import Bench, connect
+from beamline.instrument.connect import Instrument, connect
 from beamline.scan import run as run_module
 from beamline.scan.recorder import Recorder
 from beamline.scan.run import RunResult, run_scan
@@ -383,7 +383,7 @@ class Rig:
         wishes = [wish for wish in self.asked if "shutter" in wish]
         return bool(wishes) and wishes[-1].startswith("Open")
 
-    def _connect(self, config: Config, **how: Any) -> Bench:
+    def _connect(self, config: Config, **how: Any) -> Instrument:
         bench = connect(config, self.clock, **how)
         self.after_connecting()
         return bench

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.serial.line import Probe, SerialLine
-from drivers.serial.transcript import TOLD_LINES
+from drivers.serial.transcript import RECENT_LINES
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register
 
@@ -272,7 +272,7 @@ def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
     with pytest.raises(DeviceError, match="does not have the form") as error:
         ask(line, 9)
     told = error.value.wire.split(", ")
-    assert len(told) == TOLD_LINES
+    assert len(told) == RECENT_LINES
     assert told[0].startswith("> N?7 ")
     assert told[-1].startswith("< " + "x" * 40 + "... (")
     assert len(error.value.wire) < 300
