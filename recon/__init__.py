@@ -1,16 +1,19 @@
 """Tomographic reconstruction: arrays in, arrays out. `recon.reconstruct` and `recon.Geometry` are the public names.
 
-The values (Geometry, Grid, Volume) load at once; what computes loads torch and numba on first use, so that a program
-which only plans a scan starts quickly.
+The values (Geometry, Grid, Volume, RunControl, DataUse) load at once; what computes loads torch and numba on first use,
+so that a program which only plans a scan starts quickly.
 """
 
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
+from recon.base.method import DataUse, Progress, RunControl
 from recon.base.volume import Grid, Volume
+from recon.methods import REGISTRY
 
 # libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores
 # (a scan and its live reconstruction) slow each other down twentyfold.
@@ -18,13 +21,42 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction, reconstruct
+    from recon.splatting.r2 import R2
+    from recon.voxels.direct import Fbp
+    from recon.voxels.methods.asd_pocs import AsdPocs
+    from recon.voxels.methods.cgls import Cgls
+    from recon.voxels.methods.fista_tv import FistaTv
+    from recon.voxels.methods.os_sirt_tv import OsSirtTv
+    from recon.voxels.methods.sart import Sart
+    from recon.voxels.methods.sirt import Sirt
 
-__all__ = ["Geometry", "Grid", "Reconstruction", "Volume", "reconstruct"]
+__all__ = [
+    "R2",
+    "AsdPocs",
+    "Cgls",
+    "DataUse",
+    "Fbp",
+    "FistaTv",
+    "Geometry",
+    "Grid",
+    "OsSirtTv",
+    "Progress",
+    "Reconstruction",
+    "RunControl",
+    "Sart",
+    "Sirt",
+    "Volume",
+    "reconstruct",
+]
+
+_LAZY = {
+    "Reconstruction": "recon.reconstruction",
+    "reconstruct": "recon.reconstruction",
+    **{entry.cls: entry.module for entry in REGISTRY.values()},
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("Reconstruction", "reconstruct"):
-        from recon import reconstruction
-
-        return getattr(reconstruction, name)
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'recon' has no attribute {name!r}")

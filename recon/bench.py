@@ -6,7 +6,7 @@ Everything takes its clock. Times are medians over repeats within one run: on a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr, ssim3d
 from recon.base.geometry import Geometry
+from recon.base.method import Method, RunControl
 from recon.base.volume import Grid
 from recon.kernels.cpu.footprints import HU, HV
-from recon.reconstruction import Method, reconstruct
+from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import Active, Gradients, Scratch, project, render_view, view_table
 
 F32 = NDArray[np.float32]
@@ -112,8 +115,9 @@ def step_timing(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: int
     point = Grid((1, 1, 1))
     paces = []
     for _ in range(repeats + 1):
-        made = reconstruct(data, views, point, steps=steps, gaussians=gaussians, densify=False, now=now)
-        first, last = made.history[0], made.history[-1]
+        fit = R2(steps=steps, gaussians=gaussians, fit=FitSettings(policy=None))
+        result = reconstruct(data, views, fit, grid=point, control=RunControl(now=now))
+        first, last = result.history[0], result.history[-1]
         paces.append(1e3 * (last.seconds - first.seconds) / max(1, last.step - first.step))
     low, middle, high = np.percentile(paces[1:], (25, 50, 75))  # the first one may compile
     return Timing("step", float(middle), float(high - low))
@@ -163,13 +167,15 @@ def spheres(side: int = 96, rows: int = 48, views: int = 60, photons: float = 1e
     return exact.astype(np.float32), geometry, truth
 
 
-def volume_rows(now: Clock, methods: tuple[Method, ...], steps: tuple[int, ...]) -> Iterator[VolumeRow]:
-    """Reconstructions of `spheres`: the fit with each number of steps, other methods as they are."""
+def volume_rows(now: Clock, methods: Iterable[Method]) -> Iterator[VolumeRow]:
+    """Reconstructions of `spheres` by each method."""
     data, geometry, truth = spheres()
     for method in methods:
-        for n in steps if method == "r2" else (None,):
-            made = reconstruct(data, geometry, method=method, steps=n, now=now)
-            made = reconstruct(data, geometry, method=method, steps=n, now=now) if n is None else made  # compiled now
-            quality = psnr(truth, made.volume.data), ssim3d(truth, made.volume.data)
-            settings = "" if made.gaussians is None else f"{n} steps, {made.gaussians.n} Gaussians"
-            yield VolumeRow(method, settings, made.seconds, *quality)
+        result = reconstruct(data, geometry, method, control=RunControl(now=now))
+        settings = ""
+        if result.gaussians is None:  # the first run may have compiled its kernels
+            result = reconstruct(data, geometry, method, control=RunControl(now=now))
+        else:
+            settings = f"{result.history[-1].step} steps, {result.gaussians.n} Gaussians"
+        quality = psnr(truth, result.volume.data), ssim3d(truth, result.volume.data)
+        yield VolumeRow(method.name, settings, result.seconds, *quality)

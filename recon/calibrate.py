@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from recon.assess.time_model import Speeds
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
+from recon.base.method import RunControl
 from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
+from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
 
 F32 = NDArray[np.float32]
@@ -27,7 +30,7 @@ _STEP_VIEWS, _STEPS = 4, 6
 def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
     """Measure each part of a reconstruction on a part of the scan.
 
-    The first volume (FBP, or what stands in for it, see `first_volume`), placing and filling on a slab of rows; the
+    The first volume (FBP, or its replacement, see `first_volume`), placing and filling on a slab of rows; the
     step on whole views, with the number of Gaussians that a fit would start from, spread over what a coarse first
     volume shows as matter: how much they overlap decides how long a step takes.
 
@@ -106,11 +109,10 @@ def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians
     """(s a step, s for each view before the first one): what a short fit's own record says."""
     views = _around(geometry, _STEP_VIEWS)
     point = Grid((1, 1, 1), grid.voxel_size)  # filling a volume is measured elsewhere
-    made = reconstruct(
-        np.ascontiguousarray(projections[views]), geometry.select(views), point, steps=_STEPS, gaussians=gaussians,
-        densify=False, now=now,
-    )  # fmt: skip
-    first, last = made.history[0], made.history[-1]
+    fit = R2(steps=_STEPS, gaussians=gaussians, fit=FitSettings(policy=None))
+    data = np.ascontiguousarray(projections[views])
+    result = reconstruct(data, geometry.select(views), fit, grid=point, control=RunControl(now=now))
+    first, last = result.history[0], result.history[-1]
     step = (last.seconds - first.seconds) / max(1, last.step - first.step)
     return step, max(0.0, first.seconds - step) / len(views)
 

@@ -1,21 +1,17 @@
-"""warm_up: compile every kernel of a fit on a toy, so that compilation never falls into a fit's time."""
+"""warm_up: compile every kernel of a method on a toy, so that compilation never falls into a reconstruction's time."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.method import DataUse, Method
 from recon.kernels.cpu.activation import F32
 from recon.reconstruction import reconstruct
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import Start
-from recon.splatting.problem import Loss
-from recon.splatting.settings import FitSettings
+from recon.splatting.r2 import R2
 from recon.splatting.splat import project
 from recon.voxels.view_weights import covers_the_circle
 
@@ -24,41 +20,29 @@ _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 
 
 def warm_up(
-    device: str = "cpu",
-    loss: Loss = "l1",
-    geometry: Geometry | None = None,
-    *,
-    rays: RayModel | None = None,
-    start: Start = "fbp",
-    weighted: bool = False,
+    method: Method | None = None, geometry: Geometry | None = None, *, device: str = "cpu", weighted: bool = False
 ) -> None:
-    """Fit a toy for a few steps: some 30 s on a machine that has never done it, a fraction of a second afterwards.
+    """Reconstruct a toy: a fit takes some 30 s on a machine that has never done it, a fraction of a second afterwards.
 
     numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
     What another kind of geometry, first volume or ray needs is compiled for it alone: leaning views, a cone or weights
     take a sixth of that time more, a start by TV a third, a cone's short scan with exact rays two thirds.
 
     Args:
-        device: that the fit will compute on.
-        loss: of the fit; a GPU's kernels are compiled for one.
-        geometry: of the fit; None: a parallel beam, straight.
-        rays: of the fit's settings; None: their default.
-        start: of the fit.
-        weighted: views of the fit have weights, or values that are not finite.
+        method: with the settings of the run to come; None: `R2` with its defaults.
+        geometry: of the run to come; None: a parallel beam, straight.
+        device: that it will compute on.
+        weighted: its rays have weights, or values that are not finite.
+
+    Raises:
+        ValueError: the method does not take such views.
     """
     data, views = toy_of(geometry)
-    settings = FitSettings(loss=loss, policy=DensityPolicy(start=0, every=1, threshold=0.0))
-    model = settings.rays if rays is None else rays
-    if model.exact_above < math.inf:
-        model = replace(model, exact_above=0.0)  # so that there are some in the toy, too
     weights = None
     if weighted:
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
-    reconstruct(
-        data, views, steps=_VIEWS, gaussians=50, settings=replace(settings, rays=model), start=start, device=device,
-        weights=weights,
-    )  # fmt: skip
+    reconstruct(data, views, (method or R2()).toy(), device=device, use=DataUse(weights))
 
 
 def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:

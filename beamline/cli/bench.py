@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any, get_args
+from typing import Any
 
 import click
 
@@ -14,7 +14,8 @@ from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
 from drivers.clock import SystemClock
 from recon.bench import N_GAUSSIANS, SIDE, Timing, VolumeRow, kernel_timings, step_timing, volume_rows
-from recon.reconstruction import Method
+from recon.methods import by_name, names
+from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
 _STEPS = (125, 500, 2000)
@@ -64,7 +65,8 @@ def _timings(gaussians: int, side: int) -> Iterator[Timing]:
 
 
 def _rows() -> Iterator[VolumeRow]:
-    yield from volume_rows(time.perf_counter, get_args(Method), _STEPS)
+    others = [by_name(name) for name in names()]
+    yield from volume_rows(time.perf_counter, [*map(R2, _STEPS), *(method() for method in others if method is not R2)])
 
 
 def _line(timing: Timing) -> str:

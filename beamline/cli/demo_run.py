@@ -73,7 +73,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     ideal = truth(grid)
     made = Made(
         volume=Volume(record.volume.data, grid),
-        method="r2",
+        method=config.recon.method,
         seconds=record.metrics["seconds"],
         history=history_of(record.history),
         settings=record.parameters,

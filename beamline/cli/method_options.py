@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -11,22 +11,29 @@ from click.core import ParameterSource
 
 from beamline.cli.numbers import POSITIVE
 from recon.assess.time_model import PRESETS, parse_budget
-from recon.reconstruction import DEFAULT_STEPS
+from recon.base.method import Method
+from recon.methods import build, by_name, has_setting, taking, with_trait
 from recon.splatting.initialise import Start
 from recon.splatting.problem import Loss
+from recon.splatting.r2 import DEFAULT_STEPS
 
-_TIMED = ("steps", "seconds", "gaussians")
-_FITTED = (*_TIMED, "start", "loss", "device", "early_stop", "polish")
-_ITERATIVE = ("iterations", "tv_weight")
-SETTINGS = (*_FITTED, *_ITERATIVE)
-"""Options that are handed to the reconstructor as they are."""
+SETTINGS = {
+    "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
+    "early_stop": "early_stop", "polish": "polish", "iterations": "iterations", "tv_weight": "tv_weight",
+}  # fmt: skip
+"""Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
-_FIT = (*_FITTED, "checkpoint", "resume")
+_TRAITS = {
+    "budget": "presets", "quality": "presets", "device": "device", "checkpoint": "checkpoints", "resume": "checkpoints",
+}  # fmt: skip
+"""Options for methods with a trait, and the trait."""
+
 _PLANS = ("budget", "quality")
-# What each of the options that choose a plan leaves no room for.
-_CHOSEN = {"budget": ("quality", *_FIT), "quality": ("budget", *_TIMED, "polish")}
-_FINISHED = tuple(name for name in _FIT if name not in _TIMED)  # of scans that are finished only
-_DIRECT, _SMOOTHED = ("r2", "fbp"), ("fista-tv", "os-sirt-tv")
+_TIMED = ("steps", "seconds", "gaussians")
+_OF_A_FIT = (*_TIMED, "start", "loss", "device", "early_stop", "polish", "checkpoint", "resume")
+# The options that exclude each of those that choose a plan.
+_CHOSEN = {"budget": ("quality", *_OF_A_FIT), "quality": ("budget", *_TIMED, "polish")}
+_FINISHED = tuple(name for name in _OF_A_FIT if name not in _TIMED)  # of scans that are finished only
 
 
 def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
@@ -53,16 +60,32 @@ def method_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
+def method_with(name: str, options: Mapping[str, Any]) -> Method:
+    """The method of this name, with those of the options that are settings of it.
+
+    Args:
+        name: in `recon.methods`.
+        options: values by option; None stands for the method's own.
+    """
+    method = by_name(name)
+    paths = {option: SETTINGS.get(option, option) for option, value in options.items() if value is not None}
+    return build(method, {path: options[option] for option, path in paths.items() if has_setting(method, path)})
+
+
+def takers(option: str) -> tuple[str, ...]:
+    """Names of the methods that take an option."""
+    return with_trait(_TRAITS[option]) if option in _TRAITS else taking(SETTINGS[option])
+
+
 def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None:
     """Raises UsageError for options that exclude each other, or are of another method.
 
     Args:
-        ctx: of a command with `method_options`; what its user did not say, cannot contradict.
-        method: of recon.reconstruct.
+        ctx: of a command with `method_options`; only options that its user gave count.
+        method: its name in `recon.methods`.
         follow: the scan is still running.
     """
-    names = (*_PLANS, *_FIT, *_ITERATIVE)
-    given = [name for name in names if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    given = [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     if {"steps", "seconds"} <= set(given):
         raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
     for plan in _PLANS:
@@ -74,13 +97,9 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
             )
         if plan in given and follow:
             raise click.UsageError(f"{_option(plan)} is for a finished scan; with --follow give --seconds.")
-    foreign = [name for name in given if method != "r2" and name in (*_PLANS, *_FIT)]
-    if foreign:
-        raise click.UsageError(f"{_option(foreign[0])} is of the r2 fit; it does not go with --method {method}.")
-    if "iterations" in given and method in _DIRECT:
-        raise click.UsageError(f"--iterations is of the iterative methods; it does not go with --method {method}.")
-    if "tv_weight" in given and method not in _SMOOTHED:
-        raise click.UsageError(f"--tv-weight is of {' and '.join(_SMOOTHED)}; it does not go with --method {method}.")
+    for name in given:
+        if method not in (owners := takers(name)):
+            raise click.UsageError(f"{_option(name)} is of {', '.join(owners)}; it does not go with --method {method}.")
     endless = [name for name in given if follow and name in _FINISHED]
     if endless:
         raise click.UsageError(f"{_option(endless[0])} is for a finished scan; it does not go with --follow.")

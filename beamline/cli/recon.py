@@ -8,12 +8,12 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
 from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
-from beamline.cli.method_options import SETTINGS, method_options, refuse_contradictions
+from beamline.cli.method_options import SETTINGS, method_options, method_with, refuse_contradictions
 from beamline.cli.narrate import results
 from beamline.cli.numbers import NOT_NEGATIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
@@ -27,7 +27,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import Target
 from drivers.clock import SystemClock
 from recon.assess.time_model import Quality
-from recon.reconstruction import Method
+from recon.methods import DEFAULT, names
 from recon.voxels.fbp import Filter
 
 
@@ -43,8 +43,8 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @click.option(
     "-m",
     "--method",
-    type=click.Choice(get_args(Method)),
-    default="r2",
+    type=click.Choice(names()),
+    default=DEFAULT,
     show_default=True,
     help="r2: Gaussians fitted to the views; fbp: filtered back-projection; the others work on voxels, iteratively.",
 )
@@ -79,9 +79,10 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def recon(
     file: Path,
-    method: Method,
+    method: str,
     budget: float | None,
     quality: Quality | None,
+    device: str,
     checkpoint: Path | None,
     resume: Path | None,
     ramp: Filter,
@@ -111,11 +112,11 @@ def recon(
         source=source,
         target=Target(output, page),
         selection=selection,
-        method=method,
+        method=method_with(method, {**settings, "filter": ramp}),
         budget=budget,
         quality=quality,
         keeper=Keeper(checkpoint, resume),
-        **settings,
+        device=device,
         filter=ramp,
         seed=seed,
         truth=truth,
@@ -130,8 +131,7 @@ def recon(
     if not as_json:
         click.echo(results(last[-1].data))
     if last[-1].data.get("ended_early"):
-        what = "fit was" if last[-1].data["method"] == "r2" else "iterations were"
-        raise ScanStopped(f"The {what} ended early; {output} holds the volume as it then was.")
+        raise ScanStopped(f"The reconstruction was ended early; {output} holds the volume that there was by then.")
     if max_residual is not None:
         require(metrics, max_residual)
 

@@ -23,6 +23,7 @@ from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
 from drivers.clock import SystemClock
+from recon.methods import streams
 
 
 @click.command()
@@ -69,7 +70,7 @@ def _dry_run(config: Config, json_sinks: Sequence[Sink]) -> None:
 def _live(config: Config, no_live: bool) -> LiveCommand | None:
     if no_live or not config.recon.live:
         return None
-    if config.recon.method != "r2":
+    if not streams(config.recon.method):
         click.echo(
             f"No live volume: {config.recon.method} needs the whole scan; use beamline recon afterwards.", err=True
         )

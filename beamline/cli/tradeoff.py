@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
@@ -18,21 +18,18 @@ from beamline.core.events import fan_out
 from beamline.tradeoff.report import text
 from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from drivers.clock import SystemClock
-from recon.reconstruction import Method
-
-METHODS: tuple[Method, ...] = get_args(Method)
+from recon.methods import names
 
 
-def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[Method, ...]:
+def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
     """Names of methods, separated by commas; all where none are given."""
     if value is None:
-        return METHODS
-    names = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
-    known: dict[str, Method] = {method: method for method in METHODS}
-    unknown = [name for name in names if name not in known]
+        return names()
+    wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
+    unknown = [name for name in wanted if name not in names()]
     if unknown:
-        raise click.BadParameter(f"{unknown[0]!r} is none of {', '.join(METHODS)}")
-    return tuple(known[name] for name in names)
+        raise click.BadParameter(f"{unknown[0]!r} is none of {', '.join(names())}")
+    return wanted
 
 
 @click.command()
@@ -44,7 +41,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 )
 @selection_options
 @click.option(
-    "--methods", callback=listed, metavar="A,B,...", help=f"Of {', '.join(METHODS)}; all of them without this."
+    "--methods", callback=listed, metavar="A,B,...", help=f"Of {', '.join(names())}; all of them without this."
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
 @click.option(
@@ -63,7 +60,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 def tradeoff(
     file: Path,
     truth: str | None,
-    methods: tuple[Method, ...],
+    methods: tuple[str, ...],
     quick: bool,
     max_seconds: float | None,
     seed: int,

@@ -15,14 +15,15 @@ from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import Prepared
 from recon.assess.time_model import CURVES, Choice, Speeds, choose, parts_of
 from recon.base.binning import bin_views
+from recon.base.method import DataUse, Progress, RunControl
 from recon.base.volume import Grid
 from recon.calibrate import calibrate
 from recon.reconstruction import Reconstruction
 from recon.splatting.initialise import default_count, place
-from recon.splatting.optimise import Progress
+from recon.splatting.r2 import R2
 from recon.splatting.splat import voxelize
+from recon.voxels.direct import Fbp, has_direct_method
 from recon.voxels.fbp import Filter
-from recon.voxels.fdk import has_direct_method
 
 Now = Callable[[], float]
 
@@ -56,7 +57,7 @@ class Budgeted:
         return {
             "budget": budget,
             "budget_used": self.seconds,
-            "chosen_method": c.method,
+            "chosen_method": self.result.method,
             "chosen_binning": c.binning,
             "chosen_share": c.share,
             "expected_steps": c.steps,
@@ -70,7 +71,7 @@ class Budgeted:
     def said(self, budget: float) -> str:
         """What was chosen, in a line."""
         fit = ""
-        if self.choice.method == "r2":
+        if self.choice.fits:
             fit = f", {self.result.history[-1].step} steps from {self.placed} Gaussians"
         return f"{_named(self.choice, fit)}: {parts_of(self.seconds)} of {parts_of(budget)}"
 
@@ -100,9 +101,9 @@ def within(
     spent = now() - begin
     # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
     choice = choose(max(budget - spent, sys.float_info.min), speeds, min(geometry.detector_shape))
-    if choice.method == "fbp" and not has_direct_method(geometry):
+    if not choice.fits and not has_direct_method(geometry):
         # There is only the volume that Gaussians are placed by; the fewest of them, and a step, are the next best.
-        choice = replace(choice, method="r2", share=min(curve.share for curve in CURVES) / choice.binning**3)
+        choice = replace(choice, share=min(curve.share for curve in CURVES) / choice.binning**3)
     late = spent + _least(choice, speeds) - budget
     if late > 0:
         warn(
@@ -112,8 +113,8 @@ def within(
     prepared = joined(prepared, choice.binning)
     data, geometry = prepared.projections.data, prepared.geometry
     grid = Grid.matching(geometry)
-    if choice.method == "fbp":
-        result = recon.reconstruct(data, geometry, grid, "fbp", filter=filter, now=now)
+    if not choice.fits:
+        result = recon.reconstruct(data, geometry, Fbp(filter), grid=grid, control=RunControl(now=now))
         return Budgeted(result, prepared, choice, speeds, now() - begin)
     field = Grid.of_field(geometry, geometry.sample_pitch)
     placed = place(data, geometry, field, max(1, round(choice.share * unbinned)), np.random.default_rng(seed))
@@ -123,22 +124,23 @@ def within(
     fill = (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
     end = begin + budget * (1 - _RESERVE) - fill
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
+    control = RunControl(should_stop=lambda: stopped() or now() >= end, on_progress=on_progress, now=now)
+    fit = R2(seconds=max(0.0, end - now()), gaussians=placed)
     result = recon.reconstruct(
-        data, geometry, grid, seconds=max(0.0, end - now()), gaussians=placed, seed=seed, held_out=held_out,
-        on_progress=on_progress, should_stop=lambda: stopped() or now() >= end, now=now,
+        data, geometry, fit, grid=grid, seed=seed, use=DataUse(held_out=held_out), control=control
     )  # fmt: skip
     return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
 
 
 def _named(choice: Choice, fit: str = "") -> str:
     joined = f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else ""
-    return f"{choice.method}{fit}{joined}"
+    return f"{R2.name if choice.fits else Fbp.name}{fit}{joined}"
 
 
 def _least(choice: Choice, speeds: Speeds) -> float:
     """Seconds that a choice takes at the least: for a fit placing, a step and filling; as `choose` counts them."""
     first = speeds.fbp / choice.binning**3
-    if choice.method == "fbp":
+    if not choice.fits:
         return first
     return first + (speeds.start + speeds.fill) * choice.share + speeds.step / choice.binning**2
 

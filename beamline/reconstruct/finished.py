@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,13 +22,11 @@ from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import Context, Made, facts_of
 from beamline.reconstruct.result import deliver
 from drivers.clock import Clock
-from recon.assess.time_model import PRESETS
+from recon.base.method import DataUse, Method, Progress, RunControl
 from recon.base.volume import Grid
-from recon.reconstruction import DEFAULT_STEPS
 from recon.splatting.backend import backend_for
 from recon.splatting.initialise import default_count
-from recon.splatting.optimise import Progress
-from recon.splatting.settings import FitSettings
+from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
 
@@ -58,7 +56,7 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope =
         facts = facts_of(source)
         prepared = prepare(source, options.selection, warn)
     selection = options.selection
-    if options.early_stop and prepared.held_out is None:
+    if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = keep_back(prepared)
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
@@ -72,7 +70,7 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope =
             made, prepared, factor = _spend(work, options.budget)
             selection = replace(selection, binning=selection.binning * factor)
         else:
-            made = _fit(work) if options.method == "r2" else _by_voxels(work)
+            made = _fit(work, options.method) if isinstance(options.method, R2) else _made(work)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
     context = Context(facts, selection, options.command, options.seed, warn.messages, started)
     return deliver(made, prepared, truth, options.target, context, sink, clock)
@@ -82,7 +80,7 @@ def announce(options: ReconOptions, prepared: Prepared, sink: Sink, clock: Clock
     """Say what is about to be reconstructed."""
     data = {
         "file": options.source.path,
-        "method": options.method,
+        "method": options.method.name,
         "n_views": prepared.geometry.n_views,
         "n_projections": prepared.n_projections,
         "detector": prepared.geometry.detector_shape,
@@ -126,6 +124,21 @@ class _Work:
         except ValueError as error:
             raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
 
+    def run(self, method: Method, control: RunControl) -> recon.Reconstruction:
+        """By a method, with the views held out where it takes them, until it ends or is stopped."""
+        prepared, data, geometry = self.prepared, self.prepared.projections.data, self.prepared.geometry
+        held_out: Sequence[int] = ()
+        if method.traits.held_out:
+            data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
+        control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
+        with self.refused(f" by {method.name}"):
+            # So that the time of the run, and the time it says is left, hold no compilation.
+            warm_up(method, prepared.geometry, device=self.options.device)
+            return recon.reconstruct(
+                data, geometry, method, grid=self.grid, seed=self.options.seed, device=self.options.device,
+                use=DataUse(held_out=held_out), control=control,
+            )  # fmt: skip
+
     def made(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> Made:
         """The result with what it was made with: its own settings, `settings`, and whether it ended early."""
         return Made(
@@ -139,81 +152,48 @@ class _Work:
         )
 
 
-def _by_voxels(work: _Work) -> Made:
-    """By FBP or an iterative method."""
-    options, prepared = work.options, work.prepared
-    own: dict[str, Any] = {"filter": options.filter} if options.method == "fbp" else {}
-    with work.refused(f" by {options.method}"):
-        result = recon.reconstruct(
-            prepared.projections.data,
-            prepared.geometry,
-            work.grid,
-            method=options.method,
-            seed=options.seed,
-            **own,
-            iterations=options.iterations,
-            tv_weight=options.tv_weight,
-            on_progress=work.listener(),
-            should_stop=work.stop_latch,
-            now=work.clock.now,
-        )
+def _made(work: _Work) -> Made:
+    """By a method without a state to keep."""
+    result = work.run(work.options.method, RunControl(on_progress=work.listener()))
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
     return work.made(result, work.stop_latch.cut(reached, planned))
 
 
-def _fit(work: _Work) -> Made:
-    """Fit Gaussians, by steps, by seconds or by a preset; keeping its state and taking it up where that is wanted."""
-    options, prepared, grid = work.options, work.prepared, work.grid
-    steps, gaussians, polish, said = options.steps, options.gaussians, options.polish, ""
+def _fit(work: _Work, method: R2) -> Made:
+    """Fit Gaussians; save the state of the fit and continue from a saved one where that is wanted."""
+    options, prepared = work.options, work.prepared
+    asked, chosen = method.gaussians, ""
     if options.quality is not None:
-        preset = PRESETS[options.quality]
-        steps, polish = preset.steps, preset.polish
-        gaussians = max(1, round(preset.share * default_count(Grid.of_field(prepared.geometry, grid.voxel_size))))
-    if steps is None and options.seconds is None:
-        steps = DEFAULT_STEPS
-    settings, keeper = FitSettings(loss=options.loss), options.keeper
+        method = method.with_quality(
+            options.quality, default_count(Grid.of_field(prepared.geometry, work.grid.voxel_size))
+        )
+    steps, keeper = method.planned_steps or 0, options.keeper
     origin, resume = {}, None
     if keeper.wanted:
-        others = {"seed": options.seed, "start": options.start, "gaussians": gaussians or 0}
-        origin = made_from(prepared, settings, others)
-        resume = keeper.begin(origin, steps or 0, work.warn)
-    # So that the fit's time, and the time it says is left, hold no compilation.
-    warm_up(options.device, options.loss, prepared.geometry, rays=settings.rays, start=options.start)
-    data, geometry, held_out = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
-    with work.refused(" by r2"):
-        result = recon.reconstruct(
-            data,
-            geometry,
-            grid,
-            steps=steps,
-            gaussians=gaussians,
-            seed=options.seed,
-            settings=settings,
-            seconds=options.seconds,
-            start=options.start,
-            held_out=held_out,
-            early_stop=options.early_stop,
-            resume=resume,
-            device=options.device,
-            polish=polish,
-            on_progress=work.listener(options.seconds),
-            should_stop=work.stop_latch,
-            on_checkpoint=None if keeper.path is None else partial(keeper.write, origin, steps or 0, work.warn),
-            now=work.clock.now,
-        )
+        assert method.gaussians is None or isinstance(method.gaussians, int)
+        others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
+        origin = made_from(prepared, method.fit, others)
+        resume = keeper.begin(origin, steps, work.warn)
+    keep = partial(keeper.write, origin, steps, work.warn)
+    control = RunControl(
+        on_progress=work.listener(method.seconds),
+        on_checkpoint=None if keeper.path is None else keep,
+        resume=resume,
+    )
+    result = work.run(method, control)
     if result.checkpoint is not None:
-        keeper.write(origin, steps or 0, work.warn, result.checkpoint)
+        keep(result.checkpoint)
     begun = int(result.settings["gaussians_at_start"])
     if options.quality is not None:
-        said = f"{options.quality}: {steps} steps from {begun} Gaussians"
-        said += f", {polish} sweeps on voxels" if polish else ""
-    if options.gaussians is not None and resume is None and begun < options.gaussians:
-        work.warn(f"The fit started from {begun} Gaussians, not from {options.gaussians}: there is no matter for more.")
-    told = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
+        chosen = f"{options.quality}: {method.steps} steps from {begun} Gaussians"
+        chosen += f", {method.polish} sweeps on voxels" if method.polish else ""
+    if isinstance(asked, int) and resume is None and begun < asked:
+        work.warn(f"The fit started from {begun} Gaussians, not from {asked}: the sample has no room for more.")
+    result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     # Sweeps come after the last step, and end early as well.
-    early = work.stop_latch.stopped if polish else work.stop_latch.cut(result.history[-1].step, steps or 0)
+    early = work.stop_latch.stopped if method.polish else work.stop_latch.cut(result.history[-1].step, steps)
     resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
-    return work.made(told, early, said, **resumed)
+    return work.made(result, early, chosen, **resumed)
 
 
 def _spend(work: _Work, budget: float) -> tuple[Made, Prepared, int]:
@@ -225,4 +205,4 @@ def _spend(work: _Work, budget: float) -> tuple[Made, Prepared, int]:
             work.stop_latch, work.warn,
         )  # fmt: skip
     made = work.made(done.result, work.stop_latch.stopped, done.said(budget), **done.settings(budget))
-    return replace(made, seconds=done.seconds, method=done.choice.method), done.prepared, done.choice.binning
+    return replace(made, seconds=done.seconds), done.prepared, done.choice.binning

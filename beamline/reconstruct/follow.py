@@ -54,11 +54,8 @@ def follow(
         DataError: no scan, or one that stopped growing without being finished.
     """
     rhythm = rhythm or Rhythm()
-    if options.method != "r2":
-        raise ConfigError(
-            f"--follow grows an r2 volume; for {options.method} run without --follow when the scan has ended."
-        )
-    if options.selection.views != "all" or options.steps is not None:
+    method = options.streaming
+    if options.selection.views != "all" or method.steps is not None:
         raise ConfigError(
             "--follow takes every view as it comes, for --seconds after the end: leave out --views and --steps."
         )
@@ -72,7 +69,7 @@ def follow(
         growing = Growing(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
         with stop_scope() as stopped:
-            made = growing.finish(options.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
+            made = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
         # All flats are there now; the geometry stays the one that the volume has grown in.
         prepared = prepare(source, replace(options.selection, axis_col=growing.axis_col), warn)

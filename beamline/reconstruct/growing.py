@@ -23,8 +23,8 @@ from beamline.storage.rules.validate import reconstruction_blockers
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
 from drivers.frame import FrameKind
+from recon.base.method import Progress
 from recon.prep.align import AxisEstimate
-from recon.splatting.optimise import Progress
 from recon.splatting.stream import StreamingFit
 
 _FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
@@ -132,14 +132,14 @@ class Growing:
         template = geometry_of(self.source, self._options.selection, axis_col, np.zeros(1))
         data = {
             "file": self.source.path,
-            "method": "r2",
+            "method": self._options.method.name,
             "n_views": self.n_views,
             "axis_col": axis_col,
             "again": bool(self._history),
         }
         self._sink(Event("recon_started", self._clock.now(), data))
         options = self._options
-        return StreamingFit(template, seed=options.seed, gaussians=options.gaussians, now=self._clock.now)
+        return options.streaming.stream(template, options.seed, self._clock.now)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False where there is nothing to fit yet."""
@@ -212,7 +212,8 @@ class Growing:
             "gaussians": self._history[-1].n_gaussians,
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
-        return Made(volume, "r2", self._clock.now() - self._begin, self._history, settings, self._options.filter)
+        method, seconds = self._options.method.name, self._clock.now() - self._begin
+        return Made(volume, method, seconds, self._history, settings, self._options.filter)
 
 
 def _quiet(text: str) -> None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import Keeper
 from beamline.reconstruct.result import Target
 from beamline.storage.readers.open import Quantity, ScanSource, open_scan
 from recon.assess.time_model import Quality
-from recon.reconstruction import Method
-from recon.splatting.initialise import Start
-from recon.splatting.problem import Loss
+from recon.base.method import Method
+from recon.methods import names, streams
+from recon.splatting.r2 import R2
+from recon.splatting.stream import StreamingMethod
 from recon.voxels.fbp import Filter
 
 
@@ -47,18 +49,12 @@ class ReconOptions:
         source: the scan.
         target: where results go.
         selection: which part of the scan, and its correction.
-        method: of recon.reconstruct.
-        steps: of the fit; None takes the reconstructor's own number.
-        seconds: at most, for the fit; for a followed scan, after its end.
-        budget: s for everything from line integrals to volume; chooses all settings of the fit.
-        quality: a preset instead of steps and Gaussians.
-        gaussians: how many to start from; None derives it from the volume.
-        start, loss, device: of the fit.
-        early_stop: end the fit when views held out no longer gain; some are kept back where all were chosen.
-        polish: sweeps on voxels after the fit.
+        method: with its settings; `R2.seconds` of a followed scan count from its end.
+        budget: s for everything from line integrals to volume; chooses the method and all settings.
+        quality: a preset instead of the fit's steps, Gaussians and polish.
+        device: to compute on.
         keeper: of the fit's state.
-        iterations, tv_weight: of an iterative method; None takes its own.
-        filter: of the FBP.
+        filter: of the FBP that the volume is compared with.
         seed: of everything random.
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the frames that there are, where the scan still runs or died.
@@ -68,22 +64,27 @@ class ReconOptions:
     source: SourceOptions
     target: Target
     selection: Selection
-    method: Method = "r2"
-    steps: int | None = None
-    seconds: float | None = None
+    method: Method = field(default_factory=R2)
     budget: float | None = None
     quality: Quality | None = None
-    gaussians: int | None = None
-    start: Start = "fbp"
-    loss: Loss = "l1"
     device: str = "cpu"
-    early_stop: bool = False
-    polish: int = 0
     keeper: Keeper = field(default_factory=Keeper)
-    iterations: int | None = None
-    tv_weight: float | None = None
     filter: Filter = "hann"
     seed: int = 0
     truth: str | None = None
     unfinished: bool = False
     command: str = ""
+
+    @property
+    def streaming(self) -> StreamingMethod:
+        """The method of a scan that is followed.
+
+        Raises:
+            ConfigError: it needs the whole scan.
+        """
+        if not isinstance(self.method, StreamingMethod):
+            raise ConfigError(
+                f"--follow needs a method whose volume grows with the views ({', '.join(filter(streams, names()))}); "
+                f"run {self.method.name} without --follow when the scan has ended."
+            )
+        return self.method

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from beamline.core.events import Event, Sink
 from drivers.clock import Clock
-from recon.splatting.optimise import Progress
+from recon.base.method import Progress
 
 
 def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> Callable[[Progress], None]:

@@ -20,15 +20,12 @@ from beamline.storage.readers.open import ScanSource
 from beamline.storage.writers.recon_file import Value
 from drivers.frame import FrameKind
 from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
+from recon.base.method import Progress
 from recon.base.volume import Volume
-from recon.splatting.optimise import Progress
+from recon.methods import by_name
 from recon.splatting.settings import FitSettings
+from recon.voxels.direct import Fbp
 from recon.voxels.fbp import Filter
-
-METHOD_NAMES: Mapping[str, str] = {
-    "r2": "R²-Gaussian", "fbp": "FBP", "sirt": "SIRT", "sart": "SART", "cgls": "CGLS", "asd-pocs": "ASD-POCS",
-    "fista-tv": "FISTA-TV", "os-sirt-tv": "OS-SIRT-TV",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,8 +81,8 @@ class Made:
         judged = judged_by(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:
             return None
-        if self.method == "r2":
-            if self.settings.get("pace") != FitSettings().pace:
+        if (pace := self.settings.get("pace")) is not None:  # of a fit
+            if pace != FitSettings().pace:
                 return None
             return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)
         return next_decibel(judged.seconds, judged.residuals)
@@ -119,6 +116,11 @@ class Context:
     warnings: Sequence[str] = ()
     started: float = 0.0
     scan_flags: Sequence[str] = field(default_factory=tuple)
+
+
+def label_of(method: str) -> str:
+    """A method's name for people."""
+    return by_name(method).label
 
 
 def facts_of(source: ScanSource) -> ScanFacts:
@@ -155,15 +157,15 @@ def compose(
     context: Context,
 ) -> Report:
     """The report on a reconstruction."""
-    name, geometry = METHOD_NAMES[made.method], prepared.geometry
+    name, geometry = label_of(made.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]
     summary = (
         f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
         f"{prepared.n_projections} views in {made.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
-    if "fbp" in metrics and made.method != "fbp":
-        summary += f" (FBP of the same views: {formatted(best, metrics['fbp'][best])})"
+    if Fbp.name in metrics and made.method != Fbp.name:
+        summary += f" (FBP of the same views: {formatted(best, metrics[Fbp.name][best])})"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
     if made.next_decibel_said:
@@ -188,7 +190,7 @@ def compose(
         summary=summary + ".",
         scan=context.facts.table,
         settings=settings,
-        metrics={METHOD_NAMES[method]: values for method, values in metrics.items()},
+        metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=_pictures(made, prepared, truth, volumes),
@@ -201,7 +203,7 @@ def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Map
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
     row = geometry.detector_shape[0] // 2
     shown = {"Truth": truth} if truth is not None else {}
-    shown |= {METHOD_NAMES[method]: volume for method, volume in volumes.items()}
+    shown |= {label_of(method): volume for method, volume in volumes.items()}
     pictures = [
         Picture(
             "Slices",

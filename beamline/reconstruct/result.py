@@ -13,15 +13,15 @@ from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing
 from beamline.projections.prepare import Prepared
 from beamline.reconstruct.measure import measure, regions
-from beamline.reconstruct.recon_report import METHOD_NAMES, Context, Made, compose
+from beamline.reconstruct.recon_report import Context, Made, compose, label_of
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
 from drivers.clock import Clock
 from recon.base.volume import Volume
+from recon.methods import by_name
 from recon.prep.align import AxisEstimate
-from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk, has_direct_method
+from recon.voxels.direct import Fbp, direct, has_direct_method
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,18 @@ def deliver(
 
     metrics = {made.method: judged(made.volume, made.seconds)}
     volumes = {made.method: made.volume}
-    if made.method != "fbp" and target.report is not None and has_direct_method(prepared.geometry):
+    if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
         before = clock.now()
-        direct = fdk if prepared.geometry.is_cone else fbp
         data = direct(prepared.projections.data, prepared.geometry, made.volume.grid, made.filter)
-        volumes = {"fbp": Volume(data, made.volume.grid), **volumes}
-        metrics = {"fbp": judged(volumes["fbp"], clock.now() - before), **metrics}
+        volumes = {Fbp.name: Volume(data, made.volume.grid), **volumes}
+        metrics = {Fbp.name: judged(volumes[Fbp.name], clock.now() - before), **metrics}
     own = metrics[made.method]
     parameters = parameters_of(made, prepared, context)
     record = ReconRecord(
         volume=made.volume,
         length_unit=prepared.length_unit,
         raw_file=str(context.facts.path.resolve()),
-        title=f"{METHOD_NAMES[made.method]} reconstruction of {context.facts.name}",
+        title=f"{label_of(made.method)} reconstruction of {context.facts.name}",
         sample=context.facts.sample or "not stated",
         time=clock.now(),
         parameters=parameters,
@@ -99,7 +98,7 @@ def deliver(
     if (further := made.next_decibel) is not None:
         summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_said}
     if len(metrics) > 1:
-        summary["fbp"] = metrics["fbp"]
+        summary[Fbp.name] = metrics[Fbp.name]
     sink(Event("done", clock.now(), summary))
     return own
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.splatting.optimise import Progress
+from recon.base.method import Progress
 
 _FIELDS = {f.name: f.type for f in fields(Progress)}
 _WORDS = {"held_out": "views held out", "residual": "views used"}

@@ -14,6 +14,7 @@ from typing import Any
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, Ending, json_object
 from beamline.tradeoff.trials import Outcome, Status, Trial
+from recon.base.method import PRECISION
 
 
 def command(job: Path) -> Sequence[str]:
@@ -27,9 +28,14 @@ def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
     Args:
         work: a folder with data.npz.
     """
-    kinds = {(trial.method, trial.start): trial for trial in trials if trial.group != "precision"}
+    kinds = {_kernels(trial): trial for trial in trials if trial.group != PRECISION}
     job = {"data": str(work / "data.npz"), "compile": [asdict(trial) for trial in kinds.values()]}
     _run(job, work)  # a failure here comes again in a trial, which reports it
+
+
+def _kernels(trial: Trial) -> tuple[str, ...]:
+    """What decides which kernels a trial compiles: its method, and those of its settings that are words."""
+    return trial.method, *(value for value in trial.settings.values() if isinstance(value, str))
 
 
 def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = None) -> Outcome:

@@ -22,8 +22,9 @@ from beamline.tradeoff.figures import cost_curves, pareto_plot
 from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
 from beamline.tradeoff.trials import Outcome
 from recon.assess.time_model import parts_of
+from recon.base.method import PRECISION
 
-_FIELDS = ("group", "method", "views", "binning", "steps", "gaussians", "loss", "sigmas", "start", "iterations")
+_FIELDS = ("group", "method", "views", "binning")
 _WIDTH = 120  # characters
 
 
@@ -47,7 +48,7 @@ _COLUMNS = {
 def text(table: TrialTable) -> str:
     """The table for people; * marks the trials that no other beats in both time and quality."""
     lines = [machine_line(dict(table.machine)), ""]
-    shown = [o for o in table.outcomes if o.trial.group != "precision"]
+    shown = [o for o in table.outcomes if o.trial.group != PRECISION]
     width = max((len(outcome.trial.label) for outcome in shown), default=5)
     names = _metric_names(table)
     lines.append(
@@ -55,7 +56,7 @@ def text(table: TrialTable) -> str:
     )
     best = {table.compared[i].trial for i in table.front(TIME)}
     for outcome in table.outcomes:
-        if outcome.trial.group == "precision" and outcome.status == "done":
+        if outcome.trial.group == PRECISION and outcome.status == "done":
             continue
         mark = "*" if outcome.trial in best else " "
         row = f"{mark} {outcome.trial.label:<{width}}"
@@ -102,7 +103,7 @@ def conclusions(table: TrialTable) -> list[str]:
             f"+{stretch.gain:.2f} dB for {_duration(stretch.cost)} more ({_duration(stretch.per_decibel)} a dB): "
             f"{compared[stretch.end].trial.label}."
         )
-    out += [_precision(o.details) for o in table.outcomes if o.trial.group == "precision" and o.details]
+    out += [_precision(o.details) for o in table.outcomes if o.trial.group == PRECISION and o.details]
     return out
 
 
@@ -136,13 +137,14 @@ def write_table(folder: Path, table: TrialTable) -> None:
 def to_csv(table: TrialTable) -> str:
     """One line for each trial; a value that is not known is empty."""
     names = _metric_names(table)
+    settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        [*_FIELDS, "status", "seconds", "cpu_seconds", "peak_bytes", "gaussians_end", *names, "quality_db", "message"]
-    )
+    costs = ("seconds", "cpu_seconds", "peak_bytes", "gaussians_end")
+    writer.writerow([*_FIELDS, *settings, "status", *costs, *names, "quality_db", "message"])
     for outcome in table.outcomes:
         values = [getattr(outcome.trial, name) for name in _FIELDS]
+        values += [outcome.trial.settings.get(name) for name in settings]
         values += [outcome.status, outcome.seconds, outcome.cpu_seconds, outcome.peak_bytes, outcome.gaussians]
         values += [outcome.metrics.get(name) for name in names]
         writer.writerow([finite(v) for v in (*values, outcome.quality(table.by), outcome.message)])
@@ -203,7 +205,7 @@ def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
                 "reason": f"{outcome.status}: {outcome.message}".rstrip(": "),
             }
             for outcome in table.outcomes
-            if outcome.trial.group != "precision"
+            if outcome.trial.group != PRECISION
         ],
         scan=table.scan,
         command=table.command,

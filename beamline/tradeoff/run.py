@@ -24,10 +24,10 @@ from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Depth, Outcome, Timed, plan, seconds_left
+from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
 from drivers.clock import Clock
+from recon.base.method import Depth
 from recon.base.volume import Grid
-from recon.reconstruction import Method
 from recon.splatting.initialise import default_count
 
 _HELD_OUT_SHARE = 8  # one of so many views is kept back where there is nothing else to judge by
@@ -41,7 +41,7 @@ class TradeoffOptions:
     Attributes:
         source, selection: the scan and the part of it to use.
         folder: for the results; must not exist.
-        methods: of recon.reconstruct.
+        methods: names in `recon.methods`.
         depth: how many trials.
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
         truth: FILE or FILE:first:end to compare with.
@@ -52,7 +52,7 @@ class TradeoffOptions:
     source: SourceOptions
     selection: Selection
     folder: Path
-    methods: Sequence[Method]
+    methods: Sequence[str]
     depth: Depth = "quick"
     max_seconds: float | None = None
     truth: str | None = None

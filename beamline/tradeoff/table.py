@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
+from recon.base.method import PRECISION
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class TrialTable:
     @property
     def compared(self) -> tuple[Outcome, ...]:
         """The trials that reconstructed the scan successfully."""
-        return tuple(o for o in self.outcomes if o.status == "done" and o.trial.group != "precision")
+        return tuple(o for o in self.outcomes if o.status == "done" and o.trial.group != PRECISION)
 
     @property
     def qualities(self) -> list[float]:
@@ -94,8 +95,7 @@ class TrialTable:
     def event_data(self, outcome: Outcome) -> dict[str, Any]:
         """One trial, as the data of an event; `gaussians` are those at its start, as in its settings."""
         return {
-            **asdict(outcome.trial),
-            "label": outcome.trial.label,
+            **outcome.trial.as_record(),
             "status": outcome.status,
             "seconds": outcome.seconds,
             "cpu_seconds": outcome.cpu_seconds,

@@ -4,36 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from recon.reconstruction import Method
-from recon.splatting.initialise import Start
+from recon.base.method import PRECISION, Depth, Method, Plain
+from recon.methods import build, by_name
 
-Loss = Literal["l1+ssim", "l1", "l2+ssim", "poisson+ssim"]
-Depth = Literal["quick", "full"]
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
-DIRECT = ("fbp",)
 _WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
-SIGMAS = 3.5  # where the fit cuts Gaussians off when nobody says otherwise
-
-_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
-_BASE_STEPS: Mapping[Depth, int] = {"quick": 250, "full": 1000}
-_BINNED_STEPS: Mapping[Depth, tuple[int, ...]] = {"quick": (250,), "full": (125, 500, 1000)}
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
-_FACTORS: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.5, 2.0)}
-_SIGMAS: Mapping[Depth, tuple[float, ...]] = {"quick": (3.0,), "full": (2.5, 3.0, 4.5)}
-_LOSSES: tuple[Loss, ...] = ("l1", "l2+ssim", "poisson+ssim")
-# Passes over the data; about what each method needs to get near its best, and a few fewer and more.
-_ITERATIONS: Mapping[str, Mapping[Depth, tuple[int, ...]]] = {
-    "sirt": {"quick": (20, 60), "full": (10, 30, 100, 300)},
-    "sart": {"quick": (2, 6), "full": (1, 3, 10, 30)},
-    "cgls": {"quick": (5, 15), "full": (5, 10, 20, 40)},
-    "asd-pocs": {"quick": (10,), "full": (5, 20, 50)},
-    "fista-tv": {"quick": (20, 60), "full": (20, 50, 100, 200)},
-    "os-sirt-tv": {"quick": (5, 15), "full": (5, 10, 20, 40)},
-}
 
 
 @dataclass(frozen=True)
@@ -41,42 +21,60 @@ class Trial:
     """One reconstruction to make.
 
     Attributes:
-        group: what it varies: "method" where nothing, "precision" for the comparison with the float64 twin.
-        method: of recon.reconstruct.
+        group: what it varies: "method" where nothing, `PRECISION` for the comparison with the float64 reference
+            implementation.
+        method: its name in `recon.methods`.
         views: how many, spread evenly over those chosen.
         binning: detector pixels joined a side, on top of the selection's.
-        steps, gaussians, loss, sigmas: of the r2 fit; how many Gaussians it starts from, where they are cut off.
-        start: the volume that the fit's Gaussians are drawn from.
-        iterations: of the classical methods.
+        settings: of the method, by name as `recon.methods.build` takes them.
         halves: measure the half-set resolution too, which takes two more reconstructions.
     """
 
     group: str
-    method: Method
+    method: str
     views: int
     binning: int = 1
-    steps: int | None = None
-    gaussians: int | None = None
-    loss: Loss = "l1+ssim"
-    sigmas: float = SIGMAS
-    start: Start = "fbp"
-    iterations: int | None = None
+    settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
     halves: bool = False
+
+    def build(self) -> Method:
+        """The method with the settings of the trial.
+
+        Raises:
+            ValueError: for a method or a setting that there is not.
+        """
+        return build(by_name(self.method), self.settings)
 
     @property
     def label(self) -> str:
         """The settings, as short as they can be said."""
-        if self.group == "precision":
+        if self.group == PRECISION:
             return "float32 against float64"
         parts = [self.method, f"{self.views} views"]
         parts += [f"bin {self.binning}"] if self.binning > 1 else []
-        parts += [f"{self.steps} steps"] if self.steps is not None else []
-        parts += [thousands(self.gaussians)] if self.gaussians is not None else []
-        parts += [self.loss] if self.loss != "l1+ssim" else []
-        parts += [f"cut at {self.sigmas:g} σ"] if self.sigmas != SIGMAS else []
-        parts += [f"start {self.start}"] if self.start != "fbp" else []
-        parts += [f"{self.iterations} iteration{'s' * (self.iterations != 1)}"] if self.iterations is not None else []
-        return ", ".join(parts)
+        return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
+
+    def as_record(self) -> dict[str, Any]:
+        """Plain values for a table, JSON or an event."""
+        record = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {**record, **record.pop("settings"), "label": self.label}
+
+
+def _in_words(name: str, value: Plain) -> str:
+    match name, value:
+        case "steps", _:
+            return f"{value} steps"
+        case "gaussians", int():
+            return thousands(value)
+        case "iterations", _:
+            return f"{value} iteration{'s' * (value != 1)}"
+        case "fit.loss", _:
+            return f"{value} loss"
+        case "fit.ssim_weight", 0:
+            return "no SSIM"
+        case "fit.truncation.sigmas", _:
+            return f"cut at {float(value):g} σ"
+    return f"{name.rsplit('.', 1)[-1]} {value}"
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ class Outcome:
         curve: (seconds, dB) of its own record of the residual.
         curve_of: of which views that is, in words.
         message: why there are no figures.
-        details: of the comparison with the float64 twin.
+        details: of the comparison with the float64 reference implementation.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
     """
 
@@ -115,9 +113,7 @@ class Outcome:
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table or JSON."""
-        record = asdict(self)
-        record["trial"]["label"] = self.trial.label
-        return record
+        return {**asdict(self), "trial": self.trial.as_record()}
 
 
 def decibels(name: str, value: float) -> float:
@@ -131,56 +127,39 @@ def thousands(n: int) -> str:
     return f"{n / 1000:.3g}k Gaussians" if n >= 1000 else f"{n} Gaussians"
 
 
-def plan(methods: Sequence[Method], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
+def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
     """The trials, one setting varied at a time about each method's baseline; baselines first, cheap ones early.
 
     Args:
-        methods: of recon.reconstruct, in the order wanted.
+        methods: names in `recon.methods`, in the order wanted.
         n_views: how many there are.
-        gaussians: how many the r2 fit would start from by itself.
+        gaussians: how many a fit would start from by itself.
         depth: "quick" has about half as many trials as "full", and shorter ones.
+
+    Raises:
+        ValueError: for a method that there is not.
     """
+    counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
     first: list[Trial] = []
     rest: list[Trial] = []
+    last: list[Trial] = []
     for method in methods:
-        base, *others = _of_method(method, n_views, gaussians, depth)
-        first.append(base)
-        rest += others
-    unique = dict.fromkeys([*first, *sorted(rest, key=work)])
-    return tuple(unique) + ((Trial("precision", "r2", n_views),) if "r2" in methods else ())
-
-
-def _of_method(method: Method, n_views: int, gaussians: int, depth: Depth) -> list[Trial]:
-    counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
-    if method in DIRECT:
-        base = Trial("method", method, n_views, halves=True)
-        return [base, *(replace(base, group="views", views=n, halves=False) for n in counts)]
-    if method in _ITERATIONS:
-        numbers = _ITERATIONS[method][depth]
-        base = Trial("method", method, n_views, iterations=numbers[len(numbers) // 2], halves=True)
-        plain = replace(base, halves=False)
-        trials = [base, *(replace(plain, group="iterations", iterations=n) for n in numbers if n != base.iterations)]
-        return trials + [replace(plain, group="views", views=n) for n in counts]
-    base = Trial("method", method, n_views, steps=_BASE_STEPS[depth], gaussians=gaussians, halves=True)
-    plain = replace(base, halves=False)
-    trials = [base, *(replace(plain, group="steps", steps=n) for n in _STEPS[depth] if n != base.steps)]
-    trials += [replace(plain, group="views", views=n) for n in counts]
-    trials += [replace(plain, group="gaussians", gaussians=max(1, round(f * gaussians))) for f in _FACTORS[depth]]
-    # A bin of two halves the detail across: a quarter of the Gaussians describes it.
-    coarse = replace(plain, group="binning", binning=2, gaussians=max(1, gaussians // 4))
-    trials += [replace(coarse, steps=n) for n in _BINNED_STEPS[depth]]
-    trials += [replace(plain, group="cut-off", sigmas=s) for s in _SIGMAS[depth]]
-    trials.append(replace(plain, group="start", start="tv"))
-    return trials + [replace(plain, group="loss", loss=loss) for loss in _LOSSES]
+        base, *others = (
+            Trial(tried.varies, method, n_views, tried.binning, tried.settings)
+            for tried in by_name(method).trials(gaussians, depth)
+        )
+        first.append(replace(base, halves=True))
+        rest += [replace(base, group="views", views=n) for n in counts]
+        rest += [trial for trial in others if trial.group != PRECISION]
+        last += [trial for trial in others if trial.group == PRECISION]
+    return tuple(dict.fromkeys([*first, *sorted(rest, key=work), *last]))
 
 
 def work(trial: Trial) -> float:
     """A rough number for how long a trial takes, to be compared within one method only."""
-    amount = trial.views * (trial.iterations or 1) / trial.binning**3
-    if trial.steps is not None:
-        per_step = 1 + (trial.gaussians or 0) / 2e4 * (trial.sigmas / SIGMAS) ** 2
-        amount = trial.steps * per_step
-    return amount * (_WITH_HALVES if trial.halves else 1)
+    if trial.group == PRECISION:
+        return float(trial.views)
+    return trial.build().work(trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,35 +27,24 @@ from beamline.core.memory import forget_peak, peak_memory
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, judged_by
 from beamline.tradeoff.data import Data, geometry_in
-from beamline.tradeoff.trials import Loss as TrialLoss
 from beamline.tradeoff.trials import Trial
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.ray_model import Truncation
+from recon.base.method import PRECISION, DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
 from recon.splatting.precision import compare
-from recon.splatting.problem import Loss
-from recon.splatting.settings import FitSettings
 from recon.voxels.projector import data_residual
-from recon.warm_up import toy_of
-from recon.warm_up import warm_up as compile_fit
+from recon.warm_up import warm_up
 
 F32 = NDArray[np.float32]
 Say = Callable[[Mapping[str, Any]], None]
 
 _SAY_EVERY = 0.5  # s
-_LOSSES: Mapping[TrialLoss, tuple[Loss, bool]] = {
-    "l1+ssim": ("l1", True),
-    "l1": ("l1", False),
-    "l2+ssim": ("l2", True),
-    "poisson+ssim": ("poisson", True),
-}
-"""The misfit of a fit, and whether SSIM stands beside it."""
 
 
 def run(
@@ -72,13 +60,14 @@ def run(
     Raises:
         ValueError: the reconstruction refuses these settings.
     """
-    if trial.group == "precision":
+    if trial.group == PRECISION:
         found = compare(data.projections, data.geometry, seed, now)
         return {"seconds": found["seconds_float32"], "peak_bytes": peak_memory(), "details": found}
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)
-    warm_up(trial, data.geometry)
+    # On a toy of the same kind, so that compilation is in no trial's time.
+    warm_up(trial.build(), data.geometry)
     forget_peak()
     before = cpu()
     result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
@@ -127,37 +116,16 @@ def reconstruct(
 ) -> Reconstruction:
     """The one place that turns a trial into a call of recon.reconstruct.
 
-    A fit of binned views fills `grid` all the same; voxel methods have one voxel a binned pixel.
+    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel.
     """
-    if trial.method == "r2":
+    method, use = trial.build(), DataUse()
+    if method.traits.held_out:
         projections, geometry, unseen = with_held_out(projections, geometry, held_out)
+        use = DataUse(held_out=unseen)
     binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
-    if trial.method != "r2":
-        target = grid if trial.binning == 1 else Grid.matching(coarse)
-        own: dict[str, Any] = {} if trial.iterations is None else {"iterations": trial.iterations}
-        return recon.reconstruct(binned, coarse, target, method=trial.method, seed=seed, on_progress=on_progress, **own)
-    return recon.reconstruct(
-        binned, coarse, grid, steps=trial.steps, gaussians=trial.gaussians, seed=seed, settings=_settings(trial),
-        start=trial.start, held_out=unseen, on_progress=on_progress,
-    )  # fmt: skip
-
-
-def _settings(trial: Trial) -> FitSettings:
-    loss, with_ssim = _LOSSES[trial.loss]
-    settings = FitSettings(loss=loss, truncation=replace(Truncation(), sigmas=trial.sigmas))
-    return settings if with_ssim else replace(settings, ssim_weight=0.0)
-
-
-def warm_up(trial: Trial, geometry: Geometry) -> None:
-    """Compile what a trial of these views uses on a toy of the same kind, so that compilation is in no trial's time."""
-    if trial.method == "r2":
-        compile_fit("cpu", _settings(trial).loss, geometry, start=trial.start)
-    views, toy = toy_of(geometry)
-    short = replace(
-        trial, binning=1, steps=None if trial.steps is None else 3, gaussians=None if trial.gaussians is None else 60,
-        iterations=None if trial.iterations is None else 1,
-    )  # fmt: skip
-    reconstruct(short, views, toy, Grid.matching(toy), None, 0, None)
+    target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(coarse)
+    control = RunControl(on_progress=on_progress)
+    return recon.reconstruct(binned, coarse, method, grid=target, seed=seed, use=use, control=control)
 
 
 def on_grid(volume: Volume, grid: Grid) -> Volume:
@@ -225,7 +193,7 @@ def main(job: Path) -> int:
         geometry = geometry_in(Path(said["data"]))
         for trial in said["compile"]:
             with suppress(ValueError):  # a method that does not take these views: its own trial will say so
-                warm_up(Trial(**trial), geometry)
+                warm_up(Trial(**trial).build(), geometry)
         return 0
     trial = Trial(**said["trial"])
     try:

@@ -94,18 +94,21 @@ class Choice:
     """What to do with a budget.
 
     Attributes:
-        method: "r2" or "fbp".
         binning: detector pixels joined a side, on top of the selection's.
         share: Gaussians at the start over those that the unbinned volume would get by itself; 0 for FBP.
         steps: how many will fit in; 0 for FBP.
         gain: dB above the FBP of the unbinned views that the measured curve promises.
     """
 
-    method: Literal["r2", "fbp"]
     binning: int
     share: float
     steps: int
     gain: float
+
+    @property
+    def fits(self) -> bool:
+        """The choice is a fit; else FBP."""
+        return self.share > 0
 
 
 def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
@@ -131,7 +134,7 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
         loss = 3.0 * math.log2(binning)
         fbp = speeds.fbp / binning**3
         if fbp <= budget:
-            candidates.append(Choice("fbp", binning, 0.0, 0, -loss))
+            candidates.append(Choice(binning, 0.0, 0, -loss))
         for curve in CURVES:
             if curve.binning != min(binning, 2):
                 continue
@@ -141,9 +144,9 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
             steps = left / (speeds.step * curve.pace / further**2)
             gain = curve.gain(steps) - 3.0 * math.log2(further)
             if math.isfinite(gain):
-                candidates.append(Choice("r2", binning, share, int(steps), gain))
+                candidates.append(Choice(binning, share, int(steps), gain))
     if not candidates:
-        return Choice("fbp", max(n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)), 0.0, 0, -math.inf)
+        return Choice(max(n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)), 0.0, 0, -math.inf)
     # Of equal promises the finer volume, then the fewer Gaussians.
     return max(candidates, key=lambda c: (c.gain, -c.binning, -c.share))
 

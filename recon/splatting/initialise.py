@@ -19,8 +19,8 @@ from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
 from recon.voxels.iterative import solve
+from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
-from recon.voxels.solvers import OsSirtTv
 from recon.voxels.view_weights import angular_weights, covers_the_circle
 
 Start = Literal["fbp", "tv"]

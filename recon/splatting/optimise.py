@@ -1,4 +1,4 @@
-"""The fit: init, step and done over an explicit state; it prints nothing, reads no clock, can stop after any step."""
+"""The fit: init, step and run over an explicit state; it prints nothing, reads no clock, can stop after any step."""
 
 from __future__ import annotations
 
@@ -17,34 +17,11 @@ from recon.splatting.backend import Backend, Cpu, Pass
 from recon.splatting.density_control import DensityPolicy, control
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import morton_order
-from recon.splatting.problem import Problem, make_problem
+from recon.splatting.problem import FitProblem, make_problem
 from recon.splatting.settings import NAMES, FitSettings, tv_size, tv_weight
 from recon.splatting.splat import Active, voxelize
 
 _NORMALISE = 100  # steps between two times that quaternions are made of length 1
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a fit stands.
-
-    Attributes:
-        step, steps: done and planned (0 for a fit without an end, while views still arrive).
-        seconds: since the start, by the caller's clock.
-        loss: running mean of the loss, in normalised units.
-        residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.
-        n_gaussians, n_views: in the model and in the data.
-        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN where there are none.
-    """
-
-    step: int
-    steps: int
-    seconds: float
-    loss: float
-    residual: float
-    n_gaussians: int
-    n_views: int
-    held_out: float = float("nan")
 
 
 @dataclass(eq=False)
@@ -81,7 +58,7 @@ def problem_of(
     settings: FitSettings,
     backend: Backend[Any] | None = None,
     weights: F32 | None = None,
-) -> Problem:
+) -> FitProblem:
     """The problem that these settings pose; see `make_problem`. None computes on the CPU."""
     return make_problem(
         projections, geometry, grid, unit, backend or Cpu(),
@@ -122,7 +99,7 @@ def init(
 
 
 def step(
-    state: FitState, problem: Problem, settings: FitSettings, fraction: float, view: int | None = None
+    state: FitState, problem: FitProblem, settings: FitSettings, fraction: float, view: int | None = None
 ) -> FitState:
     """One Adam step on one view (or a few); density control when it is due. Changes and returns `state`.
 
@@ -163,7 +140,7 @@ def step(
 
 def run(
     state: FitState,
-    problem: Problem,
+    problem: FitProblem,
     settings: FitSettings,
     steps: int,
     on_step: Callable[[FitState], bool] | None = None,
@@ -176,7 +153,7 @@ def run(
     return state
 
 
-def misfit_of(state: FitState, problem: Problem, settings: FitSettings) -> float:
+def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> float:
     """||rendered - measured|| / ||measured|| over all views of a problem, root mean square of the views' own."""
     p, cut = state.parameters, settings.truncation
     run = problem.backend.begin(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field)
@@ -225,7 +202,7 @@ def _running(mean: Any, value: Any) -> Any:
     return value if isinstance(mean, float) and np.isnan(mean) else 0.95 * mean + 0.05 * value
 
 
-def _smooth(state: FitState, problem: Problem, settings: FitSettings, weight: float, run: Pass[Any]) -> Any:
+def _smooth(state: FitState, problem: FitProblem, settings: FitSettings, weight: float, run: Pass[Any]) -> Any:
     """Total variation on a random box of voxels, in normalised density."""
     grid = problem.grid
     side = tv_size(settings, grid)
@@ -245,7 +222,7 @@ def _smooth(state: FitState, problem: Problem, settings: FitSettings, weight: fl
 
 
 def _update(
-    state: FitState, gradients: tuple[Any, ...], problem: Problem, settings: FitSettings, fraction: float
+    state: FitState, gradients: tuple[Any, ...], problem: FitProblem, settings: FitSettings, fraction: float
 ) -> None:
     shrink = settings.pace * settings.decay**fraction
     rates = [
@@ -275,7 +252,7 @@ def _normalise_quaternions(state: FitState, backend: Backend[Any]) -> None:
         moments["quaternions"] = backend.array(scaled.astype(np.float32))
 
 
-def _grow(state: FitState, problem: Problem, policy: DensityPolicy) -> None:
+def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     backend = problem.backend
     p = {name: backend.numpy(state.parameters[name]) for name in NAMES}
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)

@@ -1,4 +1,4 @@
-"""polish: what Gaussians could not say, added on voxels by a few sweeps of ordered-subset SIRT with total variation."""
+"""polish: a few sweeps of ordered-subset SIRT with total variation add on voxels what Gaussians cannot describe."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from recon.base.volume import Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project
 from recon.voxels.iterative import solve
+from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
-from recon.voxels.solvers import OsSirtTv
 
 F32 = NDArray[np.float32]
 
@@ -66,5 +66,5 @@ def polish(
     data += projector.forward(volume.data)
     return solve(
         OsSirtTv(sweeps, tv_weight=_TV_WEIGHT), projector, data, weight=known, start=volume,
-        should_stop=should_stop, seed=seed,
+        on_iteration=lambda *_: should_stop is not None and should_stop(), seed=seed,
     )  # fmt: skip

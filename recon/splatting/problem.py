@@ -1,4 +1,4 @@
-"""Problem: the data of a fit on the device that fits them, in units in which published rates and weights hold."""
+"""FitProblem: the data of a fit on the device that fits them, in units in which published rates and weights hold."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LARGEST_LATER = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FitProblem:
     """The data of a fit: images in half fields times density units, geometry and grid in mm.
 
     Attributes:
@@ -75,7 +75,7 @@ def make_problem(
     weights: F32 | None = None,
     loss: Loss = "l1",
     ssim_weight: float = 0.25,
-) -> Problem:
+) -> FitProblem:
     """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
 
     Values that are not finite, or more than a million half fields times density units, get no weight, see
@@ -101,11 +101,13 @@ def make_problem(
     projection_loss = backend.projection_loss(
         geometry.detector_shape, ssim_weight, DataTerm(_KINDS[loss], delta, scale)
     )
-    empty = Problem((), (), (), geometry, grid, half_field, unit, delta, projection_loss, backend)
+    empty = FitProblem((), (), (), geometry, grid, half_field, unit, delta, projection_loss, backend)
     return replace(_with_views(empty, filled, known), geometry=geometry)
 
 
-def extend(problem: Problem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None) -> Problem:
+def extend(
+    problem: FitProblem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None
+) -> FitProblem:
     """The problem with more views [view, row, col]; those it has are not copied.
 
     Large values are let in up to what the loss can hold: where the first views showed nothing, it is the density unit
@@ -137,7 +139,7 @@ def joined(geometry: Geometry, factor: int) -> Geometry:
     return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
 
 
-def coarser(problem: Problem, factor: int, loss: Loss, ssim_weight: float) -> Problem:
+def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) -> FitProblem:
     """The same problem on joined pixels: a first look at the large scales for a fraction of the time.
 
     A joined pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
@@ -173,7 +175,7 @@ def noise_level(projections: F32) -> float:
     return float(np.median(np.abs(bends))) / (0.6745 * 6**0.5)
 
 
-def _with_views(problem: Problem, projections: F32, weights: F32 | None) -> Problem:
+def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> FitProblem:
     backend, loss = problem.backend, problem.loss
     images = tuple(backend.array(np.ascontiguousarray(view, np.float32) / problem.scale) for view in projections)
     known: tuple[Any | None, ...] = (None,) * len(images)

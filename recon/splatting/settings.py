@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
-from recon.splatting.problem import Loss, Problem
+from recon.splatting.problem import FitProblem, Loss
 
 NAMES = ("means", "log_scales", "quaternions", "raw")
 """Parameters of the model, in the order of their rates."""
@@ -86,7 +86,7 @@ class FitSettings:
             )
 
 
-def tv_weight(settings: FitSettings, problem: Problem, count: int) -> float:
+def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
     """The weight of total variation in a fit of at most `count` Gaussians: as set, or by the noise of the data."""
     if settings.tv_weight is not None:
         return settings.tv_weight

@@ -12,18 +12,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.geometry import Geometry
+from recon.base.method import Method, Progress
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
-from recon.splatting.problem import Problem, extend
+from recon.splatting.problem import FitProblem, extend
 from recon.splatting.settings import FitSettings, growth
+
+Clock = Callable[[], float]
 
 _NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
@@ -34,6 +38,26 @@ _ROOM = 0.1  # of the first count that a round may add; the last one has what is
 # Slower than where all views are there from the start: each round would undo with its first fast steps what the last
 # one had learnt (battery of 180 views: 30.7 dB with the rates of `FitSettings`, 31.9 with these).
 WHILE_VIEWS_COME = FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15, tv_size=32)
+
+
+@runtime_checkable
+class StreamingMethod(Method, Protocol):
+    """A method whose volume can grow while views arrive.
+
+    Attributes:
+        steps: planned; a fit of views to come takes none.
+        seconds: for the last round, over all views.
+    """
+
+    @property
+    def steps(self) -> int | None: ...
+
+    @property
+    def seconds(self) -> float | None: ...
+
+    def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
+        """A fit of views with the geometry of `template`, whose angles are ignored."""
+        ...
 
 
 class StreamingFit:
@@ -63,7 +87,7 @@ class StreamingFit:
         settings: FitSettings | None = None,
         first_views: int = 8,
         first_span: float = np.pi / 6,
-        now: Callable[[], float] = time.perf_counter,
+        now: Clock = time.perf_counter,
     ) -> None:
         self._template, self._grid = template.at([0.0]), grid or Grid.matching(template)
         self._rng = np.random.default_rng(seed)
@@ -80,7 +104,7 @@ class StreamingFit:
         self._now, self._start = now, now()
         self._data: list[F32] = []
         self._angles: list[float] = []
-        self._problem: Problem | None = None
+        self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
         self._round_views, self._round_step, self._placed = 0, 0, 0
 
@@ -129,11 +153,11 @@ class StreamingFit:
             moved = replace(self._problem.geometry, axis_col=float(axis_col))
             self._problem = replace(self._problem, geometry=moved)
 
-    def advance(self, seconds: float) -> fit.Progress:
+    def advance(self, seconds: float) -> Progress:
         """Fit for about `seconds` s (at least one step once there is a model) and say where it stands."""
         return self._advance(seconds, finishing=False)
 
-    def finish(self, seconds: float, on_progress: Callable[[fit.Progress], bool] | None = None) -> fit.Progress:
+    def finish(self, seconds: float, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
         """The scan has ended: a last round over all views with the rates decaying to the end, in about `seconds` s.
 
         `on_progress` is called about ten times a second and ends the fit by returning True.
@@ -157,16 +181,16 @@ class StreamingFit:
         """A copy of the model, None before the first one."""
         return None if self._state is None else fit.gaussians_of(self._state)
 
-    def progress(self) -> fit.Progress:
+    def progress(self) -> Progress:
         """Where the fit stands."""
         seconds, state = self._now() - self._start, self._state
         if state is None:
-            return fit.Progress(0, 0, seconds, float("nan"), float("nan"), 0, self.n_views)
-        return fit.Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.n_views)
+            return Progress(0, 0, seconds, float("nan"), float("nan"), 0, self.n_views)
+        return Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.n_views)
 
     def _advance(
-        self, seconds: float, finishing: bool, on_progress: Callable[[fit.Progress], bool] | None = None
-    ) -> fit.Progress:
+        self, seconds: float, finishing: bool, on_progress: Callable[[Progress], bool] | None = None
+    ) -> Progress:
         begin = self._now()
         if not finishing and self.n_views >= _GROWTH * self._round_views:
             self._begin_round()

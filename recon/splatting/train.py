@@ -1,67 +1,43 @@
-"""A whole R²-Gaussian fit: placing, steps against a count or a clock, held-out views, and what it leaves."""
+"""run_fit: a whole R²-Gaussian fit, by a number of steps or a clock, with views held out and checkpoints."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.volume import Grid, Volume
+from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
+from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import Start, place
-from recon.splatting.optimise import FitState, Progress
+from recon.splatting.initialise import place
+from recon.splatting.optimise import FitState
 from recon.splatting.polish import polish
-from recon.splatting.problem import Problem, coarser, joined
+from recon.splatting.problem import FitProblem, coarser, joined
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
+
+if TYPE_CHECKING:
+    from recon.splatting.r2 import R2
 
 _LOOK = 50  # steps between two looks at the views held out
 _BEST = "best."  # names of the best model's arrays in a checkpoint begin so
 _PATIENCE = 0.2  # of the steps planned, and at least six looks, may pass without a better one
 
 
-@dataclass(frozen=True)
-class FitRequest:
-    """What is asked of a fit; the words are those of `reconstruct`."""
-
-    settings: FitSettings
-    steps: int | None
-    seconds: float | None
-    gaussians: int | Gaussians | None
-    seed: int
-    start: Start
-    held_out: tuple[int, ...]
-    early_stop: bool
-    resume: Mapping[str, NDArray[Any]] | None
-    device: str
-    polish: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """What a fit leaves; the words are those of `Reconstruction`."""
-
-    volume: Volume
-    history: tuple[Progress, ...]
-    gaussians: Gaussians
-    settings: dict[str, Any]
-    checkpoint: Mapping[str, NDArray[Any]]
-
-
 @dataclass(eq=False)
-class _Watch:
+class _HeldOutTracker:
     """The residual of views held out, and the model that had it lowest."""
 
-    problem: Problem | None
+    problem: FitProblem | None
     settings: FitSettings
     value: float = float("nan")
     best: float = float("inf")
@@ -70,8 +46,8 @@ class _Watch:
 
     @classmethod
     def over(
-        cls, problem: Problem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
-    ) -> _Watch:
+        cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
+    ) -> _HeldOutTracker:
         """At `step`, or as a checkpoint has left it."""
         if problem is None or "watch" not in resume:
             return cls(problem, settings, best_step=step)
@@ -96,101 +72,102 @@ class _Watch:
                 self.kept = arrays_of(state, self.problem.backend)
 
 
-def run_fit(
-    data: F32,
-    weights: F32 | None,
-    geometry: Geometry,
-    grid: Grid,
-    request: FitRequest,
-    on_progress: Callable[[Progress], None] | None,
-    should_stop: Callable[[], bool] | None,
-    now: Callable[[], float],
-    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None,
-    checkpoint_every: float = 60.0,
-) -> Fitted:
-    """Fit line integrals [view, row, col]; see `reconstruct`.
+def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodResult:
+    """Fit the line integrals of a problem; see `R2`.
 
     Raises:
-        ValueError: as `reconstruct`.
+        ValueError: for a problem that the method cannot be fitted to.
     """
-    begin, settings = now(), request.settings
-    backend = backend_for(request.device)
-    used, kept_back = _split(geometry.n_views, request.held_out, request.early_stop)
-    data, weights = masked(data, weights)
+    now, settings, geometry = control.now, method.fit, problem.geometry
+    begin = now()
+    if method.polish and not geometry.is_straight:
+        raise ValueError(
+            "polish works on voxels, whose projector takes straight views only: these are rolled or tilted"
+        )
+    held_out = tuple(problem.use.held_out)
+    backend = backend_for(problem.device)
+    used, kept_back = _split(geometry.n_views, held_out, method.early_stop)
+    data, weights = masked(problem.projections, problem.use.weights)
     if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
         weights = weights / np.float32(np.mean(weights[weights > 0], dtype=np.float64))
     blank = kept_back[~data[kept_back].any(axis=(1, 2))]
     if blank.size:
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
     seen, known = geometry.select(used), None if weights is None else weights[used]
-    field_grid = Grid.for_fit(geometry, grid)
-    joined(seen, settings.coarse)  # what cannot be joined is told before anything is computed
-    state, n_start, unit = _first_state(data[used], seen, field_grid, request, backend)
-    problem = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
-    rough = problem
+    field_grid = Grid.for_fit(geometry, problem.grid)
+    joined(seen, settings.coarse)  # refuses what cannot be joined before anything is computed
+    if control.resume is None:
+        state, n_start, unit = _first_state(data[used], seen, field_grid, method, problem.seed, backend)
+    else:
+        state = _resumed(control.resume, geometry.n_views, backend)
+        n_start, unit = state.n, state.unit
+    fine = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
+    rough = fine
     if settings.coarse > 1:
-        rough = coarser(problem, settings.coarse, settings.loss, settings.ssim_weight)
+        rough = coarser(fine, settings.coarse, settings.loss, settings.ssim_weight)
     unseen = None
     if kept_back.size:
         others = None if weights is None else weights[kept_back]
         unseen = fit.problem_of(
             data[kept_back], geometry.select(kept_back), field_grid, unit, settings, backend, others
         )  # fmt: skip
-    watch = _Watch.over(unseen, settings, state.step, request.resume or {})
+    tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
-    planned, history = request.steps or 0, []  # 0 in a history: no number of steps was planned
-    steps, seconds = request.steps, request.seconds
+    steps, seconds = method.planned_steps, method.seconds
+    planned = steps or 0  # 0 in a history: no number of steps was planned
+    history: list[Progress] = []
 
-    def tell(at: float) -> None:
+    def report(at: float) -> None:
         history.append(
             Progress(
                 state.step, planned, at - begin, float(state.loss), float(state.residual), state.n, seen.n_views,
-                watch.value,
+                tracker.value,
             )
         )  # fmt: skip
-        if on_progress is not None:
-            on_progress(history[-1])
+        if control.on_progress is not None:
+            control.on_progress(history[-1])
 
-    fit_begin = said = handed = now()
+    fit_begin = reported = saved = now()
     done = 0
     while steps is None or state.step < steps:
         spent = now() - fit_begin
         if seconds is not None and spent >= seconds and done > 0:
             break
         fraction = min(1.0, max(state.step / planned if planned else 0.0, spent / seconds if seconds else 0.0))
-        fit.step(state, rough if fraction < settings.coarse_until else problem, settings, fraction)
+        fit.step(state, rough if fraction < settings.coarse_until else fine, settings, fraction)
         done += 1
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
-            watch.look(state, request.early_stop)
-        if now() - said > 0.1 or done == 1:
-            said = now()
-            tell(said)
-        if on_checkpoint is not None and now() - handed >= checkpoint_every:
-            on_checkpoint(arrays_of(state, backend) | watch.arrays())
-            handed = now()  # what keeping it takes must not crowd out the fit
-        if should_stop is not None and should_stop():
+            tracker.look(state, method.early_stop)
+        if now() - reported > 0.1 or done == 1:
+            reported = now()
+            report(reported)
+        if control.on_checkpoint is not None and now() - saved >= control.checkpoint_every:
+            control.on_checkpoint(arrays_of(state, backend) | tracker.arrays())
+            saved = now()  # the time that saving takes must not crowd out the fit
+        if control.should_stop is not None and control.should_stop():
             break
-        if request.early_stop and state.step - watch.best_step > max(6 * _LOOK, _PATIENCE * planned):
+        if method.early_stop and state.step - tracker.best_step > max(6 * _LOOK, _PATIENCE * planned):
             break
-    watch.look(state, request.early_stop)
-    tell(now())
+    tracker.look(state, method.early_stop)
+    report(now())
     last = state
-    if watch.kept:
-        state = state_from(watch.kept, backend)
-    volume, model = fit.volume_of(state, grid, settings, backend), fit.gaussians_of(state, backend)
-    if request.polish:
+    if tracker.kept:
+        state = state_from(tracker.kept, backend)
+    volume, model = fit.volume_of(state, problem.grid, settings, backend), fit.gaussians_of(state, backend)
+    if method.polish:
         volume = polish(
-            volume, model, data[used], seen, request.polish,
-            weights=known, rays=settings.rays, truncation=settings.truncation, should_stop=should_stop,
-            seed=request.seed,
+            volume, model, data[used], seen, method.polish,
+            weights=known, rays=settings.rays, truncation=settings.truncation, should_stop=control.should_stop,
+            seed=problem.seed,
         )  # fmt: skip
     record = {
-        **asdict(settings), "steps": state.step, "seed": request.seed, "start": request.start,
-        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": request.held_out, "device": request.device,
-        "polish": request.polish, "tv_weight": tv_weight(settings, problem, state.limit),
+        **asdict(settings), "steps": state.step, "seed": problem.seed, "start": method.start,
+        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,
+        "polish": method.polish, "tv_weight": tv_weight(settings, fine, state.limit),
         "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
-    return Fitted(volume, tuple(history), model, record, arrays_of(last, backend) | watch.arrays())
+    checkpoint = arrays_of(last, backend) | tracker.arrays()
+    return MethodResult(volume, record, tuple(history), model, checkpoint)
 
 
 def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -207,19 +184,22 @@ def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[N
 
 
 def _first_state(
-    data: F32, geometry: Geometry, field_grid: Grid, request: FitRequest, backend: Backend[Any]
+    data: F32, geometry: Geometry, field_grid: Grid, method: R2, seed: int, backend: Backend[Any]
 ) -> tuple[FitState, int, float]:
-    """The state to go on from, how many Gaussians it began with, and their density unit."""
-    if request.resume is not None:
-        state = state_from(request.resume, backend)
-        if max(state.drawn, default=0) >= geometry.n_views:
-            raise ValueError(
-                f"the checkpoint is of a fit with at least {max(state.drawn) + 1} views, these are {geometry.n_views}: "
-                "resume takes the same data and settings"
-            )
-        return state, state.n, state.unit
-    start = request.gaussians
+    """The state of a fresh fit, how many Gaussians it starts from, and their density unit."""
+    start = method.gaussians
     if not isinstance(start, Gaussians):
-        rng = np.random.default_rng(request.seed)
-        start = place(data, geometry, field_grid, start, rng, start=request.start, rays=request.settings.rays)
-    return fit.init(start, request.seed, growth(request.settings), backend), start.n, start.density_unit
+        rng = np.random.default_rng(seed)
+        start = place(data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays)
+    return fit.init(start, seed, growth(method.fit), backend), start.n, start.density_unit
+
+
+def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Backend[Any]) -> FitState:
+    """The state that a checkpoint holds."""
+    state = state_from(checkpoint, backend)
+    if max(state.drawn, default=0) >= n_views:
+        raise ValueError(
+            f"the checkpoint is of a fit with at least {max(state.drawn) + 1} views, these are {n_views}: "
+            "resume takes the same data and settings"
+        )
+    return state

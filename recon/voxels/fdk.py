@@ -13,17 +13,12 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.voxels.fbp import Filter, filter_projections
 from recon.voxels.projector import volume_slices
-from recon.voxels.view_weights import circle_weights, covers_the_circle
+from recon.voxels.view_weights import circle_weights
 
 F64 = NDArray[np.float64]
 
 _f = np.float32
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
-
-
-def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: they must be straight, and a cone's must stand all around."""
-    return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))
 
 
 @njit(**OPTIONS)

@@ -1,6 +1,6 @@
-"""Iterative reconstruction on voxels, one call: SIRT, SART, CGLS, ASD-POCS, FISTA-TV, ordered-subset SIRT with TV.
+"""Iterative reconstruction on voxels: `solve` runs one of the methods in `recon.voxels.methods`.
 
-    volume = solve("fista-tv", Projector(geometry, grid), projections)
+    volume = solve(FistaTv(), Projector(geometry, grid), projections)
 
 All work in float32. TV weights are fractions of the density unit (the 99.5th percentile of the positive voxels), so
 they hold for any unit of attenuation. Inside, lengths, line integrals and weights are about one, whatever their units:
@@ -12,59 +12,42 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.masks import masked
+from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.voxels import solvers
-from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk, has_direct_method
+from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines, volume_slices
-from recon.voxels.solvers import AsdPocs, Cgls, FistaTv, OsSirtTv, Problem, Sart, Sirt
-
-Method = Literal["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"]
-Settings = Sirt | Sart | Cgls | AsdPocs | FistaTv | OsSirtTv
+from recon.voxels.voxel_problem import VoxelProblem
 
 F32 = NDArray[np.float32]
 
 
-def default_settings(method: Method) -> Settings:
-    """The settings that `solve` takes for a method's name.
+class IterativeMethod(Protocol):
+    """An iterative method on voxels, such as `recon.voxels.methods.sirt.Sirt`."""
 
-    Raises:
-        ValueError: for an unknown name.
-    """
-    match method:
-        case "sirt":
-            return Sirt()
-        case "sart":
-            return Sart()
-        case "cgls":
-            return Cgls()
-        case "asd-pocs":
-            return AsdPocs()
-        case "fista-tv":
-            return FistaTv()
-        case "os-sirt-tv":
-            return OsSirtTv()
-    raise ValueError(f"unknown method {method!r}; use one of {', '.join(get_args(Method))}")
+    @property
+    def iterations(self) -> int: ...
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
+        ...
 
 
 def solve(
-    method: Method | Settings,
+    method: IterativeMethod,
     projector: Projector,
     projections: F32,
     *,
-    iterations: int | None = None,
     weight: F32 | None = None,
     start: Volume | None = None,
     nonnegative: bool = True,
-    on_iteration: Callable[[int, float], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    on_iteration: Callable[[int, float], object] | None = None,
     seed: int = 0,
 ) -> Volume:
     """Line integrals to a volume on the projector's grid.
@@ -72,41 +55,58 @@ def solve(
     Memory: as each method's settings say, in volumes of the grid and in copies of the projections, float32.
 
     Args:
-        method: a name, or the settings of a method.
         projections: [view, row, col], line integrals, finite where they weigh anything.
-        iterations: None: as the settings say.
         weight: of each ray, [view, row, col], 0 or more: 0 for pixels that are not to be trusted, or the inverse
             variance; only their ratios count. None: all alike.
         start: the volume to begin with; None: zero.
-        nonnegative: voxels below zero are clipped in every step ("cgls": at the end).
-        on_iteration: told each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point where
-            its correction was computed: the volume it leaves is better. "cgls", "asd-pocs": of the volume itself.
-        should_stop: asked after each iteration; if true, what there is comes back.
+        nonnegative: voxels below zero are clipped in every step (CGLS: at the end).
+        on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point
+            where its correction was computed: the volume it leaves is better. CGLS, ASD-POCS: of the volume itself.
+            The iterations end where it returns something true.
         seed: of the order of views and subsets.
 
     Raises:
-        ValueError: for an unknown method, shapes that disagree, values that are not finite, weights below zero or all
-            zero, projections that are zero everywhere, or no iterations.
+        ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
+            that are zero everywhere, or no iterations.
     """
-    settings = default_settings(method) if isinstance(method, str) else method
-    count = settings.iterations if iterations is None else operator.index(iterations)
-    if count < 1:
-        raise ValueError(f"at least one iteration is needed, got {count}")
+    if operator.index(method.iterations) < 1:
+        raise ValueError(f"at least one iteration is needed, got {method.iterations}")
     data, rays = _checked(projector, projections, weight)
     lines = _start(projector, start)
     units = _Units.of(projector, data, rays)
     inside = units.enter(projector, data, rays, lines)
 
     def go_on(iteration: int, residual: float) -> bool:
-        if on_iteration is not None:
-            on_iteration(iteration, residual)
-        return not (should_stop is not None and should_stop())
+        return on_iteration is None or not on_iteration(iteration, residual)
 
-    problem = Problem(
+    problem = VoxelProblem(
         inside, data, rays, nonnegative, np.random.default_rng(seed), go_on, lambda: _direct(inside, data, rays)
     )
-    found = _run(problem, replace(settings, iterations=count), lines)
+    found = method.iterate(problem, lines)
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
+
+
+def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunControl) -> MethodResult:
+    """`Method.run` of an iterative method, whose settings are a dataclass.
+
+    Raises:
+        ValueError: as `solve`.
+    """
+    begin, geometry = control.now(), problem.geometry
+    history: list[Progress] = []
+
+    def report(iteration: int, residual: float) -> bool:
+        seconds = control.now() - begin
+        history.append(Progress(iteration, method.iterations, seconds, residual, residual, 0, geometry.n_views))
+        if control.on_progress is not None:
+            control.on_progress(history[-1])
+        return control.should_stop is not None and control.should_stop()
+
+    filled, known = masked(problem.projections, problem.use.weights)
+    projector = Projector(geometry, problem.grid)
+    volume = solve(method, projector, filled, weight=known, on_iteration=report, seed=problem.seed)
+    settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
+    return MethodResult(volume, {**settings, "seed": problem.seed}, tuple(history))
 
 
 @dataclass(frozen=True)
@@ -160,23 +160,7 @@ def _direct(projector: Projector, data: F32, rays: F32 | None) -> F32 | None:
         images = masked(images[seen], projection_images(rays[seen]))[0]
     if not has_direct_method(geometry):
         return None
-    return volume_lines((fdk if geometry.is_cone else fbp)(images, geometry, projector.grid))
-
-
-def _run(problem: Problem, settings: Settings, x: F32) -> F32:
-    match settings:
-        case Sirt():
-            return solvers.sirt(problem, settings, x)
-        case Sart():
-            return solvers.sart(problem, settings, x)
-        case Cgls():
-            return solvers.cgls(problem, settings, x)
-        case AsdPocs():
-            return solvers.asd_pocs(problem, settings, x)
-        case FistaTv():
-            return solvers.fista_tv(problem, settings, x)
-        case OsSirtTv():
-            return solvers.os_sirt_tv(problem, settings, x)
+    return volume_lines(direct(images, geometry, projector.grid))
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
 
 import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from recon import AsdPocs, Cgls, FistaTv, OsSirtTv, Sart, Sirt
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
-from recon.voxels.iterative import Method, default_settings, solve
+from recon.voxels.iterative import solve
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -95,20 +95,21 @@ def _battery(side: int = 96, n_views: int = 60, photons: float = 2e4) -> tuple[G
 def test_quality_and_time_of_each_method(sample: str, shared_data: Path) -> None:
     geometry, views, truth = _walnut(shared_data) if sample == "walnut" else _battery()
     projector = Projector(geometry, Grid.matching(geometry))
-    for method in get_args(Method):
-        solve(method, projector, views, iterations=1)  # compiles
+    methods = (Sirt(), Sart(), Cgls(), AsdPocs(), FistaTv(), OsSirtTv())
+    for method in methods:
+        solve(method.toy(), projector, views)  # compiles
     begin = time.perf_counter()
     direct = np.maximum(fbp(views, geometry, filter="hann"), 0)
     print(f"{sample} fbp hann {time.perf_counter() - begin:.2f} s, {psnr(truth, direct):.2f} dB")
-    for name in get_args(Method):
-        method: Method = name
+    for method in methods:
         begin, worked = time.perf_counter(), time.process_time()
         curve: list[float] = []
         volume = solve(method, projector, views, on_iteration=lambda _, r, curve=curve: curve.append(r))
         wall, busy = time.perf_counter() - begin, time.process_time() - worked
-        steps = default_settings(method).iterations
+        steps = method.iterations
         print(
-            f"{sample} {method:10s} {steps:3d} iterations {wall:6.2f} s (cpu {busy:6.2f}), {steps / wall:5.2f} it/s, "
+            f"{sample} {method.name:10s} {steps:3d} iterations {wall:6.2f} s (cpu {busy:6.2f}), "
+            f"{steps / wall:5.2f} it/s, "
             f"{psnr(truth, volume.data):.2f} dB, residual {curve[-1]:.4f}"
         )
         assert np.isfinite(volume.data).all()

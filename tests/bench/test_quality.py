@@ -18,6 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
+from recon import AsdPocs, FistaTv, OsSirtTv, Sirt
 from recon.assess.metrics import psnr, ssim3d
 from recon.splatting.polish import polish
 from recon.splatting.settings import FitSettings
@@ -25,7 +26,6 @@ from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
 from recon.voxels.iterative import solve
 from recon.voxels.projector import Projector
-from recon.voxels.solvers import AsdPocs, FistaTv, OsSirtTv, Sirt
 from recon.warm_up import warm_up
 from tests.bench.quality_cases import OBJECTS, Case, cone, dense_battery, walnut
 
@@ -112,7 +112,7 @@ def _compare(
         made: list[recon.Reconstruction] = []
 
         def fitted(steps: int = steps, made: list[recon.Reconstruction] = made) -> F32:
-            made.append(recon.reconstruct(data, geometry, grid, steps=steps, gaussians=count))
+            made.append(recon.reconstruct(data, geometry, recon.R2(steps=steps, gaussians=count), grid=grid))
             return made[0].volume.data
 
         name = f"R²-Gaussian, {steps} steps from {count // 1000}k"
@@ -170,10 +170,10 @@ def test_the_teapot_at_full_size_against_the_published_figures(shared_data: Path
         (3000, 50_000, FitSettings()),
         (10_000, 50_000, FitSettings(views_per_step=1, pace=5.0)),
     ):
+        fit = recon.R2(steps=steps, gaussians=count, fit=settings)
+        fit = recon.R2(steps=steps, gaussians=count, fit=settings)
         table.add(
             f"R²-Gaussian, {steps} steps of {settings.views_per_step} views from {count // 1000}k",
-            lambda: recon.reconstruct(
-                case.projections, case.geometry, case.grid, steps=steps, gaussians=count, settings=settings  # noqa: B023
-            ).volume.data,
-        )  # fmt: skip
+            lambda fit=fit: recon.reconstruct(case.projections, case.geometry, fit, grid=case.grid).volume.data,
+        )
     assert table.best("R²")[1][0] > published - 1

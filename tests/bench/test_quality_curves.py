@@ -67,10 +67,12 @@ def measured(data: F32, geometry: Geometry, truth: F32) -> dict[tuple[int, float
     out: dict[tuple[int, float], list[tuple[float, float]]] = {}
     for binning, share in KINDS:
         for steps in STEPS:
-            result = recon.reconstruct(
-                bin_views(data, binning), geometry.binned(binning), grid, steps=steps, gaussians=round(share * count),
-                now=time.process_time,
-            )  # fmt: skip
+            fit, control = (
+                recon.R2(steps=steps, gaussians=round(share * count)),
+                recon.RunControl(now=time.process_time),
+            )
+            binned, coarse = bin_views(data, binning), geometry.binned(binning)
+            result = recon.reconstruct(binned, coarse, fit, grid=grid, control=control)
             first, last = result.history[0], result.history[-1]
             pace = (last.seconds - first.seconds) / max(1, last.step - first.step)
             out.setdefault((binning, share), []).append((pace, psnr(truth, result.volume.data) - base))

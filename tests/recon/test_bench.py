@@ -10,7 +10,9 @@ import pytest
 
 from recon.base.volume import Grid, Volume
 from recon.bench import kernel_timings, spheres, standard_case, step_timing, timed, volume_rows
+from recon.splatting.r2 import R2
 from recon.splatting.splat import project
+from recon.voxels.direct import Fbp
 from recon.voxels.projector import data_residual
 
 
@@ -66,7 +68,7 @@ def test_the_sample_and_its_views_belong_together() -> None:
 def test_rows_of_quality(monkeypatch: pytest.MonkeyPatch) -> None:
     small = spheres(32, 8, 12)
     monkeypatch.setattr("recon.bench.spheres", lambda: small)
-    rows = list(volume_rows(time.perf_counter, ("fbp", "r2"), (3, 40)))
+    rows = list(volume_rows(time.perf_counter, (Fbp(), R2(steps=3), R2(steps=40))))
     assert [row.method for row in rows] == ["fbp", "r2", "r2"]
     assert rows[2].psnr > rows[1].psnr
     assert rows[1].settings.startswith("3 steps, ") and rows[0].settings == ""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 
 import recon
-import recon.reconstruction
 import recon.splatting.initialise
+from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
 from recon.base.ray_model import RayModel
+from recon.methods import build, by_name, names
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector
@@ -44,10 +46,10 @@ def noisy(phantom: Phantom) -> np.ndarray:
 def test_few_noisy_views_beat_fbp(phantom: Phantom, noisy: np.ndarray) -> None:
     truth = phantom.attenuation(GRID)
     best = max(
-        psnr(truth, recon.reconstruct(noisy, VIEWS, method="fbp", filter=name).volume.data)
+        psnr(truth, recon.reconstruct(noisy, VIEWS, Fbp(name)).volume.data)
         for name in ("ram-lak", "shepp-logan", "hann")
     )
-    result = recon.reconstruct(noisy, VIEWS, steps=500, gaussians=2500)
+    result = recon.reconstruct(noisy, VIEWS, R2(steps=500, gaussians=2500))
     assert psnr(truth, result.volume.data) > best + 1
     assert result.volume.data.shape == GRID.shape and result.volume.data.dtype == np.float32
     assert result.history[-1].step == 500 and result.gaussians is not None
@@ -55,15 +57,15 @@ def test_few_noisy_views_beat_fbp(phantom: Phantom, noisy: np.ndarray) -> None:
 
 
 def test_the_same_seed_gives_the_same_volume(noisy: np.ndarray) -> None:
-    first, second = (recon.reconstruct(noisy, VIEWS, steps=30, seed=4).volume.data for _ in range(2))
+    first, second = (recon.reconstruct(noisy, VIEWS, R2(steps=30), seed=4).volume.data for _ in range(2))
     np.testing.assert_array_equal(first, second)
-    other = recon.reconstruct(noisy, VIEWS, steps=30, seed=5).volume.data
+    other = recon.reconstruct(noisy, VIEWS, R2(steps=30), seed=5).volume.data
     assert not np.array_equal(first, other)
 
 
 def test_a_model_can_be_continued(noisy: np.ndarray) -> None:
-    first = recon.reconstruct(noisy, VIEWS, steps=60, gaussians=1500)
-    second = recon.reconstruct(noisy, VIEWS, steps=60, gaussians=first.gaussians, densify=False)
+    first = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=1500))
+    second = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=first.gaussians, fit=FitSettings(policy=None)))
     assert second.history[-1].residual < first.history[-1].residual
     assert second.history[-1].n_gaussians == first.history[-1].n_gaussians
 
@@ -72,7 +74,7 @@ def test_a_small_box_holds_what_the_whole_volume_holds_there(noisy: np.ndarray) 
     # The matter outside the box is in the views, so it must be in the model.
     z, y, x = GRID.coordinates()
     box = recon.Grid((6, 12, 10), PITCH, centre=(float(z[9:15].mean()), float(y[20:32].mean()), float(x[5:15].mean())))
-    whole, part = (recon.reconstruct(noisy, VIEWS, grid, steps=60).volume.data for grid in (GRID, box))
+    whole, part = (recon.reconstruct(noisy, VIEWS, R2(steps=60), grid=grid).volume.data for grid in (GRID, box))
     np.testing.assert_allclose(part, whole[9:15, 20:32, 5:15], atol=1e-3 * whole.max())
 
 
@@ -84,7 +86,7 @@ def test_matter_beyond_the_default_grid_is_explained() -> None:
     views = recon.Geometry.parallel(turn, SHAPE, PITCH, axis_col=32.0)
     data = np.stack([sample.line_integrals(a, detector) for a in turn])
     grid = recon.Grid.of_field(views, PITCH)
-    result = recon.reconstruct(data, views, grid, steps=400, gaussians=2500)
+    result = recon.reconstruct(data, views, R2(steps=400, gaussians=2500), grid=grid)
     assert result.history[-1].residual < 0.06
     assert psnr(sample.attenuation(grid), result.volume.data) > 25
 
@@ -99,13 +101,13 @@ def test_matter_beyond_the_default_grid_is_explained() -> None:
     ],
 )
 def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callable[[np.ndarray], object]) -> None:
-    expected = recon.reconstruct(noisy, VIEWS, steps=5, gaussians=300).volume.data
-    found = recon.reconstruct(kind(noisy), VIEWS, steps=5, gaussians=300).volume.data  # type: ignore[arg-type]
+    expected = recon.reconstruct(noisy, VIEWS, R2(steps=5, gaussians=300)).volume.data
+    found = recon.reconstruct(kind(noisy), VIEWS, R2(steps=5, gaussians=300)).volume.data  # type: ignore[arg-type]
     np.testing.assert_array_equal(found, expected)
 
 
 def test_no_step_gives_the_starting_point(noisy: np.ndarray) -> None:
-    result = recon.reconstruct(noisy, VIEWS, steps=0, gaussians=300)
+    result = recon.reconstruct(noisy, VIEWS, R2(steps=0, gaussians=300))
     assert [p.step for p in result.history] == [0] and result.history[0].n_gaussians == 300
     assert result.gaussians is not None and result.volume.data.max() > 0
     # Scaled to the data: the sum of the volume is that of the line integrals.
@@ -115,39 +117,33 @@ def test_no_step_gives_the_starting_point(noisy: np.ndarray) -> None:
 
 def test_it_can_be_stopped_and_watched(noisy: np.ndarray) -> None:
     seen: list[int] = []
-    result = recon.reconstruct(
-        noisy, VIEWS, steps=10_000, gaussians=500,
-        on_progress=lambda p: seen.append(p.step), should_stop=lambda: len(seen) >= 3,
-    )  # fmt: skip
+    control = RunControl(on_progress=lambda p: seen.append(p.step), should_stop=lambda: len(seen) >= 3)
+    result = recon.reconstruct(noisy, VIEWS, R2(steps=10_000, gaussians=500), control=control)
     assert result.history[-1].step < 10_000 and len(seen) >= 3
     assert np.isfinite(result.volume.data).all() and result.volume.data.max() > 0
 
 
 def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
     ticks = iter(np.arange(0, 1e6, 0.05))
-    result = recon.reconstruct(noisy, VIEWS, seconds=2.0, gaussians=500, now=lambda: float(next(ticks)))
+    control = RunControl(now=lambda: float(next(ticks)))
+    result = recon.reconstruct(noisy, VIEWS, R2(seconds=2.0, gaussians=500), control=control)
     assert 5 <= result.history[-1].step <= 40
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"method": "magic"}, "method must be one of"),
+        ({"method": "magic"}, "method must be one of r2, fbp, .*, got 'magic'"),
         ({"projections": np.zeros((3, 20, 40))}, "geometry says"),
         ({"projections": np.full((24, 20, 40), np.nan)}, "no value that is finite"),
         ({"projections": np.full((24, 20, 40), 1e300)}, "no value that is finite"),
         ({"projections": np.ones((24, 20, 40), complex)}, "real numbers"),
         ({"projections": np.zeros((24, 20, 40))}, "no matter"),
-        ({"filter": "magic"}, "filter must be one of"),
-        ({"steps": -1}, "steps must be"),
-        ({"seconds": -1.0}, "seconds must be"),
-        ({"seconds": float("nan")}, "seconds must be"),
-        ({"gaussians": 0}, "at least one Gaussian"),
-        ({"start": "magic"}, "start must be one of"),
-        ({"held_out": (24,)}, "views 0 to 23"),
-        ({"held_out": tuple(range(24))}, "none is left"),
-        ({"early_stop": True}, "there are none"),
-        ({"resume": {}}, "no checkpoint"),
+        ({"method": R2(gaussians=0)}, "at least one Gaussian"),
+        ({"method": R2(early_stop=True)}, "there are none"),
+        ({"use": DataUse(held_out=(24,))}, "views 0 to 23"),
+        ({"use": DataUse(held_out=tuple(range(24)))}, "none is left"),
+        ({"control": RunControl(resume={})}, "no checkpoint"),
         ({"device": "abacus"}, "'abacus' was asked for"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
     ],
@@ -158,46 +154,50 @@ def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], mess
         recon.reconstruct(**arguments)  # type: ignore[arg-type]
 
 
-OF_THE_FIT: dict[str, object] = {
-    "steps": 3, "seconds": 1.0, "gaussians": 100, "densify": False, "settings": FitSettings(), "start": "tv",
-    "held_out": (3,), "early_stop": True, "resume": {}, "device": "cuda", "polish": 3, "on_checkpoint": print,
-}  # fmt: skip
-OF_ITERATIONS: dict[str, object] = {"iterations": 3}
-OF_TV: dict[str, object] = {"tv_weight": 0.1}
-OF_FBP: dict[str, object] = {"filter": "ram-lak"}
-
-
 @pytest.mark.parametrize(
-    ("method", "foreign"),
+    ("method", "change", "message"),
     [
-        ("r2", OF_ITERATIONS | OF_TV | OF_FBP),
-        ("fbp", OF_THE_FIT | OF_ITERATIONS | OF_TV),
-        ("sirt", OF_THE_FIT | OF_TV | OF_FBP),
-        ("fista-tv", OF_THE_FIT | OF_FBP),
-        ("os-sirt-tv", OF_THE_FIT | OF_FBP),
+        (Fbp, {"filter": "magic"}, "filter must be one of"),
+        (R2, {"steps": -1}, "steps must be"),
+        (R2, {"seconds": -1.0}, "seconds must be"),
+        (R2, {"seconds": float("nan")}, "seconds must be"),
+        (R2, {"start": "magic"}, "start must be one of"),
     ],
 )
-def test_no_option_silently_does_nothing(
-    noisy: np.ndarray, method: recon.reconstruction.Method, foreign: dict[str, object]
-) -> None:
-    for name, value in foreign.items():
-        with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} \(of "):
-            recon.reconstruct(noisy, VIEWS, method=method, **{name: value})  # type: ignore[arg-type]
+def test_bad_settings_are_refused(method: type[R2], change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        method(**change)  # type: ignore[arg-type]
+
+
+OF_A_FIT: dict[str, dict[str, object]] = {
+    "held_out": {"use": DataUse(held_out=(3,))},
+    "resume": {"control": RunControl(resume={})},
+    "on_checkpoint": {"control": RunControl(on_checkpoint=print)},
+    "device 'cuda'": {"device": "cuda"},
+}
+
+
+@pytest.mark.parametrize("method", [name for name in names() if name != "r2"])
+def test_no_argument_silently_does_nothing(noisy: np.ndarray, method: str) -> None:
+    for name, argument in OF_A_FIT.items():
+        with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} \(of r2\)"):
+            recon.reconstruct(noisy, VIEWS, method, **argument)  # type: ignore[arg-type]
 
 
 def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> None:
-    with pytest.raises(
-        ValueError, match=r"'sirt' does not take steps \(of r2\), tv_weight \(of fista-tv, os-sirt-tv\)"
-    ):
-        recon.reconstruct(noisy, VIEWS, method="sirt", steps=5, tv_weight=0.1)
+    with pytest.raises(ValueError, match=r"'sirt' does not take held_out \(of r2\), on_checkpoint \(of r2\)"):
+        recon.reconstruct(
+            noisy, VIEWS, "sirt", use=DataUse(held_out=(3,)), control=RunControl(on_checkpoint=print)
+        )  # fmt: skip
 
 
-def test_each_option_but_the_data_and_hooks_is_checked_against_the_method() -> None:
-    # A new option that nobody assigns to a method would be one that may silently do nothing.
+def test_each_argument_but_the_data_and_hooks_is_checked_against_the_method() -> None:
+    # A new argument that no method is asked about would be one that may silently do nothing.
     free = {"projections", "geometry", "grid", "method", "seed", "weights", "on_progress", "should_stop",
             "checkpoint_every", "now"}  # fmt: skip
-    assigned = set(OF_THE_FIT | OF_ITERATIONS | OF_TV | OF_FBP)
-    assert set(inspect.signature(recon.reconstruct).parameters) == free | assigned
+    names = {"device", *inspect.signature(recon.reconstruct).parameters} - {"use", "control"}
+    names |= {field.name for kind in (DataUse, RunControl) for field in fields(kind)}
+    assert names == free | {name.split()[0] for name in OF_A_FIT}
 
 
 @pytest.mark.parametrize(
@@ -206,14 +206,13 @@ def test_each_option_but_the_data_and_hooks_is_checked_against_the_method() -> N
      ("os-sirt-tv", 20, 3.0)],
 )  # fmt: skip
 def test_classical_methods_by_the_same_call_beat_fbp(
-    phantom: Phantom, noisy: np.ndarray, method: recon.reconstruction.Method, iterations: int, margin: float
+    phantom: Phantom, noisy: np.ndarray, method: str, iterations: int, margin: float
 ) -> None:
     truth = phantom.attenuation(GRID)
-    baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, method="fbp").volume.data)
+    baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, "fbp").volume.data)
     seen: list[int] = []
-    result = recon.reconstruct(
-        noisy, VIEWS, method=method, iterations=iterations, on_progress=lambda p: seen.append(p.step)
-    )
+    chosen = build(by_name(method), {"iterations": iterations})
+    result = recon.reconstruct(noisy, VIEWS, chosen, control=RunControl(on_progress=lambda p: seen.append(p.step)))
     assert psnr(truth, result.volume.data) > baseline + margin
     assert seen == list(range(1, iterations + 1)) and result.history[-1].residual < 0.2
     assert result.gaussians is None and result.settings["iterations"] == iterations
@@ -222,9 +221,8 @@ def test_classical_methods_by_the_same_call_beat_fbp(
 def test_views_held_out_are_measured_and_not_fitted(noisy: np.ndarray) -> None:
     spoilt = noisy.copy()
     spoilt[5] *= 3
-    kept, other = (
-        recon.reconstruct(data, VIEWS, steps=60, gaussians=800, held_out=(5, 17)) for data in (noisy, spoilt)
-    )  # fmt: skip
+    fit, use = R2(steps=60, gaussians=800), DataUse(held_out=(5, 17))
+    kept, other = (recon.reconstruct(data, VIEWS, fit, use=use) for data in (noisy, spoilt))
     np.testing.assert_array_equal(kept.volume.data, other.volume.data)
     assert kept.history[-1].n_views == 22
     assert other.history[-1].held_out > 3 * kept.history[-1].held_out > 0
@@ -232,52 +230,50 @@ def test_views_held_out_are_measured_and_not_fitted(noisy: np.ndarray) -> None:
 
 def test_a_fit_may_end_where_views_held_out_stop_getting_better(noisy: np.ndarray) -> None:
     loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)
-    options = {"gaussians": 3000, "held_out": tuple(range(0, 24, 4)), "settings": FitSettings(pace=15.0)}
-    early = recon.reconstruct(loud, VIEWS, steps=3000, early_stop=True, **options)  # type: ignore[arg-type]
+    use = DataUse(held_out=tuple(range(0, 24, 4)))
+    fit = R2(steps=3000, gaussians=3000, early_stop=True, fit=FitSettings(pace=15.0))
+    early = recon.reconstruct(loud, VIEWS, fit, use=use)
     assert early.history[-1].step < 3000
     lowest = min(p.held_out for p in early.history if np.isfinite(p.held_out))
     # What comes back is the model that was best, not the one that stopped.
-    again = recon.reconstruct(
-        loud, VIEWS, steps=0, gaussians=early.gaussians, held_out=tuple(range(0, 24, 4))
-    )  # fmt: skip
+    again = recon.reconstruct(loud, VIEWS, R2(steps=0, gaussians=early.gaussians), use=use)
     assert again.history[-1].held_out == pytest.approx(lowest, rel=1e-4)
 
 
 def test_a_fit_can_be_left_and_taken_up_again(noisy: np.ndarray) -> None:
-    whole = recon.reconstruct(noisy, VIEWS, steps=120, gaussians=600)
+    whole = recon.reconstruct(noisy, VIEWS, R2(steps=120, gaussians=600))
     asked: list[int] = []
-    part = recon.reconstruct(
-        noisy, VIEWS, steps=120, gaussians=600, should_stop=lambda: asked.append(0) or len(asked) >= 50
-    )
+    control = RunControl(should_stop=lambda: asked.append(0) or len(asked) >= 50)
+    part = recon.reconstruct(noisy, VIEWS, R2(steps=120, gaussians=600), control=control)
     assert part.history[-1].step == 50 and part.checkpoint is not None
-    rest = recon.reconstruct(noisy, VIEWS, steps=120, resume=part.checkpoint)
+    rest = recon.reconstruct(noisy, VIEWS, R2(steps=120), control=RunControl(resume=part.checkpoint))
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
 def test_checkpoints_are_handed_out_as_the_fit_goes_on(noisy: np.ndarray) -> None:
     kept: list[dict[str, np.ndarray]] = []
     ticks = iter(range(100_000))
-    options = {"steps": 60, "gaussians": 600}
-    whole = recon.reconstruct(
-        noisy, VIEWS, **options, now=lambda: float(next(ticks)), checkpoint_every=50.0,
-        on_checkpoint=lambda arrays: kept.append(dict(arrays)),
-    )  # fmt: skip
+    fit = R2(steps=60, gaussians=600)
+    control = RunControl(
+        now=lambda: float(next(ticks)), checkpoint_every=50.0, on_checkpoint=lambda arrays: kept.append(dict(arrays))
+    )
+    whole = recon.reconstruct(noisy, VIEWS, fit, control=control)
     steps = [int(arrays["counts"][1]) for arrays in kept]
     assert len(steps) > 2 and steps == sorted(set(steps)) and steps[-1] < 60
-    rest = recon.reconstruct(noisy, VIEWS, **options, resume=kept[1])
+    rest = recon.reconstruct(noisy, VIEWS, fit, control=RunControl(resume=kept[1]))
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
 def test_early_stopping_goes_on_where_a_fit_was_left(noisy: np.ndarray) -> None:
     # The best model so far was the first one; a fit that was interrupted later must still give it back.
     loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)
-    options = {"steps": 600, "held_out": (3, 15), "early_stop": True}
-    whole = recon.reconstruct(loud, VIEWS, gaussians=2000, **options)
+    fit, use = R2(steps=600, gaussians=2000, early_stop=True), DataUse(held_out=(3, 15))
+    whole = recon.reconstruct(loud, VIEWS, fit, use=use)
     asked: list[int] = []
-    part = recon.reconstruct(
-        loud, VIEWS, gaussians=2000, should_stop=lambda: asked.append(0) or len(asked) >= 220, **options
-    )
-    rest = recon.reconstruct(loud, VIEWS, resume=part.checkpoint, **options)
+    control = RunControl(should_stop=lambda: asked.append(0) or len(asked) >= 220)
+    part = recon.reconstruct(loud, VIEWS, fit, use=use, control=control)
+    control = RunControl(resume=part.checkpoint)
+    rest = recon.reconstruct(loud, VIEWS, R2(steps=600, early_stop=True), use=use, control=control)
     assert rest.history[-1].step == whole.history[-1].step > 220
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
@@ -285,7 +281,7 @@ def test_early_stopping_goes_on_where_a_fit_was_left(noisy: np.ndarray) -> None:
 @pytest.mark.parametrize("weight", [1e-20, 1e-3, 1e20])
 def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
     alone, weighed = (
-        recon.reconstruct(noisy, VIEWS, steps=30, gaussians=400, weights=w).volume.data
+        recon.reconstruct(noisy, VIEWS, R2(steps=30, gaussians=400), use=DataUse(weights=w)).volume.data
         for w in (None, np.full(noisy.shape, weight, np.float32))
     )
     np.testing.assert_allclose(weighed, alone, atol=1e-3 * float(alone.max()))
@@ -299,15 +295,15 @@ def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: 
     blank = noisy.copy()
     blank[7] = 0
     with pytest.raises(ValueError, match=message):
-        recon.reconstruct(blank, VIEWS, steps=3, gaussians=100, held_out=held_out)
+        recon.reconstruct(blank, VIEWS, R2(steps=3, gaussians=100), use=DataUse(held_out=held_out))
     with pytest.raises(TypeError):
-        recon.reconstruct(noisy, VIEWS, steps=3, gaussians=100, held_out=(2.9,))  # type: ignore[arg-type]
+        recon.reconstruct(noisy, VIEWS, R2(steps=3, gaussians=100), use=DataUse(held_out=(2.9,)))  # type: ignore[arg-type]
 
 
 def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
-    kept = recon.reconstruct(noisy, VIEWS, steps=2, gaussians=100).checkpoint
+    kept = recon.reconstruct(noisy, VIEWS, R2(steps=2, gaussians=100)).checkpoint
     with pytest.raises(ValueError, match=r"fit with at least 2\d views, these are 12"):
-        recon.reconstruct(noisy[:12], VIEWS.select(range(12)), steps=4, resume=kept)
+        recon.reconstruct(noisy[:12], VIEWS.select(range(12)), R2(steps=4), control=RunControl(resume=kept))
 
 
 @pytest.mark.parametrize(
@@ -317,8 +313,8 @@ def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
 )  # fmt: skip
 def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, settings: FitSettings) -> None:
     truth = phantom.attenuation(GRID)
-    baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, method="fbp").volume.data)
-    result = recon.reconstruct(noisy, VIEWS, steps=300, gaussians=2500, settings=settings)
+    baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, "fbp").volume.data)
+    result = recon.reconstruct(noisy, VIEWS, R2(steps=300, gaussians=2500, fit=settings))
     assert psnr(truth, result.volume.data) > baseline + 1
 
 
@@ -327,7 +323,7 @@ def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phanto
     # so more than rays through matter: 22.9 dB, squares alike for all 25.3; by e^3 as much it was 18.5.
     bright = np.where(np.random.default_rng(9).random(noisy.shape) < 0.005, np.float32(-3), noisy)
     likely, squares = (
-        recon.reconstruct(bright, VIEWS, steps=300, gaussians=2500, settings=FitSettings(loss=loss)).volume.data
+        recon.reconstruct(bright, VIEWS, R2(steps=300, gaussians=2500, fit=FitSettings(loss=loss))).volume.data
         for loss in ("poisson", "l2")
     )
     truth = phantom.attenuation(GRID)
@@ -341,27 +337,27 @@ def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.ini
     around = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     cone = recon.Geometry.cone(around, SHAPE, 2 * PITCH, 12.0, 24.0, axis_col=18.3)
     data = Projector(cone, GRID).forward(truth)
-    baseline = psnr(truth, recon.reconstruct(data, cone, GRID, "fbp").volume.data)
+    baseline = psnr(truth, recon.reconstruct(data, cone, "fbp", grid=GRID).volume.data)
     settings = FitSettings(rays=RayModel(exact_above=0.01))
-    result = recon.reconstruct(data, cone, GRID, steps=500, gaussians=2500, settings=settings, start=start)
+    result = recon.reconstruct(data, cone, R2(steps=500, gaussians=2500, start=start, fit=settings), grid=GRID)
     assert psnr(truth, result.volume.data) > baseline + 1
 
 
 def test_tilted_views_are_fitted_as_they_are(phantom: Phantom, noisy: np.ndarray) -> None:
-    start = recon.reconstruct(noisy, VIEWS, steps=200, gaussians=2000).gaussians
+    start = recon.reconstruct(noisy, VIEWS, R2(steps=200, gaussians=2000)).gaussians
     assert start is not None
     tilted = recon.Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=18.3, tilt=0.15, roll=0.03)
     data = project(start, tilted).numpy()
-    told, untold = (recon.reconstruct(data, g, GRID, steps=300, gaussians=2000) for g in (tilted, VIEWS))
+    told, untold = (recon.reconstruct(data, g, R2(steps=300, gaussians=2000), grid=GRID) for g in (tilted, VIEWS))
     truth = voxelize(start, GRID).numpy()
     assert psnr(truth, told.volume.data) > psnr(truth, untold.volume.data) + 3
 
 
 def test_tilted_views_half_a_turn_apart_are_two_sides(noisy: np.ndarray) -> None:
     views = recon.Geometry.parallel([0.0, np.pi], SHAPE, PITCH, axis_col=18.3, tilt=0.3)
-    assert np.isfinite(recon.reconstruct(noisy[[0, 0]], views, GRID, steps=2, gaussians=200).volume.data).all()
+    assert np.isfinite(recon.reconstruct(noisy[[0, 0]], views, R2(steps=2, gaussians=200), grid=GRID).volume.data).all()
     with pytest.raises(ValueError, match="one view"):
-        recon.reconstruct(noisy[[0, 0]], views.at([0.3, 0.3 + 2 * np.pi]), GRID)
+        recon.reconstruct(noisy[[0, 0]], views.at([0.3, 0.3 + 2 * np.pi]), grid=GRID)
 
 
 def test_one_view_is_refused(noisy: np.ndarray) -> None:

@@ -38,11 +38,11 @@ weights = None
 if weighted:
     weights = np.ones(data.shape, np.float32)
     weights[2, 3:5, 4:9] = 0
+method = recon.R2(steps=120, gaussians=60, start=start, fit=FitSettings(loss=loss, rays=rays))
 warm_up(WARM)
 before = compiled()
 assert sum(n for _, n in before.values()) > 10, before
-settings = FitSettings(loss=loss, rays=rays)
-recon.reconstruct(data, views, steps=120, gaussians=60, settings=settings, start=start, weights=weights)
+recon.reconstruct(data, views, method, use=recon.DataUse(weights))
 late = sorted(name for key, (name, n) in compiled().items() if n != before.get(key, ("", 0))[1])
 print("late:", *late)
 """
@@ -61,8 +61,8 @@ views = recon.Geometry.cone(np.linspace(0, 3.6, 12), shape, 0.2, 20.0, 40.0, rol
 }
 
 
-_OF_THE_FIT = "'cpu', loss, views, rays=rays, start=start, weighted=weighted"
-_OF_A_PARALLEL_BEAM = "'cpu', loss"
+_OF_THE_FIT = "method, views, weighted=weighted"
+_OF_A_PARALLEL_BEAM = "recon.R2(fit=FitSettings(loss=loss))"
 _EXACT = "cone, a short scan, rolled, exact rays"
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from beamline.cli.recon import repeated, report_beside
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.reconstruction import DEFAULT_STEPS
+from recon.splatting.r2 import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -51,12 +51,12 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "truth missing": ({}, ["--truth", "truth.npz"], 2, "truth.npz"),
     "truth of another shape": ({}, ["--truth", "scan.npy"], 2, "shape"),
     "of the other method": ({}, ["--gaussians", "5"], 2, "r2"),
-    "a loss of fbp": ({}, ["--loss", "l2"], 2, "--loss is of the r2 fit"),
-    "a checkpoint of fbp": ({}, ["--checkpoint", "fit.h5"], 2, "--checkpoint is of the r2 fit"),
-    "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of the iterative methods"),
+    "a loss of fbp": ({}, ["--loss", "l2"], 2, "--loss is of r2"),
+    "a checkpoint of fbp": ({}, ["--checkpoint", "fit.h5"], 2, "--checkpoint is of r2"),
+    "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of sirt, sart, cgls, asd-pocs"),
     "iterations of a fit": ({}, ["-m", "r2", "--iterations", "5"], 2, "does not go with --method r2"),
-    "steps of iterations": ({}, ["-m", "sirt", "--steps", "5"], 2, "--steps is of the r2 fit"),
-    "smoothing of sirt": ({}, ["-m", "sirt", "--tv-weight", "0.1"], 2, "fista-tv and os-sirt-tv"),
+    "steps of iterations": ({}, ["-m", "sirt", "--steps", "5"], 2, "--steps is of r2"),
+    "smoothing of sirt": ({}, ["-m", "sirt", "--tv-weight", "0.1"], 2, "fista-tv, os-sirt-tv"),
     "budget and loss": ({}, ["--budget", "30s", "--loss", "l2"], 2, "exclude"),
     "budget and early stop": ({}, ["--budget", "30s", "--early-stop"], 2, "exclude"),
     "following with a start": ({}, ["-m", "r2", "--follow", "--start", "tv"], 2, "finished scan"),
@@ -117,7 +117,7 @@ def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str,
 def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str, method: str) -> None:
     result = beamline("recon", "scan.h5", "-m", method, *option.split())
     assert result.exit_code == 2 and result.stdout == ""
-    assert f"{option.split()[0]} is of the r2 fit; it does not go with --method {method}." in result.stderr
+    assert f"{option.split()[0]} is of r2; it does not go with --method {method}." in result.stderr
     assert left(folder) == {"scan.h5"}
 
 

@@ -24,6 +24,7 @@ from recon.assess.metrics import psnr
 from recon.assess.time_model import PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.splatting.r2 import R2
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -61,7 +62,7 @@ def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pyte
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
     done = _spend(prepared, budget, Ticking(0.01))
-    assert done.choice.method == "r2"
+    assert done.choice.fits
     assert 0.9 * budget < done.seconds <= budget
     assert done.result.volume.grid == Grid.matching(prepared.geometry)
     assert f"of {budget:.3g} s" in done.said(budget)
@@ -72,7 +73,7 @@ def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pyte
 def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     done = _spend(prepared, 5.0, Ticking(0.01))
-    assert (done.choice.method, done.choice.binning) == ("fbp", 2)
+    assert not done.choice.fits and done.choice.binning == 2
     assert done.result.volume.grid.shape == (3, 20, 20)
     assert "pixels joined 2 x 2" in done.said(5.0) and done.said(5.0).startswith("fbp")
 
@@ -90,7 +91,7 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
     warned: list[str] = []
     done = _spend(prepared, 5.0, clock, warned)
     joined_pixels = done.choice.binning
-    assert done.choice.method == "fbp" and joined_pixels >= 4  # about as many as six rows allow
+    assert not done.choice.fits and joined_pixels >= 4  # about as many as six rows allow
     assert done.seconds > 7 and f"of {5.0:.3g} s" in done.said(5.0)
     assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
     late = 7.01 + 432 / joined_pixels**3 - 5
@@ -127,9 +128,9 @@ def test_a_cones_budget_counts_pixels_at_the_axis(prepared: Prepared) -> None:
     cone = _cone(prepared, 2 * np.pi)
     done = _spend(cone, 8.0, Ticking(0.01))
     grid = Grid.matching(cone.geometry)
-    assert done.choice.method == "r2" and done.result.volume.grid == grid
+    assert done.choice.fits and done.result.volume.grid == grid
     truth = SCAN.truth(grid)
-    direct = psnr(truth, recon.reconstruct(cone.projections.data, cone.geometry, grid, "fbp").volume.data)
+    direct = psnr(truth, recon.reconstruct(cone.projections.data, cone.geometry, "fbp", grid=grid).volume.data)
     assert psnr(truth, done.result.volume.data) > direct + 1
     assert done.result.history[-1].residual < 0.05
 
@@ -153,7 +154,7 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
     """A cone's short scan, and views that lean, are for neither FBP nor FDK."""
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     done = _spend(_cone(prepared, turn, tilt=tilt), 5.0, Ticking(0.01))
-    assert done.choice.method == done.result.method == "r2" and done.choice.binning == 2
+    assert done.choice.fits and done.result.method == "r2" and done.choice.binning == 2
     assert done.result.history[-1].step > 0 and 0 < done.placed < 100
     assert done.result.volume.data.max() > 0
 
@@ -170,7 +171,7 @@ def test_joined_views_keep_their_scale_and_place(prepared: Prepared) -> None:
 def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
-    monkeypatch.setattr(module, "choose", lambda *_: Choice("r2", 2, 1.0, 100, 1.0))
+    monkeypatch.setattr(module, "choose", lambda *_: Choice(2, 1.0, 100, 1.0))
     with SourceOptions(tmp_path / "scan.h5").open() as source:
         grid = Grid.matching(prepare(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
     np.save(tmp_path / "truth.npy", SCAN.truth(grid))
@@ -209,7 +210,7 @@ def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
     events: list[Event] = []
-    plain = replace(options, quality=None, steps=5, target=Target(tmp_path / "plain.h5", None))
+    plain = replace(options, quality=None, method=R2(steps=5), target=Target(tmp_path / "plain.h5", None))
     run(plain, events.append, SystemClock())
     return dict(events[-1].data)
 
@@ -220,7 +221,7 @@ def test_a_real_budget_on_a_real_clock(prepared: Prepared) -> None:
     begin = time.perf_counter()
     done = within(4.0, prepared, 0, "hann", time.perf_counter, lambda p: None, lambda: False, lambda w: None)
     took = time.perf_counter() - begin
-    assert done.choice.method == "r2"
+    assert done.choice.fits
     assert 3.0 < took < 4.4
     assert done.seconds == pytest.approx(took, abs=0.2)
     assert done.result.history[-1].residual < 0.2

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import get_args
 
 import h5py
 import numpy as np
@@ -23,7 +22,6 @@ from beamline.reconstruct import result as deliver
 from beamline.reconstruct.checkpoints import Keeper
 from beamline.reconstruct.finished import run
 from beamline.reconstruct.options import ReconOptions, SourceOptions
-from beamline.reconstruct.recon_report import METHOD_NAMES
 from beamline.reconstruct.result import Target
 from beamline.storage.writers.checkpoint import read_checkpoint
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -32,7 +30,11 @@ from drivers.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.reconstruction import Method
+from recon.methods import build, by_name
+from recon.splatting.problem import Loss
+from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
+from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,7 +49,7 @@ def _options(tmp_path: Path, **changes: object) -> ReconOptions:
         source=SourceOptions(tmp_path / "scan.h5"),
         target=Target(tmp_path / "out.h5", None),
         selection=Selection(),
-        method="fbp",
+        method=Fbp(),
         command="beamline recon scan.h5 -m fbp",
     )
     return replace(options, **changes)  # type: ignore[arg-type]
@@ -80,9 +82,7 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     events: list[Event] = []
     np.savez(tmp_path / "truth.npz", volume=SCAN.truth(Grid.matching(Geometry.parallel([0.0], (2, 40), 0.5))))
     target = Target(tmp_path / "out.h5", tmp_path / "out.html")
-    options = _options(
-        tmp_path, method="r2", steps=150, gaussians=400, target=target, truth=str(tmp_path / "truth.npz")
-    )
+    options = _options(tmp_path, method=R2(steps=150, gaussians=400), target=target, truth=str(tmp_path / "truth.npz"))
     options = replace(options, selection=Selection(views="fixed:12", axis_col=SCAN.axis_col))
     metrics = run(options, events.append, SystemClock())
     assert metrics["psnr"] > events[-1].data["fbp"]["psnr"]  # 12 views: FBP has streaks
@@ -99,28 +99,31 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     assert page.count("data:image/png;base64,") == 4  # slices, quality, projection, sinogram; the axis was given
 
 
-@pytest.mark.parametrize("changes", [{"steps": 3, "start": "tv", "loss": "l2"}, {"budget": 1.0}])
+@pytest.mark.parametrize(
+    "changes", [{"method": R2(steps=3, start="tv", fit=FitSettings(loss="l2"))}, {"method": R2(), "budget": 1.0}]
+)
 def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
 ) -> None:
     asked: list[dict[str, object]] = []
 
-    def compiled(device: str = "cpu", loss: str = "l1", geometry: object = None, **more: object) -> None:
-        asked.append({"device": device, "loss": loss, "geometry": geometry, **more})
+    def compiled(method: R2 | None = None, geometry: object = None, device: str = "cpu") -> None:
+        asked.append({"method": method or R2(), "geometry": geometry})
 
     monkeypatch.setattr(offline, "warm_up", compiled)
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
-    run(_options(tmp_path, method="r2", selection=selection, **changes), lambda event: None, SystemClock())
+    run(_options(tmp_path, selection=selection, **changes), lambda event: None, SystemClock())
     assert len(asked) == 1
     geometry = asked[0].pop("geometry")
     assert isinstance(geometry, Geometry) and geometry.n_views == 20 and geometry.detector_shape == (2, 40)
-    assert asked[0].get("start", "fbp") == changes.get("start", "fbp")
-    assert asked[0]["loss"] == changes.get("loss", "l1")
+    compiled_for, wanted = asked[0]["method"], changes["method"]
+    assert isinstance(compiled_for, R2) and isinstance(wanted, R2)
+    assert (compiled_for.start, compiled_for.fit) == (wanted.start, wanted.fit)
 
 
 def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
     selection = Selection(views="first:20", rows=(0, 2), binning=2, axis_col=20.7, seed=3)
-    run(_options(tmp_path, selection=selection, seed=3, filter="hann"), lambda e: None, SystemClock())
+    run(_options(tmp_path, selection=selection, seed=3), lambda e: None, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
     said = {
         "method": "fbp",
@@ -228,13 +231,14 @@ def test_what_a_dead_scan_left_is_reconstructed_when_asked_for(tmp_path: Path) -
 def test_the_same_seed_gives_the_same_volume(tmp_path: Path) -> None:
     volumes = []
     for name in ("a.h5", "b.h5"):
-        options = _options(tmp_path, method="r2", steps=20, gaussians=200, seed=5, target=Target(tmp_path / name, None))
+        options = _options(tmp_path, method=R2(steps=20, gaussians=200), seed=5, target=Target(tmp_path / name, None))
         run(options, lambda e: None, SystemClock())
         volumes.append(read_reconstruction(tmp_path / name).volume.data)
     np.testing.assert_allclose(volumes[0], volumes[1], atol=1e-4 * np.abs(volumes[0]).max())
 
 
-FIT = {"method": "r2", "steps": 80, "gaussians": 300, "selection": Selection(axis_col=SCAN.axis_col)}
+R2_FIT = R2(steps=80, gaussians=300)
+FIT = {"method": R2_FIT, "selection": Selection(axis_col=SCAN.axis_col)}
 
 
 def _volume(path: Path) -> np.ndarray:
@@ -281,19 +285,24 @@ def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     kept = tmp_path / "fit.checkpoint.h5"
     run(_options(tmp_path, **FIT, keeper=Keeper(kept)), lambda e: None, SystemClock())
+    squares = replace(R2_FIT, fit=FitSettings(loss="l2"))
     other = _options(
-        tmp_path, **FIT, loss="l2", seed=4, keeper=Keeper(None, kept), target=Target(tmp_path / "b.h5", None)
+        tmp_path,
+        **{**FIT, "method": squares},
+        seed=4,
+        keeper=Keeper(None, kept),
+        target=Target(tmp_path / "b.h5", None),
     )
     with pytest.raises(DataError, match=r"loss \(l2, l1 in the checkpoint\); seed \(4, 0 in the checkpoint\)"):
         run(other, lambda e: None, SystemClock())
     with pytest.raises(DataError, match="axis_col"):
-        run(replace(other, loss="l1", seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock())
+        run(replace(other, method=R2_FIT, seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock())
     assert _names(tmp_path) == {"scan.h5", "out.h5", "fit.checkpoint.h5"}
 
 
 def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> None:
     events: list[Event] = []
-    options = _options(tmp_path, **{**FIT, "steps": 120}, early_stop=True)
+    options = _options(tmp_path, **{**FIT, "method": replace(R2_FIT, steps=120, early_stop=True)})
     metrics = run(options, events.append, SystemClock())
     said = [event.data["message"] for event in events if event.event == "state"]
     assert said == ["4 of 45 views are held out to say when to stop"]
@@ -304,18 +313,19 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("loss", ["l2", "poisson"])
-def test_every_loss_is_fitted_and_kept(tmp_path: Path, loss: str) -> None:
-    metrics = run(_options(tmp_path, **FIT, loss=loss, start="tv"), lambda e: None, SystemClock())
+def test_every_loss_is_fitted_and_kept(tmp_path: Path, loss: Loss) -> None:
+    method = replace(R2_FIT, start="tv", fit=FitSettings(loss=loss))
+    metrics = run(_options(tmp_path, **{**FIT, "method": method}), lambda e: None, SystemClock())
     parameters = read_reconstruction(tmp_path / "out.h5").parameters
     assert (parameters["loss"], parameters["start"], parameters["device"]) == (loss, "tv", "cpu")
     assert metrics["residual"] < 0.2
 
 
 @pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
-def test_iterations_become_volume_history_and_report(tmp_path: Path, method: Method) -> None:
+def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str) -> None:
     events: list[Event] = []
     options = _options(
-        tmp_path, method=method, iterations=8, selection=Selection(axis_col=SCAN.axis_col),
+        tmp_path, method=build(by_name(method), {"iterations": 8}), selection=Selection(axis_col=SCAN.axis_col),
         target=Target(tmp_path / "out.h5", tmp_path / "out.html"),
     )  # fmt: skip
     metrics = run(options, events.append, SystemClock())
@@ -326,11 +336,7 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: Met
     record = read_reconstruction(tmp_path / "out.h5")
     assert (record.parameters["method"], record.parameters["iterations"]) == (method, 8)
     np.testing.assert_array_equal(record.history["step"], np.arange(1, 9))
-    assert METHOD_NAMES[method] in (tmp_path / "out.html").read_text(encoding="utf-8")
-
-
-def test_every_method_has_a_name() -> None:
-    assert set(METHOD_NAMES) == set(get_args(Method))
+    assert by_name(method).label in (tmp_path / "out.html").read_text(encoding="utf-8")
 
 
 def test_a_device_that_is_not_there_is_told_before_the_work(tmp_path: Path) -> None:
@@ -346,8 +352,7 @@ def test_walnut_from_60_views_is_better_than_fbp(tmp_path: Path, shared_data: Pa
     options = _options(
         tmp_path,
         source=SourceOptions(shared_data / "walnut_parallel_rebinned_240x96x256.h5", quantity="line_integrals"),
-        method="r2",
-        seconds=40.0,
+        method=R2(seconds=40.0),
         selection=Selection(views="fixed:60"),
         truth=f"{shared_data / 'walnut_fdk_256.npz'}:70:166",
         target=Target(tmp_path / "out.h5", tmp_path / "out.html"),

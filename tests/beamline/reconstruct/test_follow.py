@@ -25,6 +25,8 @@ from drivers.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
 from recon.base.volume import Volume
 from recon.prep.align import AxisEstimate
+from recon.splatting.r2 import R2
+from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, frames_of
 
 EPOCH = 1.8e9
@@ -97,14 +99,16 @@ def _schedule(
         clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
 
 
+FIT = R2(seconds=2.0, gaussians=200)
+
+
 def _options(tmp_path: Path, **changes: object) -> ReconOptions:
     output = tmp_path / "recon.h5"
     options = ReconOptions(
         source=SourceOptions(tmp_path / "scan.h5"),
         target=Target(output, None),
         selection=Selection(axis_col=SCAN.axis_col),
-        seconds=2.0,
-        gaussians=200,
+        method=FIT,
         command="beamline recon scan.h5 --follow",
     )
     return replace(options, **changes)  # type: ignore[arg-type]
@@ -119,7 +123,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     target = Target(tmp_path / "recon.h5", tmp_path / "report.html")
-    metrics = follow(_options(tmp_path, target=target, seconds=4.0), events.append, clock, RHYTHM)
+    metrics = follow(_options(tmp_path, target=target, method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM)
 
     names = [event.event for event in events]
     assert names[0] == "state"
@@ -166,7 +170,7 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
     def at_once() -> Iterator[Callable[[], bool]]:
         yield lambda: True
 
-    follow(_options(tmp_path, seconds=1e5), events.append, clock, RHYTHM, at_once)
+    follow(_options(tmp_path, method=replace(FIT, seconds=1e5)), events.append, clock, RHYTHM, at_once)
     assert events[-1].event == "done"
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
     assert parameters["ended_early"] and parameters["n_views"] == 30
@@ -215,7 +219,9 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(module, "locate_axis", locate)
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    metrics = follow(_options(tmp_path, selection=Selection(), seconds=4.0), events.append, clock, RHYTHM)
+    metrics = follow(
+        _options(tmp_path, selection=Selection(), method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM
+    )
     assert [e.data["axis_col"] for e in events if e.event == "recon_started"] == [18.0, 20.7]
     assert events[-1].data["axis_col"] == 20.7
     assert [e.data["again"] for e in events if e.event == "recon_started"] == [False, True]
@@ -285,9 +291,9 @@ def test_scans_that_make_no_volume(
 @pytest.mark.parametrize(
     ("changes", "error"),
     [
-        ({"method": "fbp"}, ConfigError),
+        ({"method": Fbp()}, ConfigError),
         ({"selection": Selection(views="fixed:5")}, ConfigError),
-        ({"steps": 10}, ConfigError),
+        ({"method": R2(steps=10)}, ConfigError),
         ({"truth": "missing.npz"}, ConfigError),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 from beamline.core.events import Event
 from beamline.reconstruct.progress import progress_events
 from drivers.clock import SystemClock
-from recon.splatting.optimise import Progress
+from recon.base.method import Progress
 
 
 def _told(points: Sequence[tuple[int, float]], steps: int, seconds: float | None = None) -> list[dict[str, Any]]:

@@ -46,7 +46,7 @@ def _scan(folder: Path, turn: float) -> tuple[Prepared, Context]:
 @pytest.mark.parametrize(("turn", "compared"), [(2 * np.pi, True), (3.6, False)])
 def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, turn: float, compared: bool) -> None:
     prepared, context = _scan(tmp_path, turn)
-    result = recon.reconstruct(prepared.projections.data, prepared.geometry, method="os-sirt-tv", iterations=3)
+    result = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.OsSirtTv(iterations=3))
     made = Made(result.volume, "os-sirt-tv", result.seconds, result.history, result.settings)
     events: list[Event] = []
     deliver(

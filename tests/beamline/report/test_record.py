@@ -12,8 +12,8 @@ from beamline.reconstruct.recon_report import Made
 from beamline.report.figures import quality_against_time
 from beamline.report.record import history_arrays, history_of, judged_by
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
+from recon.base.method import Progress
 from recon.base.volume import Grid, Volume
-from recon.splatting.optimise import Progress
 from recon.splatting.settings import FitSettings
 from recon.splatting.stream import WHILE_VIEWS_COME
 

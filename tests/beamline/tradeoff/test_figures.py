@@ -12,8 +12,8 @@ from beamline.tradeoff import figures as tradeoff_figures
 from beamline.tradeoff.figures import cost_curves, pareto_plot
 from beamline.tradeoff.trials import Outcome, Trial
 
-FBP, FIT = Trial("method", "fbp", 10), Trial("method", "r2", 10, steps=100)
-FEW = Trial("views", "r2", 5, steps=100)
+FBP, FIT = Trial("method", "fbp", 10), Trial("method", "r2", 10, settings={"steps": 100})
+FEW = Trial("views", "r2", 5, settings={"steps": 100})
 
 
 @pytest.fixture

@@ -42,14 +42,18 @@ def test_what_becomes_of_a_process(
     assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
 
 
-def test_kernels_are_compiled_once_for_each_method_and_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_compiled_once_for_each_method_start_and_loss(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
     out = tmp_path / "seen.json"
     monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
     compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
     job = json.loads(out.read_text())
-    assert sorted((trial["method"], trial["start"]) for trial in job["compile"]) == [
-        ("fbp", "fbp"), ("r2", "fbp"), ("r2", "tv"), ("sirt", "fbp")
+    words = ("start", "fit.loss")
+    kinds = [(trial["method"], *(trial["settings"].get(name, "") for name in words)) for trial in job["compile"]]
+    assert sorted(kinds) == [
+        ("fbp", "", ""), ("r2", "", ""), ("r2", "", "l2"), ("r2", "", "poisson"), ("r2", "tv", ""), ("sirt", "", "")
     ]  # fmt: skip
     assert job["data"] == str(tmp_path / "data.npz")  # whose geometry decides which kernels are used
 

@@ -14,10 +14,12 @@ import pytest
 from beamline.core.machine import machine
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
 from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Depth, Outcome, Trial, plan
+from beamline.tradeoff.trials import Outcome, Trial, plan
+from recon.base.method import Depth
+from recon.methods import names
 
 BASE = Trial("method", "fbp", 10)
-FIT = Trial("method", "r2", 10, steps=100, gaussians=2000)
+FIT = Trial("method", "r2", 10, settings={"steps": 100, "gaussians": 2000})
 
 
 def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
@@ -32,10 +34,9 @@ def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8)
 def test_the_table_fits_into_120_columns(depth: Depth) -> None:
     """Also with four-digit numbers of views, and with everything that can be measured."""
     metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784, "resolution": 0.6221}
-    methods = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
     outcomes = tuple(
         Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4)
-        for trial in plan(methods, 1801, 200_000, depth)
+        for trial in plan(names(), 1801, 200_000, depth)
     )
     said = text(TrialTable(outcomes, "psnr", "mm", machine(), {}, ""))
     rows = said.split("\n\n")[1].splitlines()[1:]
@@ -47,7 +48,7 @@ def test_the_table_fits_into_120_columns(depth: Depth) -> None:
 
 
 def test_each_further_decibel_is_told_with_its_price() -> None:
-    worse = replace(FIT, group="steps", steps=50)
+    worse = replace(FIT, group="steps", settings={**FIT.settings, "steps": 50})
     table = _table(_done(BASE, 2.0, 20.0), _done(FIT, 12.0, 24.0), _done(worse, 13.0, 23.0))
     quality, fastest, step = conclusions(table)
     assert quality == "Quality: PSNR, dB."

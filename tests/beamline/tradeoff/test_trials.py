@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.tradeoff.trials import Outcome, Timed, Trial, decibels, plan, seconds_left, work
+from recon.methods import by_name, names
 
-METHODS = ("r2", "fbp", "sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv")
+METHODS = names()
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
-    "views": {"views"}, "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"binning", "gaussians", "steps"},
-    "loss": {"loss"}, "start": {"start"}, "cut-off": {"sigmas"}, "iterations": {"iterations"},
+    "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},
+    "loss": {"fit.loss", "fit.ssim_weight"}, "start": {"start"}, "cut-off": {"fit.truncation.sigmas"},
+    "iterations": {"iterations"},
 }  # fmt: skip
 
 
@@ -33,8 +35,11 @@ def test_one_change_at_a_time_about_each_methods_baseline(
         if trial.group == "precision":
             continue
         base = bases[trial.method]
-        changed = {f.name for f in fields(Trial) if getattr(trial, f.name) != getattr(base, f.name)}
-        assert changed - {"group", "halves"} <= VARIED[trial.group]
+        changed = {name for name, _ in trial.settings.items() ^ base.settings.items()}
+        assert changed <= VARIED[trial.group]
+        assert (trial.views != n_views) is (trial.group == "views")
+        assert (trial.binning != 1) is (trial.group == "binning")
+        assert isinstance(trial.build(), by_name(trial.method))
         assert 2 <= trial.views <= n_views
         assert not trial.halves
     assert sum(t.group == "precision" for t in trials) == ("r2" in methods)
@@ -47,21 +52,32 @@ def test_full_tries_more_than_quick() -> None:
     assert len({t.label for t in full}) == len(full)
 
 
+def test_a_method_or_setting_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"method must be one of r2, .*, got 'art'"):
+        plan(("fbp", "art"), 60, 1000, "quick")
+    with pytest.raises(ValueError, match=r"'sirt' has no setting 'steps' \(r2 has\)"):
+        Trial("method", "sirt", 60, settings={"steps": 5}).build()
+
+
 def test_labels_say_what_is_not_the_default() -> None:
-    trial = Trial("method", "r2", 60, steps=500, gaussians=50_000)
+    trial = Trial("method", "r2", 60, settings={"steps": 500, "gaussians": 50_000})
     assert trial.label == "r2, 60 views, 500 steps, 50k Gaussians"
-    assert replace(trial, sigmas=3.0, loss="l1", binning=2).label == (
-        "r2, 60 views, bin 2, 500 steps, 50k Gaussians, l1, cut at 3 σ"
+    changed = {**trial.settings, "fit.ssim_weight": 0.0, "fit.truncation.sigmas": 3.0}
+    assert replace(trial, settings=changed, binning=2).label == (
+        "r2, 60 views, bin 2, 500 steps, 50k Gaussians, no SSIM, cut at 3 σ"
     )
-    assert replace(trial, start="tv").label == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
-    assert Trial("iterations", "sart", 9, iterations=1).label == "sart, 9 views, 1 iteration"
-    assert Trial("iterations", "sart", 9, iterations=30).label == "sart, 9 views, 30 iterations"
+    assert (
+        replace(trial, settings={**trial.settings, "start": "tv"}).label
+        == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
+    )
+    assert Trial("iterations", "sart", 9, settings={"iterations": 1}).label == "sart, 9 views, 1 iteration"
+    assert Trial("iterations", "sart", 9, settings={"iterations": 30}).label == "sart, 9 views, 30 iterations"
 
 
 @given(st.floats(0.1, 1e4), st.integers(1, 20), st.floats(0, 10))
 def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start: float) -> None:
-    base = Trial("method", "r2", 60, steps=100, gaussians=1000)
-    left = [replace(base, steps=100 * k) for k in range(1, n + 1)]
+    base = Trial("method", "r2", 60, settings={"steps": 100, "gaussians": 1000})
+    left = [replace(base, settings={**base.settings, "steps": 100 * k}) for k in range(1, n + 1)]
     expected = n * start + speed * sum(map(work, left))
     one = Timed(base, start + speed * work(base), speed * work(base))
     assert seconds_left([one], left) == pytest.approx(expected)
@@ -73,7 +89,7 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
 
 
 def test_where_the_time_of_a_trial_went() -> None:
-    trial = Trial("steps", "r2", 60, steps=100, gaussians=1000)
+    trial = Trial("steps", "r2", 60, settings={"steps": 100, "gaussians": 1000})
     assert Timed.of(Outcome(trial, "done", 4.0), 7.0) == Timed(trial, 7.0, 4.0)
     base = replace(trial, group="method", halves=True)
     assert Timed.of(Outcome(base, "done", 4.0), 15.0).working == 12.0

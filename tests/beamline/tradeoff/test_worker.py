@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import recon.warm_up
 from beamline.tradeoff import worker as module
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.trials import Trial
@@ -66,12 +67,13 @@ def test_fewer_views_are_worse_and_spread_over_all_angles(data: Data) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{}, {"binning": 2}, {"loss": "l1"}, {"loss": "l2+ssim"}, {"loss": "poisson+ssim"}, {"sigmas": 2.5},
-     {"start": "tv"}],
+    [{}, {"binning": 2}, {"fit.ssim_weight": 0.0}, {"fit.loss": "l2"}, {"fit.loss": "poisson"},
+     {"fit.truncation.sigmas": 2.5}, {"start": "tv"}],
 )  # fmt: skip
 def test_a_fit_with_each_setting(data: Data, change: dict[str, Any]) -> None:
     said: list[Any] = []
-    trial = Trial("method", "r2", 27, steps=120, gaussians=150, **change)
+    binning = change.pop("binning", 1)
+    trial = Trial("method", "r2", 27, binning, {"steps": 120, "gaussians": 150, **change})
     found = run(trial, data, 0, said.append)
     assert found["metrics"]["psnr"] > 15
     assert found["gaussians"] >= 100 and found["curve_of"] == "views held out"
@@ -82,7 +84,7 @@ def test_a_fit_with_each_setting(data: Data, change: dict[str, Any]) -> None:
 
 def test_a_fit_is_judged_by_views_that_it_does_not_see(data: Data) -> None:
     """Its record ends with the residual of the views held out, and spoiling them changes nothing but that."""
-    trial = Trial("method", "r2", 27, steps=100, gaussians=150)
+    trial = Trial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
     assert data.held_out is not None
     spoilt = replace(data, held_out=(2 * data.held_out[0], data.held_out[1]))
     kept, other = (run(trial, d, 0, _silent) for d in (data, spoilt))
@@ -92,7 +94,7 @@ def test_a_fit_is_judged_by_views_that_it_does_not_see(data: Data) -> None:
 
 @pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
 def test_iterations(data: Data, method: str) -> None:
-    few, more = (run(Trial("iterations", method, 27, iterations=n), data, 0, _silent) for n in (1, 4))
+    few, more = (run(Trial("iterations", method, 27, settings={"iterations": n}), data, 0, _silent) for n in (1, 4))
     assert more["metrics"]["residual_held_out"] < few["metrics"]["residual_held_out"]
     assert len(more["curve"]) == 4 and more["curve_of"] == "views used" and more["gaussians"] is None
 
@@ -129,12 +131,15 @@ def test_a_job_may_be_to_compile(
 ) -> None:  # fmt: skip
     """It compiles for the geometry of the data and says nothing, also of methods that do not take such views."""
     _cone(data, **leaning).save(tmp_path / "data.npz")
-    trials = [Trial("method", "cgls", 60, iterations=10), Trial("method", "r2", 60, steps=500, gaussians=1000)]
+    trials = [
+        Trial("method", "cgls", 60, settings={"iterations": 10}),
+        Trial("method", "r2", 60, settings={"steps": 500, "gaussians": 1000}),
+    ]
     job = {"data": str(tmp_path / "data.npz"), "compile": [asdict(trial) for trial in trials]}
     (tmp_path / "job.json").write_text(json.dumps(job))
     fitted: list[Geometry] = []
-    plain = module.reconstruct
-    monkeypatch.setattr(module, "reconstruct", lambda *said: fitted.append(said[2]) or plain(*said))
+    plain = recon.warm_up.reconstruct
+    monkeypatch.setattr(recon.warm_up, "reconstruct", lambda *said, **k: fitted.append(said[1]) or plain(*said, **k))
     assert main(tmp_path / "job.json") == 0
     assert capsys.readouterr().out == ""
     assert len(fitted) == 2 and all(views.is_cone and views.is_straight != bool(leaning) for views in fitted)
@@ -143,7 +148,7 @@ def test_a_job_may_be_to_compile(
 def test_trials_of_a_cone(data: Data) -> None:
     cone = _cone(data)
     views = cone.geometry.n_views
-    for trial in (Trial("method", "fbp", views), Trial("method", "r2", views, steps=5, gaussians=50)):
+    for trial in (Trial("method", "fbp", views), Trial("method", "r2", views, settings={"steps": 5, "gaussians": 50})):
         assert np.isfinite(run(trial, cone, 0, _silent)["metrics"]["psnr"])
 
 
@@ -169,7 +174,7 @@ def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys
     assert main(tmp_path / "job.json") == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "result"
     Data(np.zeros_like(data.projections), data.geometry, data.held_out, None).save(tmp_path / "data.npz")
-    job["trial"] = asdict(Trial("method", "r2", 27, steps=2, gaussians=10))
+    job["trial"] = asdict(Trial("method", "r2", 27, settings={"steps": 2, "gaussians": 10}))
     (tmp_path / "job.json").write_text(json.dumps(job))
     assert main(tmp_path / "job.json") == 1
     last = json.loads(capsys.readouterr().out.splitlines()[-1])

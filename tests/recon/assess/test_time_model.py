@@ -25,6 +25,7 @@ from recon.assess.time_model import (
 )  # fmt: skip
 from recon.bench import spheres
 from recon.reconstruction import reconstruct
+from recon.splatting.r2 import R2
 
 SPEEDS = st.builds(
     Speeds, fbp=st.floats(0.01, 100), start=st.floats(0.01, 100), step=st.floats(1e-4, 10), fill=st.floats(0.01, 50)
@@ -35,7 +36,7 @@ BUDGETS = st.floats(0.1, 1e5)
 def _cost(choice: Choice, speeds: Speeds) -> float:
     """What a choice takes by the speeds it was made from, written out once more."""
     time = speeds.fbp / choice.binning**3
-    if choice.method == "r2":
+    if choice.fits:
         ratios = [(c, choice.binning // c.binning) for c in CURVES if c.binning == min(choice.binning, 2)]
         kinds = [(c, n) for c, n in ratios if math.isclose(c.share, choice.share * n**3)]
         assert len(kinds) == 1
@@ -54,8 +55,8 @@ def test_what_is_chosen_fits_the_budget_or_is_the_smallest_there_is(
     if math.isfinite(choice.gain):
         assert _cost(choice, speeds) <= budget * (1 + 1e-9)
     else:
-        assert choice.method == "fbp" and speeds.fbp / choice.binning**3 > budget
-    assert (choice.steps > 0) is (choice.method == "r2")
+        assert not choice.fits and speeds.fbp / choice.binning**3 > budget
+    assert (choice.steps > 0) is (choice.fits)
 
 
 @given(BUDGETS, SPEEDS, st.floats(1, 10))
@@ -68,11 +69,11 @@ def test_more_time_or_a_faster_machine_never_promises_less(budget: float, speeds
 
 def test_with_little_time_it_is_fbp_and_with_much_a_fit_of_all_pixels() -> None:
     speeds = Speeds(fbp=0.5, start=1.0, step=5e-3, fill=0.2)
-    assert choose(0.6, speeds, 1000) == Choice("fbp", 1, 0.0, 0, 0.0)
+    assert choose(0.6, speeds, 1000) == Choice(1, 0.0, 0, 0.0)
     joined = choose(0.1, speeds, 1000)
-    assert joined.method == "fbp" and joined.binning == 2
+    assert not joined.fits and joined.binning == 2
     long = choose(60.0, speeds, 1000)
-    assert (long.method, long.binning) == ("r2", 1)
+    assert long.fits and long.binning == 1
     assert long.gain > 1 and long.steps > 500
     with pytest.raises(ValueError, match="positive"):
         choose(0.0, speeds, 100)
@@ -134,7 +135,8 @@ def test_the_next_decibel_of_a_fit_is_about_what_it_takes() -> None:
     """The forecast of the shorter fit's volume against longer fits of a third sample."""
     data, geometry, truth = spheres(side=64, rows=32, views=40)
     found = {
-        steps: psnr(truth, reconstruct(data, geometry, steps=steps).volume.data) for steps in (125, 150, 180, 250, 350)
+        steps: psnr(truth, reconstruct(data, geometry, R2(steps=steps)).volume.data)
+        for steps in (125, 150, 180, 250, 350)
     }
     at, gains = np.log(list(found)), np.array(list(found.values()))
     forecast = next_decibel_of_fit(1.0, 125)

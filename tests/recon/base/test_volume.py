@@ -10,6 +10,7 @@ from recon.base.volume import Grid
 from recon.reconstruction import Reconstruction, reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
+from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 
@@ -25,8 +26,8 @@ def _sample(width: float, height: float, seed: int = 0) -> Gaussians:
     return Gaussians.from_physical(means, np.full((25, 3), 1.5), rng.uniform(0.05, 0.1, 25))
 
 
-def _fitted(data: np.ndarray, views: Geometry, grid: Grid | None = None, **options: object) -> Reconstruction:
-    return reconstruct(data, views, grid, **({"steps": 60, "gaussians": 600} | options))  # type: ignore[arg-type]
+def _fitted(data: np.ndarray, views: Geometry, grid: Grid | None = None) -> Reconstruction:
+    return reconstruct(data, views, R2(steps=60, gaussians=600), grid=grid)
 
 
 def test_a_shift_of_all_views_is_fitted_as_an_axis_elsewhere() -> None:
@@ -91,7 +92,7 @@ def test_small_shifts_leave_the_matching_volume_the_size_of_the_detector() -> No
 
 def test_a_volume_of_no_stated_size_shows_all_heights_that_jumping_views_see() -> None:
     views = Geometry.parallel(TURN, (10, 32), shifts=np.resize([[0.0, 10.0], [0.0, -10.0]], (48, 2)))
-    result = reconstruct(project(_sample(9.0, 12.0), views).numpy(), views, method="fbp")
+    result = reconstruct(project(_sample(9.0, 12.0), views).numpy(), views, "fbp")
     planes = np.abs(result.volume.data).sum(axis=(1, 2))
     assert result.volume.grid.shape[0] == 30 and (planes[:10] > 0).all() and (planes[20:] > 0).all()
 
@@ -132,4 +133,4 @@ def test_a_cone_too_wide_for_a_box_of_its_pixels_is_fitted(turn: np.ndarray) -> 
 def test_what_cannot_be_joined_is_told_before_anything_is_placed() -> None:
     views = Geometry.parallel(TURN, (1, 32))
     with pytest.raises(ValueError, match="coarse=2 joins 2 x 2 pixels, and the detector has 1 x 32"):
-        reconstruct(np.zeros((48, 1, 32)), views, steps=5, settings=FitSettings(coarse=2))
+        reconstruct(np.zeros((48, 1, 32)), views, R2(steps=5, fit=FitSettings(coarse=2)))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.method import DataUse
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.prep.correct import References, correct
@@ -20,6 +21,7 @@ from recon.reconstruction import Reconstruction, reconstruct
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import without_wild_pixels
+from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
@@ -42,8 +44,11 @@ def truth() -> F32:
     return spheres.volume(GRID)
 
 
-def fitted(data: F32, geometry: Geometry = VIEWS, steps: int = 100, **options: object) -> Reconstruction:
-    found = reconstruct(data, geometry, steps=steps, gaussians=1200, settings=SHORT, **options)  # type: ignore[arg-type]
+def fitted(
+    data: F32, geometry: Geometry = VIEWS, steps: int = 100, seed: int = 0, weights: F32 | None = None
+) -> Reconstruction:
+    method = R2(steps=steps, gaussians=1200, fit=SHORT)
+    found = reconstruct(data, geometry, method, seed=seed, use=DataUse(weights))
     assert np.isfinite(found.volume.data).all()
     assert found.gaussians is not None
     for values in found.gaussians.arrays().values():
@@ -61,10 +66,10 @@ def a_few(seed: int = 0) -> Gaussians:
 def test_projections_of_nothing_are_refused_by_name_and_empty_a_model_that_is_there() -> None:
     nothing = np.zeros((32, *SHAPE), np.float32)
     with pytest.raises(ValueError, match="no matter"):
-        reconstruct(nothing, VIEWS, steps=1)
-    assert not reconstruct(nothing, VIEWS, method="fbp").volume.data.any()
+        reconstruct(nothing, VIEWS, R2(steps=1))
+    assert not reconstruct(nothing, VIEWS, "fbp").volume.data.any()
     start = a_few()
-    left = reconstruct(nothing, VIEWS, steps=300, gaussians=start, settings=replace(SHORT, pace=10.0))
+    left = reconstruct(nothing, VIEWS, R2(steps=300, gaussians=start, fit=replace(SHORT, pace=10.0)))
     assert left.gaussians is not None and np.isfinite(left.volume.data).all()
     assert float(left.gaussians.densities.mean()) < 0.3 * float(start.densities.mean())
 

@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.methods import build
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.polish import polish
+from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
+from recon.voxels.direct import Fbp
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -80,7 +83,7 @@ def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
 
 def test_reconstruct_polishes_and_says_so() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
-    plain, polished = (reconstruct(data, VIEWS, steps=60, gaussians=300, polish=n) for n in (0, 5))
+    plain, polished = (reconstruct(data, VIEWS, R2(steps=60, gaussians=300, polish=n)) for n in (0, 5))
     assert psnr(_box(), polished.volume.data) > psnr(_box(), plain.volume.data) + 0.5
     assert (plain.settings["polish"], polished.settings["polish"]) == (0, 5)
     # The model is the fit's, whatever voxels add.
@@ -91,9 +94,9 @@ def test_reconstruct_polishes_and_says_so() -> None:
 def test_what_cannot_be_is_refused() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
     with pytest.raises(ValueError, match="polish must be 0 sweeps or more, got -1"):
-        reconstruct(data, VIEWS, steps=1, polish=-1)
-    with pytest.raises(ValueError, match="polish"):
-        reconstruct(data, VIEWS, method="fbp", polish=2)
+        reconstruct(data, VIEWS, R2(steps=1, polish=-1))
+    with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'polish' \(r2 has\)"):
+        build(Fbp, {"polish": 2})
     leaning = Geometry.parallel(VIEWS.angles, VIEWS.detector_shape, tilt=0.1)
     with pytest.raises(ValueError, match=r"polish .* rolled or tilted"):
-        reconstruct(data, leaning, steps=1, polish=2)
+        reconstruct(data, leaning, R2(steps=1, polish=2))

@@ -1,0 +1,195 @@
+"""Method: what every reconstruction method is, and the values that go in and come out.
+
+A method is a frozen dataclass of its settings that meets the Protocol `Method`. `recon.methods` registers it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+
+F32 = NDArray[np.float32]
+Depth = Literal["quick", "full"]
+Plain = str | int | float
+
+PRECISION = "precision"
+"""`TrialSettings.varies` of a comparison of float32 kernels with the float64 reference implementation."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a reconstruction stands.
+
+    Attributes:
+        step, steps: done and planned, or iterations (0 for a fit without an end, while views still arrive).
+        seconds: since the start, by the caller's clock.
+        loss: running mean of the loss, in normalised units.
+        residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.
+        n_gaussians, n_views: in the model and in the data.
+        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN where there are none.
+    """
+
+    step: int
+    steps: int
+    seconds: float
+    loss: float
+    residual: float
+    n_gaussians: int
+    n_views: int
+    held_out: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class DataUse:
+    """How the projections are used.
+
+    Attributes:
+        weights: of each ray [view, row, col], 0 or more; None: one for all. FBP fills rays of weight 0 from their
+            neighbours and takes all others alike.
+        held_out: numbers of the views that are not fitted; their residual is in the history.
+    """
+
+    weights: F32 | None = None
+    held_out: Sequence[int] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class RunControl:
+    """How a caller watches, ends and continues a reconstruction.
+
+    Attributes:
+        should_stop: asked between steps or iterations; True ends the reconstruction with the volume so far.
+        on_progress: called about ten times a second, or after each iteration; direct methods do not call it.
+        on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
+        checkpoint_every: s.
+        resume: the checkpoint of a fit with the same data and settings, which is continued.
+        now: a clock in s.
+    """
+
+    should_stop: Callable[[], bool] | None = None
+    on_progress: Callable[[Progress], None] | None = None
+    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None
+    checkpoint_every: float = 60.0
+    resume: Mapping[str, NDArray[Any]] | None = None
+    now: Callable[[], float] = time.perf_counter
+
+
+@dataclass(frozen=True, eq=False)
+class ReconProblem:
+    """What a method reconstructs.
+
+    Attributes:
+        projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
+        geometry: of these views.
+        grid: of the volume.
+        use: weights and views held out.
+        seed: of every random choice.
+        device: to compute on.
+    """
+
+    projections: F32
+    geometry: Geometry
+    grid: Grid
+    use: DataUse
+    seed: int
+    device: str
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """What a method returns; the attributes are those of `recon.Reconstruction`.
+
+    `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import.
+    """
+
+    volume: Volume
+    settings: Mapping[str, Any]
+    history: tuple[Progress, ...] = ()
+    gaussians: Any = None
+    checkpoint: Mapping[str, NDArray[Any]] | None = None
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What a method can do beyond turning line integrals into a volume.
+
+    Attributes:
+        direct: one pass without iterations: it has no history, and cannot be stopped.
+        device: it computes on any device, not on the CPU alone.
+        held_out: views can be held out.
+        checkpoints: its state can be saved and continued.
+        presets: a quality preset or a time budget chooses its settings.
+        any_grid: its model has no voxels, so that views of joined pixels still fill the full grid.
+    """
+
+    direct: bool = False
+    device: bool = False
+    held_out: bool = False
+    checkpoints: bool = False
+    presets: bool = False
+    any_grid: bool = False
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """One way in which a trade-off tries a method.
+
+    Attributes:
+        varies: the group of the trial: "method" for the baseline, else what differs from it, or `PRECISION`.
+        settings: that differ from the defaults, by name as `recon.methods.build` takes them.
+        binning: detector pixels joined a side.
+    """
+
+    varies: str
+    settings: Mapping[str, Plain] = field(default_factory=dict)
+    binning: int = 1
+
+
+class Method(Protocol):
+    """A reconstruction method: a frozen dataclass whose fields are its settings.
+
+    Attributes:
+        name: in commands, files and events.
+        label: in reports.
+        colour: in pictures, as matplotlib takes it.
+        traits: what it can do.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+    colour: ClassVar[str]
+    traits: ClassVar[Traits]
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        """Reconstruct.
+
+        Raises:
+            ValueError: the method does not take these views, settings or data.
+        """
+        ...
+
+    def toy(self) -> Self:
+        """The same method with as little work as still runs each of its kernels."""
+        ...
+
+    @classmethod
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        """The settings that a trade-off tries on all views, the baseline first.
+
+        Args:
+            gaussians: how many a fit starts from by default.
+            depth: "quick" has fewer trials, and shorter ones.
+        """
+        ...
+
+    def work(self, n_views: int, binning: int) -> float:
+        """A rough measure of the time that a run takes, to be compared within one method only."""
+        ...

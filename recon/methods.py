@@ -1,0 +1,114 @@
+"""The registry of reconstruction methods: one line a method. Adding one takes its file and its line here.
+
+A line says where the method's class is, so that its name is known without loading what it computes with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from typing import Any
+
+from recon.base.method import Method
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a method is.
+
+    Attributes:
+        module, cls: of its settings class, see `recon.base.method.Method`.
+        streams: it has `stream`, so that its volume can grow while views arrive.
+    """
+
+    module: str
+    cls: str
+    streams: bool = False
+
+
+REGISTRY: dict[str, Entry] = {
+    "r2": Entry("recon.splatting.r2", "R2", streams=True),
+    "fbp": Entry("recon.voxels.direct", "Fbp"),
+    "sirt": Entry("recon.voxels.methods.sirt", "Sirt"),
+    "sart": Entry("recon.voxels.methods.sart", "Sart"),
+    "cgls": Entry("recon.voxels.methods.cgls", "Cgls"),
+    "asd-pocs": Entry("recon.voxels.methods.asd_pocs", "AsdPocs"),
+    "fista-tv": Entry("recon.voxels.methods.fista_tv", "FistaTv"),
+    "os-sirt-tv": Entry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
+}
+
+DEFAULT = "r2"
+"""The method where none is named."""
+
+
+def names() -> tuple[str, ...]:
+    """Names of all methods; loads none of them."""
+    return tuple(REGISTRY)
+
+
+def streams(name: str) -> bool:
+    """Whether a method's volume can grow while views arrive; loads nothing.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    return _entry(name).streams
+
+
+def by_name(name: str) -> type[Method]:
+    """The settings class of a method.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    entry = _entry(name)
+    return getattr(import_module(entry.module), entry.cls)
+
+
+def taking(field: str) -> tuple[str, ...]:
+    """Names of the methods that have a setting, such as "iterations", or "fit.loss" within another one."""
+    return tuple(name for name in REGISTRY if has_setting(by_name(name), field))
+
+
+def has_setting(method: type[Method], field: str) -> bool:
+    """Whether the settings class has this field; "fit.loss" is the field of the default value of `fit`."""
+    value: Any = method()
+    *outer, last = field.split(".")
+    for name in outer:
+        value = getattr(value, name, None)
+    return value is not None and last in {f.name for f in fields(value)}
+
+
+def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
+    """A method with these settings, by name as in `taking`, and its defaults for all others.
+
+    Raises:
+        ValueError: the method does not have such a setting, or not with such a value.
+    """
+    for name in settings:
+        if not has_setting(method, name):
+            owners = ", ".join(taking(name)) or "no method"
+            raise ValueError(f"method {method.name!r} has no setting {name!r} ({owners} has)")
+    return _changed(method(), settings)
+
+
+def _changed(value: Any, settings: Mapping[str, Any]) -> Any:
+    flat = {name: setting for name, setting in settings.items() if "." not in name}
+    nested: dict[str, dict[str, Any]] = {}
+    for name, setting in settings.items():
+        if "." in name:
+            outer, inner = name.split(".", 1)
+            nested.setdefault(outer, {})[inner] = setting
+    return replace(value, **flat, **{name: _changed(getattr(value, name), inner) for name, inner in nested.items()})
+
+
+def with_trait(trait: str) -> tuple[str, ...]:
+    """Names of the methods that can do something, by a field of `recon.base.method.Traits`."""
+    return tuple(name for name in REGISTRY if getattr(by_name(name).traits, trait))
+
+
+def _entry(name: str) -> Entry:
+    if name not in REGISTRY:
+        raise ValueError(f"method must be one of {', '.join(REGISTRY)}, got {name!r}")
+    return REGISTRY[name]

@@ -1,0 +1,124 @@
+"""R2: the R²-Gaussian fit as a method, with the settings that its user chooses."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self, get_args
+
+from recon.assess.time_model import PRESETS, Quality
+from recon.base.geometry import Geometry
+from recon.base.method import PRECISION, Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
+from recon.splatting.density_control import DensityPolicy
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import Start
+from recon.splatting.settings import FitSettings
+from recon.splatting.stream import Clock, StreamingFit
+from recon.splatting.train import run_fit
+
+DEFAULT_STEPS = 1000
+_TOY_STEPS, _TOY_GAUSSIANS = 4, 50
+
+# What a trade-off tries, by depth.
+_BASE_STEPS = {"quick": 250, "full": 1000}
+_STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
+_FACTORS = {"quick": (0.5,), "full": (0.5, 2.0)}
+_BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
+_SIGMAS = {"quick": (3.0,), "full": (2.5, 3.0, 4.5)}
+
+
+@dataclass(frozen=True, eq=False)
+class R2:
+    """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
+
+    Attributes:
+        steps: of the fit; 0 gives the starting point; None takes 1000, or as many as fit into `seconds`.
+        seconds: a time budget for the fit; the rates decay along it.
+        gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
+        start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
+        early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
+            that had it lowest.
+        polish: sweeps over the views after the fit that add on voxels what Gaussians cannot describe, see
+            `polish.polish`; the result's `gaussians` stay the model as it was fitted.
+        fit: weights, rates and limits.
+    """
+
+    name: ClassVar[str] = "r2"
+    label: ClassVar[str] = "R²-Gaussian"
+    colour: ClassVar[str] = "tab:blue"
+    traits: ClassVar[Traits] = Traits(device=True, held_out=True, checkpoints=True, presets=True, any_grid=True)
+
+    steps: int | None = None
+    seconds: float | None = None
+    gaussians: int | Gaussians | None = None
+    start: Start = "fbp"
+    early_stop: bool = False
+    polish: int = 0
+    fit: FitSettings = field(default_factory=FitSettings)
+
+    def __post_init__(self) -> None:
+        if self.start not in get_args(Start):
+            raise ValueError(f"start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
+        if self.steps is not None and operator.index(self.steps) < 0:
+            raise ValueError(f"steps must be 0 or more, got {self.steps}")
+        if operator.index(self.polish) < 0:
+            raise ValueError(f"polish must be 0 sweeps or more, got {self.polish}")
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
+            raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
+
+    @property
+    def planned_steps(self) -> int | None:
+        """Steps that end the fit; None where `seconds` alone do."""
+        return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        return run_fit(self, problem, control)
+
+    def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
+        """A fit of views to come; it takes of these settings the number of Gaussians alone.
+
+        Raises:
+            ValueError: as `StreamingFit`, or where the fit would start from Gaussians instead of a number.
+        """
+        if isinstance(self.gaussians, Gaussians):
+            raise ValueError("a fit that follows a scan starts from a number of Gaussians, not from a model")
+        return StreamingFit(template, seed=seed, gaussians=self.gaussians, now=now)
+
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """With the steps, Gaussians and polish of a preset, for a grid that is worth `default_count` Gaussians."""
+        preset = PRESETS[quality]
+        count = max(1, round(preset.share * default_count))
+        return replace(self, steps=preset.steps, gaussians=count, polish=preset.polish)
+
+    def toy(self) -> Self:
+        policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)
+        rays = self.fit.rays
+        if rays.exact_above < math.inf:
+            rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
+        fit = replace(self.fit, policy=policy, rays=rays, coarse=min(self.fit.coarse, 2))
+        return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
+
+    @classmethod
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        base: dict[str, Plain] = {"steps": _BASE_STEPS[depth], "gaussians": gaussians}
+        found = [TrialSettings("method", base)]
+        found += [TrialSettings("steps", base | {"steps": n}) for n in _STEPS[depth] if n != base["steps"]]
+        counts = [max(1, round(factor * gaussians)) for factor in _FACTORS[depth]]
+        found += [TrialSettings("gaussians", base | {"gaussians": count}) for count in counts]
+        # A bin of two halves the detail across: a quarter of the Gaussians describes it.
+        coarse = max(1, gaussians // 4)
+        found += [
+            TrialSettings("binning", {"steps": steps, "gaussians": coarse}, binning=2) for steps in _BINNED_STEPS[depth]
+        ]
+        found += [TrialSettings("cut-off", base | {"fit.truncation.sigmas": n}) for n in _SIGMAS[depth]]
+        found.append(TrialSettings("start", base | {"start": "tv"}))
+        found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
+        found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
+        return [*found, TrialSettings(PRECISION)]
+
+    def work(self, n_views: int, binning: int) -> float:
+        count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or 0
+        spread = self.fit.truncation.sigmas / FitSettings().truncation.sigmas
+        return (self.planned_steps or 0) * (1 + count / 2e4 * spread**2)

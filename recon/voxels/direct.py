@@ -1,0 +1,65 @@
+"""Fbp: the direct method, FBP for a parallel beam and FDK for a cone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid, Volume
+from recon.voxels.fbp import Filter, fbp
+from recon.voxels.fdk import fdk
+from recon.voxels.view_weights import covers_the_circle
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Fbp:
+    """Filtered back-projection (FDK for a cone).
+
+    Attributes:
+        filter: the smooth one, "hann", is best for few or noisy views.
+    """
+
+    name: ClassVar[str] = "fbp"
+    label: ClassVar[str] = "FBP"
+    colour: ClassVar[str] = "0.35"
+    traits: ClassVar[Traits] = Traits(direct=True)
+
+    filter: Filter = "hann"
+
+    def __post_init__(self) -> None:
+        if self.filter not in get_args(Filter):
+            raise ValueError(f"filter must be one of {', '.join(get_args(Filter))}, got {self.filter!r}")
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        filled = masked(problem.projections, problem.use.weights)[0]
+        data = direct(filled, problem.geometry, problem.grid, self.filter)
+        return MethodResult(Volume(data, problem.grid), {"filter": self.filter})
+
+    def toy(self) -> Self:
+        return self
+
+    @classmethod
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        return [TrialSettings("method")]
+
+    def work(self, n_views: int, binning: int) -> float:
+        return n_views / binning**3
+
+
+def direct(projections: F32, geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> F32:
+    """FBP or FDK [z, y, x], whichever the beam wants; see `fbp` and `fdk`."""
+    return (fdk if geometry.is_cone else fbp)(projections, geometry, grid, filter)
+
+
+def has_direct_method(geometry: Geometry) -> bool:
+    """Whether FBP or FDK takes these views: they must be straight, and a cone's must stand all around."""
+    return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))

@@ -1,0 +1,1 @@
+"""Iterative methods on voxels, one a file."""

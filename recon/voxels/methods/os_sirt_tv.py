@@ -1,0 +1,75 @@
+"""OS-SIRT-TV: ordered-subset SIRT with a proximal step of total variation after each sweep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.voxels.iterative import run_iterative
+from recon.voxels.sweeps import interleaved
+from recon.voxels.tv import TotalVariationProx, difference_weights
+from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iteration_trials
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class OsSirtTv:
+    """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
+
+    Attributes:
+        tv_weight: the threshold of that step in density units. Best of 0.002, 0.004 and 0.008 for 60 views, for a
+            measured walnut (0.15 to 0.25 dB to its neighbours) and a simulated battery (1.0 to 1.5 dB).
+        momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
+            167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
+            -0.1 and -1.0 dB: noise comes in sooner, too.
+    """
+
+    name: ClassVar[str] = "os-sirt-tv"
+    label: ClassVar[str] = "OS-SIRT-TV"
+    colour: ClassVar[str] = "tab:orange"
+    traits: ClassVar[Traits] = Traits()
+
+    iterations: int = 40
+    subsets: int = 9
+    tv_weight: float = 0.004
+    tv_steps: int = 5
+    momentum: bool = False
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        return run_iterative(self, problem, control)
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
+        projector = problem.projector
+        sweeps = problem.sweeps(interleaved(projector, self.subsets))
+        weights = difference_weights(projector.grid)
+        prox = TotalVariationProx(x.shape, weights, problem.nonnegative, self.tv_steps)
+        scale = problem.scale
+        ahead = Momentum(x) if self.momentum else None
+        for k in range(self.iterations):
+            error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
+            # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
+            prox(x, self.tv_weight * density_unit(x))
+            go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
+            if not go_on or k + 1 == self.iterations:
+                break
+            if ahead is not None:
+                ahead(x)
+        return x
+
+    def toy(self) -> Self:
+        return replace(self, iterations=1)
+
+    @classmethod
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        return iteration_trials({"quick": (5, 15), "full": (5, 10, 20, 40)}[depth])
+
+    def work(self, n_views: int, binning: int) -> float:
+        return n_views * self.iterations / binning**3

@@ -1,0 +1,57 @@
+"""SART: simultaneous algebraic reconstruction, one view a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.voxels.iterative import run_iterative
+from recon.voxels.voxel_problem import VoxelProblem, iteration_trials
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Sart:
+    """Simultaneous algebraic reconstruction, one view a step in random order (Andersen & Kak 1984).
+
+    The relaxation shrinks by `decay` a sweep. Memory: 3 volumes, 3 x the projections.
+    """
+
+    name: ClassVar[str] = "sart"
+    label: ClassVar[str] = "SART"
+    colour: ClassVar[str] = "tab:olive"
+    traits: ClassVar[Traits] = Traits()
+
+    iterations: int = 20
+    relaxation: float = 1.0
+    decay: float = 0.999
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        return run_iterative(self, problem, control)
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
+        sweeps = problem.single_views()
+        scale = problem.scale
+        for k in range(self.iterations):
+            error = sweeps.run(x, self.relaxation * self.decay**k, problem.nonnegative, problem.rng)
+            if not problem.go_on(k + 1, math.sqrt(error) / scale):
+                break
+        return x
+
+    def toy(self) -> Self:
+        return replace(self, iterations=1)
+
+    @classmethod
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        return iteration_trials({"quick": (2, 6), "full": (1, 3, 10, 30)}[depth])
+
+    def work(self, n_views: int, binning: int) -> float:
+        return n_views * self.iterations / binning**3

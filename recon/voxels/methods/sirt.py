@@ -1,0 +1,54 @@
+"""SIRT: simultaneous iterative reconstruction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.voxels.iterative import run_iterative
+from recon.voxels.voxel_problem import VoxelProblem, iteration_trials
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Sirt:
+    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections."""
+
+    name: ClassVar[str] = "sirt"
+    label: ClassVar[str] = "SIRT"
+    colour: ClassVar[str] = "tab:green"
+    traits: ClassVar[Traits] = Traits()
+
+    iterations: int = 100
+    relaxation: float = 1.0
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        return run_iterative(self, problem, control)
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
+        everything = [np.arange(problem.projector.geometry.n_views)]
+        sweeps = problem.sweeps(everything)
+        scale = problem.scale
+        for k in range(self.iterations):
+            error = sweeps.run(x, self.relaxation, problem.nonnegative, None)
+            if not problem.go_on(k + 1, math.sqrt(error) / scale):
+                break
+        return x
+
+    def toy(self) -> Self:
+        return replace(self, iterations=1)
+
+    @classmethod
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        return iteration_trials({"quick": (20, 60), "full": (10, 30, 100, 300)}[depth])
+
+    def work(self, n_views: int, binning: int) -> float:
+        return n_views * self.iterations / binning**3

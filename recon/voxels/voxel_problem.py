@@ -1,0 +1,111 @@
+"""VoxelProblem: what an iterative method on voxels works on, and the parts that several of them share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.method import TrialSettings
+from recon.kernels.cpu.vectors import combine, dot, misfit
+from recon.voxels.projector import Projector
+from recon.voxels.sweeps import Sweeps
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelProblem:
+    """What an iterative method works on, as lines along z; `recon.voxels.iterative.solve` makes it.
+
+    Attributes:
+        data: [view, col, row], finite.
+        weight: of each ray, [view, col, row], or None.
+        nonnegative: voxels below zero are clipped.
+        rng: for the order of views and subsets.
+        go_on: called with (iteration, relative residual) after each iteration; False ends the method.
+        direct: the volume [y, x, z] of filtered back-projection, computed when asked for; None where it cannot be.
+    """
+
+    projector: Projector
+    data: F32
+    weight: F32 | None
+    nonnegative: bool
+    rng: np.random.Generator
+    go_on: Callable[[int, float], bool]
+    direct: Callable[[], F32 | None]
+
+    @property
+    def scale(self) -> float:
+        """||p||, rays weighed."""
+        return math.sqrt(misfit(self.data, np.zeros_like(self.data), self.weight))
+
+    def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
+        """Sweeps over all views in these subsets."""
+        return Sweeps(self.projector, self.data, self.weight, subsets)
+
+    def single_views(self) -> Sweeps:
+        """Sweeps with one view a step."""
+        return self.sweeps([np.array([view]) for view in range(self.projector.geometry.n_views)])
+
+
+def density_unit(x: F32) -> float:
+    """A typical high density: the 99.5th percentile of the positive values, from some 10⁵ of them; 0 for none."""
+    sample = x.reshape(-1)[:: max(1, x.size // 100_003)]
+    positive = sample[sample > 0]
+    return float(np.percentile(positive, 99.5)) if positive.size else 0.0
+
+
+class Momentum:
+    """Nesterov's extrapolation between the steps of a descent, which starts anew where it points uphill.
+
+    O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes.
+    """
+
+    def __init__(self, start: F32) -> None:
+        self._last, self._from, self._t = start.copy(), start.copy(), 1.0
+
+    def __call__(self, x: F32) -> None:
+        """From the point x that a step has reached to the one where the next step starts, in place."""
+        combine(1.0, self._from, -1.0, x, self._from)  # back along the step
+        combine(1.0, x, -1.0, self._last, self._last)  # from the last point reached to this one
+        if dot(self._from, self._last) > 0:
+            self._t = 1.0
+        after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
+        change, self._last = self._last, self._from
+        self._last[...] = x
+        combine(1.0, x, (self._t - 1) / after, change, x)
+        change[...] = x
+        self._from, self._t = change, after
+
+
+def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6) -> float:
+    """An upper bound of the largest eigenvalue of Aᵀ W A, within a few per cent, by power iteration.
+
+    For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942),
+    so the step 1 / bound is safe after any number of rounds; the Rayleigh quotient would err to the other side.
+    """
+    nz, ny, nx = projector.grid.shape
+    x = np.ones((ny, nx, nz), np.float32)
+    bound = math.inf
+    for _ in range(rounds):
+        image = projector.forward_lines(x)
+        if weight is not None:
+            image *= weight
+        product = projector.adjoint_lines(image)
+        ratio = np.divide(product, x, out=np.zeros_like(x), where=x > 0)
+        bound = min(bound, float(ratio.max()))
+        if bound == 0:
+            return math.inf  # no ray meets the box
+        x = product / product.max()
+    return bound
+
+
+def iteration_trials(numbers: Sequence[int]) -> list[TrialSettings]:
+    """Trials of numbers of iterations: the middle one is the baseline."""
+    base = numbers[len(numbers) // 2]
+    others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
+    return [TrialSettings("method", {"iterations": base}), *others]
