@@ -1,7 +1,7 @@
-"""FrameDigest: what the monitor, the operator and the file need to know about a frame, gathered in one pass.
+"""FrameDigest: statistics of a frame for the monitor, the operator and the file, computed in one pass.
 
-Counts (uint16) are looked at once: a histogram of grey values holds every statistic but the preview exactly. Other
-types need the range before the histogram, so they are looked at twice. Pixels that are not finite, or hold the
+Counts (uint16) are read once: a histogram of grey values holds every statistic but the preview exactly. Other types
+need the range before the histogram, so they are read twice. Pixels that are not finite, or hold the
 no-data value, are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
 """
 

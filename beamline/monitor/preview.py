@@ -1,4 +1,4 @@
-"""What the checks read off a frame's preview: light above dark, transmission, and the edges where air should be."""
+"""Quantities of a frame's preview for the checks: light above dark, transmission, and edges where air should be."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from beamline.monitor.check import ScanContext
 
 EDGE_FRACTION = 16  # an edge strip is a sixteenth of the columns
-ENOUGH = 128  # blocks per side that tell a check what it needs; a large preview is thinned to about so many
+ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
 
 Region = tuple[slice, slice]
 WHOLE: Region = (slice(None), slice(None))
@@ -27,7 +27,7 @@ def light(preview: NDArray[np.float32], context: ScanContext, region: Region = W
 
 
 def more_light(context: ScanContext, exposure: float) -> float:
-    """How many times the flats' light a frame of `exposure` s would get without a sample: flats may have their own."""
+    """Light without a sample in a frame of `exposure` s, over that of the flats, which may have their own exposure."""
     return exposure / context.flat_exposure
 
 

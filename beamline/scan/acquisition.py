@@ -23,19 +23,19 @@ NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DA
 
 
 @dataclass(frozen=True)
-class Done:
-    """A block and what became of it."""
+class TakenBlock:
+    """A block with its frames and missing triggers."""
 
     block: Block
     taken: Taken
 
 
 class Acquisition:
-    """One scan. `frames()` may be called once; what is missing can be read at any time.
+    """The frames of one scan. `frames()` may be called once; `missing` can be read at any time.
 
     Args:
         timeline: without violations.
-        camera_settings: roi, binning and readout; exposure and trigger are each block's own.
+        camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: takes (event, data) for block_started, block_done and warning.
     """
@@ -52,9 +52,9 @@ class Acquisition:
     ) -> None:
         self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
         self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit)
-        self._done: list[Done] = []
+        self._done: list[TakenBlock] = []
         self.unsafe = False
-        """At the end something did not obey: stage, camera or shutter may be as the scan left them."""
+        """A device failed while the instrument was made safe: stage, camera or shutter may be as during the scan."""
 
     @property
     def n_frames(self) -> int:
@@ -69,45 +69,45 @@ class Acquisition:
     def frames(self) -> Generator[Frame, None, None]:
         """Frames, each with its own memory, its row in the file, its trigger and its angle.
 
-        However it ends (also when the caller closes the iterator): stage stopped, camera and trigger output disarmed,
-        shutter closed; the sample and the stage go back to where they were unless the scan was aborted or a device
-        failed. A lost frame does not end the scan; the error comes when everything else is taken.
+        In any case (also when the caller closes the iterator), at the end the stage is stopped, camera and trigger
+        output are disarmed and the shutter is closed; sample and stage return to where they were unless the scan was
+        aborted or a device failed. A lost frame does not end the scan; the error is raised after the last frame.
 
         Raises:
             LedgerError: frames are missing, or some have no trigger; all others were delivered with their angles.
-            ScanStopped: a stop was asked for and heeded.
+            ScanStopped: a stop was requested, and the scan has ended in order.
             ScanAborted: an abort, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """
         home = self._devices.stage.position()
-        calm = whole = False
+        devices_work = all_taken = False
         try:
             yield from self._blocks()
-            calm = whole = True
+            devices_work = all_taken = True
         except ScanAborted as aborted:
-            raise ScanAborted(f"{aborted}{self._unbalanced()}") from None
-        except GeneratorExit:  # the caller gave up; the devices are well
-            calm = True
+            raise ScanAborted(f"{aborted}{self._discrepancies()}") from None
+        except GeneratorExit:  # closed by the caller; no device has failed
+            devices_work = True
             raise
         finally:
-            failures = self._make_safe(home if calm and not self._stop.aborting else None)
-            for error in failures[1:] if whole else failures:
+            failures = self._make_safe(home if devices_work and not self._stop.aborting else None)
+            for error in failures[1:] if all_taken else failures:
                 self._emit("warning", {"message": _in_words(error)})
         if failures:
             raise failures[0]
-        self._verdict()
+        self._raise_outcome()
 
     def _blocks(self) -> Iterator[Frame]:
         for block in self._timeline.blocks:
             if self._stop.aborting:
                 raise ScanAborted(f"Aborted: {self._stop.reason}.")
-            if self._stop.stopping and not self._owed(block):
+            if self._stop.stopping and not self._still_needed(block):
                 continue
-            done = Done(block, Taken())
+            done = TakenBlock(block, Taken())
             self._done.append(done)
             what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.n, "first_row": self.n_frames}
             self._emit("block_started", {**what, "exposure": block.exposure, "period": block.period})
-            self._prepare(block.kind)
+            self._set_shutter_and_sample(block.kind)
             yield from self._exposures.take(block, self.n_frames, done.taken)
             if block.kind is FrameKind.FLAT:
                 self._devices.sample.back()
@@ -124,16 +124,16 @@ class Acquisition:
                 },
             )
 
-    def _owed(self, block: Block) -> bool:
-        """References that a stopped scan still needs: projections were taken, and nothing of this kind was.
+    def _still_needed(self, block: Block) -> bool:
+        """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.
 
-        A stop during this very block ends it for good, since a block is asked for only once.
+        A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {done.block.kind for done in self._done if done.taken.frames}
         return block.kind is not FrameKind.PROJECTION and FrameKind.PROJECTION in kinds and block.kind not in kinds
 
-    def _prepare(self, kind: FrameKind) -> None:
-        """Shutter and sample as the kind of frame needs them; a shutter that does not obey ends the scan."""
+    def _set_shutter_and_sample(self, kind: FrameKind) -> None:
+        """Bring shutter and sample where this kind of frame needs them; a shutter that does not move ends the scan."""
         shutter, sample = self._devices.shutter, self._devices.sample
         if kind is FrameKind.DARK:
             shutter.close()
@@ -148,19 +148,19 @@ class Acquisition:
             )
 
     def _make_safe(self, home: float | None) -> list[Exception]:
-        """Every step is tried, whatever became of the one before; the first failure of each that did not work."""
+        """Stop the stage, disarm, close the shutter; all steps are tried. Returns the first error of each one."""
         stage, camera, shutter = self._devices.stage, self._devices.camera, self._devices.shutter
         failed: list[Exception] = []
 
         def attempt(*ways: Callable[[], object]) -> bool:
-            """One way after the other until one works: a line that was disturbed once often works again."""
+            """Try one way after the other until one works: a serial line that failed once often works again."""
             failures: list[Exception] = []
             for way in ways:
                 try:
                     way()
-                except ScanAborted:  # it came while the stage was moving here
+                except ScanAborted:  # requested while the stage was moving here
                     return attempt(stage.abort, stage.abort)
-                except Exception as error:  # a defect in one device must not leave the others unsafe
+                except Exception as error:  # a failure of one device must not leave the others unsafe
                     failures.append(error)
                 else:
                     for failure in failures:
@@ -182,37 +182,37 @@ class Acquisition:
             self.unsafe = not attempt(*stop)
         return failed
 
-    def _verdict(self) -> None:
+    def _raise_outcome(self) -> None:
         views = sum(done.taken.frames for done in self._done if done.block.kind is FrameKind.PROJECTION)
         planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
         if self._stop.aborting:
-            raise ScanAborted(f"Aborted: {self._stop.reason}.{self._unbalanced()}")
+            raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
         if self._stop.stopping:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before anything was acquired: {self._stop.reason}.")
             raise ScanStopped(
                 f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file is complete as far as "
-                f"it goes.{self._unbalanced()}"
+                f"it goes.{self._discrepancies()}"
             )
-        if unbalanced := self._unbalanced():
+        if text := self._discrepancies():
             raise LedgerError(
-                f"{unbalanced.strip()} Every other frame is in the file with its own angle. Repeat these views, or "
+                f"{text.strip()} Every other frame is in the file with its own angle. Repeat these views, or "
                 "reconstruct without them; a longer period_s leaves the camera more time.",
                 self.missing,
             )
 
-    def _unbalanced(self) -> str:
-        """What is missing, extra or doubtful so far, a sentence after another, each after a space."""
-        return "".join(f" {text}" for done in self._done if (text := _account(done)))
+    def _discrepancies(self) -> str:
+        """Sentences on missing, extra and doubtful frames so far, each after a space."""
+        return "".join(f" {text}" for done in self._done if (text := _describe(done)))
 
 
 def _in_words(error: Exception) -> str:
-    """Failures of devices speak for themselves; of a defect its kind matters."""
+    """The message of an error; for one that is not ours, with its type."""
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"
 
 
-def _account(done: Done) -> str:
-    """What is missing of a block, in sentences."""
+def _describe(done: TakenBlock) -> str:
+    """Sentences on missing, extra and doubtful frames of a block."""
     block, taken, noun = done.block, done.taken, NOUN[done.block.kind]
     text = ""
     if taken.missing:

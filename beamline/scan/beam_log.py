@@ -1,4 +1,4 @@
-"""Beam log: the beam monitor read at a set period while frames are taken, in a thread that no scan ever waits for."""
+"""Beam log: reads the beam monitor periodically while frames are taken, in its own thread; the scan never waits."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from drivers.errors import DeviceError
 from drivers.protocols import BeamMonitor, BeamReading
 
 LAST_WAIT = 3.0
-"""s that the end of a scan waits for a reading under way."""
+"""Longest wait in s for a reading in progress at the end of a scan."""
 
 
 class BeamLog:
-    """Use as a context manager. Each reading is an event `beam`; a monitor that fails is told once until it answers.
+    """Use as a context manager. Each reading is an event `beam`; failing readings are one warning until one succeeds.
 
     Args:
         monitor: None: nothing is read.
         period: s of real time between readings.
-        emit: takes (event, data) for beam and warning, from the log's own thread.
+        emit: takes (event, data) of `beam` and `warning`, called in the log's thread.
     """
 
     def __init__(self, monitor: BeamMonitor | None, period: float, emit: Emit) -> None:
         self._monitor, self._period, self._emit = monitor, period, emit
         self._readings: list[BeamReading] = []
-        self._failed = 0  # readings in a row
+        self._failed = 0  # failed readings in a row
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="beam log", daemon=True)
 
     @property
     def readings(self) -> tuple[BeamReading, ...]:
-        """So far, in the order of time."""
+        """The readings so far, in order of time."""
         return tuple(self._readings)
 
     def __enter__(self) -> Self:
@@ -52,18 +52,18 @@ class BeamLog:
         while not self._over.is_set():
             try:
                 reading = self._monitor.reading()
-            except Exception as error:  # whatever is wrong with it, the scan goes on
+            except Exception as error:  # no failure of the beam monitor ends the scan
                 self._fail(self._monitor.name, error)
             else:
                 self._enter(self._monitor.name, reading)
             self._over.wait(self._period)
 
     def _enter(self, name: str, reading: BeamReading) -> None:
-        if self._over.is_set():  # it came too late to be written
+        if self._over.is_set():  # too late to be written
             return
         if self._failed:
-            failed = "1 reading" if self._failed == 1 else f"{self._failed} readings"
-            self._emit("warning", {"message": f"{name}: it answers again, after {failed} that failed."})
+            failed = "1 failed reading" if self._failed == 1 else f"{self._failed} failed readings"
+            self._emit("warning", {"message": f"{name}: it answers again after {failed}."})
             self._failed = 0
         self._readings.append(reading)
         self._emit("beam", {"value": reading.value, "unit": reading.unit, "read_at": reading.time})
@@ -72,5 +72,5 @@ class BeamLog:
         self._failed += 1
         if self._failed > 1 or self._over.is_set():
             return
-        said = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
-        self._emit("warning", {"message": f"{said} The scan goes on; this is said once until it answers again."})
+        problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
+        self._emit("warning", {"message": f"{problem} The scan goes on without readings until it answers again."})

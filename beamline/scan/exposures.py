@@ -30,13 +30,13 @@ SILENT_EXPOSURES = 3  # software triggers in a row without a frame
 
 @dataclass
 class Taken:
-    """What became of a block, filled in while it is taken.
+    """Frames and missing triggers of a block; filled in while the block is taken.
 
     Attributes:
         frames: delivered, with and without a trigger.
         missing: triggers, counted within the block, that gave no frame though one was waited for.
-        lost, ignored: of these, as far as it is known.
-        extra: frames that no trigger made.
+        lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
+        extra: frames that no trigger exposed.
         shift: triggers by which the angles of a pass may be wrong (see ledger.Account).
     """
 
@@ -48,7 +48,7 @@ class Taken:
     shift: int = 0
 
     def enter(self, account: Account, first: int) -> None:
-        """Add a pass that began at trigger `first`."""
+        """Add a pass whose first trigger is `first`."""
         self.missing += [first + i for i in account.missing]
         self.lost += account.lost
         self.ignored += account.ignored
@@ -60,7 +60,7 @@ class Taken:
 class _Pass:
     """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes.
 
-    `braked`: when the stage was told to stop on the way.
+    `braked`: time at which the stage was ordered to stop during the pass.
     """
 
     ledger: Ledger
@@ -76,10 +76,10 @@ class _Pass:
 
 
 class Exposures:
-    """Takes blocks from a camera and a stage; shutter and sample are somebody else's business.
+    """Takes blocks of frames with a camera and a stage. Shutter and sample are operated by Acquisition.
 
     Args:
-        camera_settings: roi, binning and readout for all blocks; exposure and trigger are each block's own.
+        camera_settings: roi, binning and readout for all blocks; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: where warnings go.
     """
@@ -98,12 +98,12 @@ class Exposures:
         self._clock, self._stop, self._emit = clock, stop, emit
 
     def take(self, block: Block, first_row: int, taken: Taken) -> Iterator[Frame]:
-        """The block's frames, numbered from `first_row`; `taken` tells what is missing.
+        """The block's frames, numbered from `first_row`; `taken` records what is missing.
 
         A stop that comes while they are taken ends them early. A block begun after the stop is taken whole.
 
         Raises:
-            ScanAborted: abort was asked for; the stage may still be moving.
+            ScanAborted: an abort was requested; the stage may still be moving.
             InstrumentError: the camera is silent.
             DeviceError: a device failed.
         """
@@ -125,11 +125,11 @@ class Exposures:
         return self._wait(move_seconds(distance, limits.max_speed, limits.acceleration))
 
     def go_home(self, angle: float) -> None:
-        """Move to `angle` although a stop was asked for; only an abort ends this move early."""
+        """Move to `angle` also after a stop request; only an abort ends this move early."""
         limits = self._stage.limits
         seconds = move_seconds(angle - self._stage.position(), limits.max_speed, limits.acceleration)
         self._stage.start_move(angle, limits.max_speed)
-        self._wait(seconds, heed_stop=False)
+        self._wait(seconds, until_stop=False)
 
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         first = 0
@@ -169,9 +169,9 @@ class Exposures:
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
-        """Frames while the stage turns; after a stop, those that are on their way.
+        """Frames while the stage turns; after a stop, the frames that are still being transferred.
 
-        Waits on the progress of frames, not on the stage: a camera that falls silent is noticed at once.
+        Waits for frames, not for the stage, so that a camera without frames is noticed at once.
         """
         tail = block.exposure + self._camera.timing.readout
         patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
@@ -183,7 +183,7 @@ class Exposures:
                 flight.braked = self._clock.now()
                 self._stage.stop()
                 braking = True
-            frame = self._next_frame(tail + 2 * block.period if braking else wait, heed_stop=not braking)
+            frame = self._next_frame(tail + 2 * block.period if braking else wait, until_stop=not braking)
             if frame is not None:
                 wait = patience
                 yield flight.enter(frame)
@@ -197,8 +197,8 @@ class Exposures:
                     )
         if not braking:
             self._wait(flight.seconds)
-        while (frame := self._next_frame(0.0, heed_stop=False)) is not None:
-            yield flight.enter(frame)  # no trigger is left: the ledger calls these extra
+        while (frame := self._next_frame(0.0, until_stop=False)) is not None:
+            yield flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
     def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats."""
@@ -218,8 +218,8 @@ class Exposures:
                 position = self._stage.position()
             self._clock.sleep(triggered + period - self._clock.now())
             self._camera.software_trigger()
-            triggered = self._clock.now()  # after the call: when in it the camera fired is not known
-            frame = self._next_frame(patience, heed_stop=False)
+            triggered = self._clock.now()  # after the call: the time of the exposure within it is not known
+            frame = self._next_frame(patience, until_stop=False)
             if frame is not None:
                 silent = 0
                 yield frame, i, position
@@ -231,25 +231,26 @@ class Exposures:
                     f"{self._camera.name}: {silent} triggers in a row gave no frame within {patience:.3g} s each. "
                     "Check the camera. What was taken before is in the file."
                 )
-            # A frame that comes late must not be taken for the next one: arming anew forgets it.
+            # A late frame must not be taken for the next one: arming again discards it.
             self._camera.disarm()
             self._camera.arm(block.n - i)
         self._camera.disarm()
 
-    def _next_frame(self, timeout: float, heed_stop: bool) -> CameraFrame | None:
-        """The next frame, or None after `timeout` s (or, with `heed_stop`, when a stop is asked for).
+    def _next_frame(self, timeout: float, until_stop: bool) -> CameraFrame | None:
+        """The next frame, or None after `timeout` s (with `until_stop`, also at a stop request).
 
-        A camera may report an error once and go on (frames lost from its ring show as missing); twice is a failure.
+        A first error of the camera is a warning (frames lost from its ring buffer become missing ones); a second is
+        raised.
         """
         deadline = self._clock.now() + timeout
         failed = False
         while True:
-            self._heed_abort()
+            self._check_abort()
             remaining = deadline - self._clock.now()
             try:
                 return self._camera.next_frame(max(0.0, min(SLICE, remaining)))
             except DeviceTimeout:
-                if remaining <= SLICE or (heed_stop and self._stop.stopping):
+                if remaining <= SLICE or (until_stop and self._stop.stopping):
                     return None
             except DeviceError as error:
                 if failed:
@@ -257,12 +258,12 @@ class Exposures:
                 failed = True
                 self._emit("warning", {"message": str(error)})
 
-    def _wait(self, seconds: float, heed_stop: bool = True) -> bool:
+    def _wait(self, seconds: float, until_stop: bool = True) -> bool:
         """Wait for a move that should take `seconds`; False where a stop cut it short."""
         deadline = self._clock.now() + 2 * seconds + 5.0
         while self._stage.moving():
-            self._heed_abort()
-            if heed_stop and self._stop.stopping:
+            self._check_abort()
+            if until_stop and self._stop.stopping:
                 self.stand()
                 return False
             if self._clock.now() > deadline:
@@ -281,11 +282,11 @@ class Exposures:
         deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
         self._stage.stop()
         while self._stage.moving():
-            self._heed_abort()
+            self._check_abort()
             if self._clock.now() > deadline:
                 raise InstrumentError(f"{self._stage.name}: it still moves after a stop. Use its emergency stop.")
             self._clock.sleep(POLL)
 
-    def _heed_abort(self) -> None:
+    def _check_abort(self) -> None:
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.")

@@ -1,10 +1,10 @@
-"""Ledger: which trigger exposed which frame, worked out from framestamps and times, so that no angle is ever guessed.
+"""Ledger: which trigger exposed which frame, derived from framestamps and times, so that no angle is guessed.
 
-A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost on the way. A
-trigger that comes too early is ignored without a word: framestamps stay contiguous and only the time shows a gap of two
-periods. While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame
-is the nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict
-& Bordner 1962). All functions are pure; a Ledger is a value.
+A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost in transfer. The
+camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
+While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame is the
+nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict &
+Bordner 1962). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 
-FREE = 0.35  # periods by which a frame may miss its place on the train; further off, no trigger made it
+FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
 PHASE_GAIN, PERIOD_GAIN = 0.3, 0.05
 PERIOD_RANGE = 0.2  # the true period may differ from the planned one by this fraction
 
-EXTRA = -1  # the trigger of a frame that no trigger made
+EXTRA = -1  # the trigger of a frame that no trigger exposed
 
 
 class LedgerError(DataError):
@@ -62,7 +62,7 @@ class Train:
 
 @dataclass(frozen=True)
 class Entry:
-    """What the ledger says about a frame: its trigger (EXTRA: none made it) and the angle in radians at that time."""
+    """The trigger of a frame (EXTRA: no trigger exposed it) and the angle in radians at its time."""
 
     trigger: int
     angle: float
@@ -70,19 +70,19 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """The account so far. Make it with `Ledger(train)`, carry it on with `assign`, end it with `settle`.
+    """Triggers and frames matched so far: begins as `Ledger(train)`, goes on by `assign`, ends by `settle`.
 
     Attributes:
         train: what was expected.
         last: the trigger of the last matched frame, -1 before the first.
         exposed: framestamp of the last frame, matched or not, -1 before the first.
         unmatched: exposures since the last matched frame, delivered or not.
-        phase, period: when the last matched trigger is believed to have been, and the period, both in s.
-        first: the first matched frame: framestamp, trigger, and periods since the believed time of trigger 0.
+        phase, period: estimated time of the last matched trigger, and estimated period, both in s.
+        first: the first matched frame: framestamp, trigger, and periods since the expected time of trigger 0.
         missing: triggers up to `last` without a frame.
         lost: of these, frames that were exposed but never delivered.
         ignored: of these, triggers that exposed nothing.
-        extra: framestamps of frames that no trigger made.
+        extra: framestamps of frames that no trigger exposed.
     """
 
     train: Train
@@ -99,7 +99,7 @@ class Ledger:
 
     @property
     def complete(self) -> bool:
-        """The last trigger has its frame: nothing more will come."""
+        """The last trigger has its frame: no more frames are expected."""
         return self.last == self.train.n - 1
 
 
@@ -110,8 +110,8 @@ class Account:
     Attributes:
         missing: triggers without a frame, ascending.
         lost: of these, exposed but not delivered (framestamp gap).
-        ignored: of these, not exposed (time gap). The remaining ones came after the last frame, and nobody can tell.
-        extra: framestamps of the frames that no trigger made.
+        ignored: of these, not exposed (time gap). Those after the last frame may be either.
+        extra: framestamps of the frames that no trigger exposed.
         shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
             missing at the other; 0 where nothing is missing there or the time of the first trigger was known.
     """
@@ -124,14 +124,14 @@ class Account:
 
 
 def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
-    """Enter a received frame: the ledger with it, and the trigger and angle that it has.
+    """Enter a received frame: the ledger after it, and the frame's trigger and angle.
 
     Frames come in the order in which they were exposed.
 
     Args:
         time: the frame's trigger time in s.
-        steady: the stage turned at constant speed. While it brakes, times say nothing, but the triggers come ever
-            later, so none is ignored and the framestamps alone count them.
+        steady: the stage turned at constant speed. While it brakes, times cannot be used; but the intervals between
+            triggers only grow, so none is ignored and the framestamps alone count them.
     """
     train = ledger.train
     new_exposures = framestamp - ledger.exposed
@@ -172,10 +172,10 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
 
 
 def settle(ledger: Ledger, cut_short: bool = False) -> Account:
-    """Close the account: every trigger after the last frame is missing.
+    """Close the ledger: every trigger after the last frame is missing.
 
     Args:
-        cut_short: triggers after the last frame were not waited for: they were not taken, rather than missed.
+        cut_short: the scan was stopped; triggers after the last frame were not waited for and do not count as missing.
     """
     at_the_end = range(0 if cut_short else ledger.last + 1, 0 if cut_short else ledger.train.n)
     return Account(
@@ -195,14 +195,14 @@ def _window(train: Train) -> float:
 def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int, float]:
     """Position in periods, trigger, and distance between the two, of the first frame.
 
-    Where the expected time leaves it open, framestamps decide: no trigger was ignored before the first frame, for a
-    camera that was armed and idle has no reason to ignore one.
+    Where the expected time is not precise enough, framestamps decide: no trigger was ignored before the first frame,
+    because a camera that is armed and idle ignores none.
     """
     if train.first is None:
         return float(framestamp), framestamp, 0.0
     position = (time - train.first) / train.period
     trigger = framestamp if abs(position - framestamp) <= _window(train) else round(position)
-    # The uncertainty of the expected time is not the frame's fault.
+    # Only the distance beyond the uncertainty of the expected time counts.
     return position, trigger, max(0.0, abs(position - trigger) - train.tolerance / train.period)
 
 
@@ -210,8 +210,8 @@ def _shift(ledger: Ledger, at_the_end: int | None) -> int:
     """The largest shift of all angles that the time of the first frame allows.
 
     Args:
-        at_the_end: triggers without a frame there; None where it is not known, and only as many count as the first
-            frame's time speaks for.
+        at_the_end: triggers without a frame there; None where it is not known: then as many as the first frame's time
+            suggests.
     """
     if ledger.last < 0:
         return 0

@@ -31,7 +31,7 @@ from drivers.protocols import CameraSettings, CameraTiming, StageLimits, Trigger
 
 @dataclass(frozen=True, eq=False)
 class DryRun:
-    """A scan as it would be: plan, timeline, what the devices can do, and the room on the disk in bytes."""
+    """A scan worked out without devices: plan, timeline, limits of stage and camera, free bytes on the disk."""
 
     plan: ScanPlan
     timeline: Timeline
@@ -67,7 +67,7 @@ class DryRun:
 
 
 def dry_run(settings: Config) -> DryRun:
-    """Work a configuration out.
+    """Work out a configuration without asking a device.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
@@ -89,7 +89,7 @@ def dry_run(settings: Config) -> DryRun:
 
 
 def refuse_violations(worked: Timeline) -> None:
-    """Raises ConfigError with every broken limit, where there is one."""
+    """Raise ConfigError with every broken limit, if there is any."""
     broken = worked.violations
     if len(broken) == 1:
         raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
@@ -98,7 +98,7 @@ def refuse_violations(worked: Timeline) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk that holds `folder`, or will hold it once it is made.
+    """Free space on the disk that holds `folder`, or will hold it once it exists.
 
     Raises:
         ConfigError: a file stands in the way, or there is no such disk.
@@ -118,10 +118,10 @@ class ReadyScan:
     """A scan that may start.
 
     Attributes:
-        settings: the camera's, as it accepted them for the views.
-        timing: what the camera says of them.
+        settings: of the camera for the views, as it accepted them.
+        timing: of the camera with these settings.
         monitor: before the first frame.
-        info: what the file will say of the scan.
+        info: written into the file before the first frame.
     """
 
     plan: ScanPlan
@@ -139,7 +139,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
         runs: where the file will be, for the free disk.
 
     Raises:
-        ConfigError: a plan that cannot be, every broken limit, or a simulated scene that cannot
+        ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot
             be exposed with the camera's settings.
         DeviceRefused: the camera does not take its settings.
     """
@@ -182,7 +182,7 @@ def _info(config: Config, instrument: Instrument, plan: ScanPlan, timeline: Time
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:
-        # The scene's cone, in the words of NXtomo: the pixel is that on the detector.
+        # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
         source_distance, sdd = instrument.simulated.cone
         pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     asked = {

@@ -26,12 +26,12 @@ from drivers.frame import Frame
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # at least and at most
 STALL = 60.0  # real s without a frame written, after which the disk is taken for dead
-SAY_EVERY = 0.1  # real s between `frame` events
+EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
 
 
 class Writer(Protocol):
-    """What takes the rows: NXtomoWriter."""
+    """Writes rows to a file: NXtomoWriter."""
 
     @property
     def path(self) -> Path: ...
@@ -43,7 +43,7 @@ class Writer(Protocol):
 class Recorder:
     """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
 
-    Nothing is ever dropped: where the disk is behind, `put` waits.
+    No frame is dropped: while the disk is behind, `put` waits.
 
     Args:
         stop_on_alarm: an alarm asks for a stop.
@@ -68,7 +68,7 @@ class Recorder:
         self._emit, self._stop, self._stop_on_alarm = emit, stop, stop_on_alarm
         self._progress = _Progress(timeline)
         self._active: set[tuple[str, Level]] = set()
-        self._blind = False
+        self._monitor_off = False
         self.n_frames = 0
         self.flagged: Counter[str] = Counter()
         self._failure: Exception | None = None
@@ -78,36 +78,36 @@ class Recorder:
         self._thread.start()
 
     def put(self, frame: Frame) -> None:
-        """Hand a frame over; waits while the disk is far behind.
+        """Queue a frame for writing; waits while the queue is full.
 
         Raises:
-            DataError: it could not be, or a frame before it could not be written.
+            DataError: the disk takes no frames, or a frame before could not be written.
         """
-        self._hand_over(frame)
-        self._heed_failure()
+        self._enqueue(frame)
+        self._raise_failure()
 
     def finish(self) -> None:
         """Wait until every frame that was put is written.
 
         Raises:
-            DataError: one could not be.
+            DataError: one could not be written.
         """
-        self._hand_over(None)
+        self._enqueue(None)
         written = -1
         while self._thread.is_alive() and written != self.n_frames:
             written = self.n_frames
             self._thread.join(STALL)
         if self._thread.is_alive():
             raise self._stalled()
-        self._heed_failure()
+        self._raise_failure()
 
     @property
     def hangs(self) -> bool:
-        """A frame is still being written: after `finish`, a disk that does not answer."""
+        """A frame is still being written; after `finish` this means that the disk does not answer."""
         return self._thread.is_alive()
 
-    def _hand_over(self, item: Frame | None) -> None:
-        """A frame, or None as the last."""
+    def _enqueue(self, item: Frame | None) -> None:
+        """Queue a frame, or None after the last one."""
         try:
             self._waiting.put(item, timeout=STALL)
         except Full:
@@ -116,7 +116,7 @@ class Recorder:
     def _stalled(self) -> DataError:
         return DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
 
-    def _heed_failure(self) -> None:
+    def _raise_failure(self) -> None:
         cause = self._failure
         if isinstance(cause, BeamlineError):
             raise cause
@@ -129,7 +129,7 @@ class Recorder:
     def _run(self) -> None:
         while (frame := self._waiting.get()) is not None:
             if self._failure is not None:
-                continue  # frames after a failure are only taken, so that nobody waits for room
+                continue  # frames after a failure are discarded, so that `put` does not wait for a place in the queue
             try:
                 self._record(frame)
             except Exception as error:
@@ -140,25 +140,25 @@ class Recorder:
         flags = self._look(frame, found)
         self._writer.append(frame, found, bitmask(flags))
         self.n_frames += 1
-        self._tell(flags)
+        self._report(flags)
         data = self._progress.update(frame, self.n_frames)
         if data is not None:
             self._emit("frame", {**data, "mean": found.mean})
 
     def _look(self, frame: Frame, found: FrameDigest) -> tuple[Flag, ...]:
-        """The monitor's flags. A defect of the monitor must not cost a frame: it is said, and the monitor is off."""
-        if self._blind:
+        """The monitor's flags. A check that raises costs no frame: it is a warning, and the monitor is switched off."""
+        if self._monitor_off:
             return ()
         try:
             self._monitor, flags = look(self._monitor, frame, found)
         except Exception as error:
-            self._blind = True
+            self._monitor_off = True
             self._emit("warning", {"message": f"the monitor failed at row {frame.index} and is off: {error!r}"})
             return ()
         return flags
 
-    def _tell(self, flags: tuple[Flag, ...]) -> None:
-        """A `flag` event where a check begins to flag (or gets worse), not for every frame that it goes on."""
+    def _report(self, flags: tuple[Flag, ...]) -> None:
+        """Count flags; emit a `flag` event where a check begins to flag or its level changes, not for every frame."""
         self.flagged.update(flag.check for flag in flags)
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
@@ -170,22 +170,23 @@ class Recorder:
 
 
 class _Progress:
-    """How far, how fast, how long still; None where it was said a moment ago."""
+    """Data of the `frame` event: frames written, rate, time left."""
 
     def __init__(self, timeline: Timeline) -> None:
         self._total, self._bytes = timeline.n_frames, timeline.frame_bytes
-        # Moves are spread over the frames: the figure may creep, but it always falls, also after a wait for a hand.
+        # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
         periods = np.concatenate([np.full(block.n, block.period) for block in timeline.blocks])
         self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
         self._times: deque[float] = deque(maxlen=RATE_FRAMES)
-        self._said = -SAY_EVERY
+        self._last_event = -EVENT_INTERVAL
 
     def update(self, frame: Frame, n: int) -> Mapping[str, Any] | None:
+        """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)
         now = time.monotonic()
-        if now - self._said < SAY_EVERY and n < self._total:
+        if now - self._last_event < EVENT_INTERVAL and n < self._total:
             return None
-        self._said = now
+        self._last_event = now
         span = self._times[-1] - self._times[0]
         rate = (len(self._times) - 1) / span if span > 0 else 0.0
         return {

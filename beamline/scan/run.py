@@ -1,4 +1,4 @@
-"""Run: one scan from configuration to file, in a folder of its own, told as events, and closed whatever happens."""
+"""Run: one scan from configuration to file, in its own folder, reported by events, and closed in any case."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
     "the last frames are being written"
 )
-"""What `stopping` says where making the instrument safe failed; the warnings or the error say what of it."""
+"""Message of the state `stopping` where a device failed while the instrument was made safe; warnings name it."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class RunResult:
         flags: frames that each of the monitor's checks flagged.
         seconds: real time of the whole run.
         bytes: size of the scan file.
-        recon: what the live reconstruction said at its end; None without one, or where it failed.
+        recon: data of the live reconstruction's `done` event; None without one, or where it failed.
     """
 
     path: Path
@@ -95,14 +95,14 @@ def run_scan(
     Args:
         runs: the folder in which the run gets its own; the configured one unless given.
         sinks: besides events.jsonl and user.log in the run's folder.
-        stop: to end it from another thread or a signal handler.
-        live: makes the command line of a live reconstruction; None: none.
+        stop: ends the scan from another thread or a signal handler.
+        live: gives the command line of a live reconstruction; None: there is none.
         instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
         ask: puts a request to the operator, where the shutter or the sample is moved by hand.
 
     Raises:
         ConfigError: the plan breaks a limit; nothing has moved and no folder was made.
-        DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: somebody asked for it.
+        DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
         DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
             the file; the event `scan_done` says how much, and `failed` why.
     """
@@ -110,9 +110,9 @@ def run_scan(
     stop = stop or StopRequest()
     runs = runs or Path(config.storage.folder)
     with ExitStack() as connected:
-        instrument = instrument or connected.enter_context(connect(config, ask=ask, heed=lambda: _heed(stop)))
+        instrument = instrument or connected.enter_context(connect(config, ask=ask, heed=lambda: _refuse_stop(stop)))
         ready = preflight(config, instrument, runs)
-        _heed(stop)
+        _refuse_stop(stop)
         folder = create_run_folder(runs, config.sample.name, SystemClock().now())
         with ExitStack() as stack:
             try:
@@ -128,8 +128,8 @@ def run_scan(
             return run.go(live, release=connected.close)
 
 
-def _heed(stop: StopRequest) -> None:
-    """Before the run has begun, a stop is as good as an abort."""
+def _refuse_stop(stop: StopRequest) -> None:
+    """Raise ScanAborted where a stop was requested: before anything moves, a stop is an abort."""
     if stop.stopping:
         raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
 
@@ -145,7 +145,7 @@ class _Run:
     began: float
 
     def go(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
-        """The whole run, and its last word."""
+        """The whole run, and its last event: `done` or `failed`."""
         try:
             self._enter(State.PREPARING)
             result = self._scan(live, release)
@@ -180,18 +180,18 @@ class _Run:
             error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
         self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
         disk = _failure_of(recorder.finish)
-        error = self._graver(error, disk)
+        error = self._worse(error, disk)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
         missing = acquisition.missing
-        # A write that does not return holds HDF5's lock: to close the file would be to wait for it.
+        # A write that does not return holds HDF5's lock: closing the file would wait for it.
         unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
-        error = self._graver(error, unfinished)
+        error = self._worse(error, unfinished)
         if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed
-            error = self._graver(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
+            error = self._worse(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
         for remark in writer.remarks:
             self.emit("warning", {"message": remark})
-        error = self._graver(error, _failure_of(release))
+        error = self._worse(error, _failure_of(release))
         result = RunResult(
             path=writer.path,
             n_frames=writer.committed,
@@ -222,8 +222,8 @@ class _Run:
         stopped = self.stop.stopping
         return lambda: unfinished or self.stop.aborting or (self.stop.stopping and not stopped)
 
-    def _graver(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
-        """Of two failures the one that the run ends with: a stop or lost frames give way to another; both are told."""
+    def _worse(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
+        """The error that the run ends with; a stop or lost frames yield to any other. The other becomes a warning."""
         if error is None or after is None or after is error:
             return error or after
         if isinstance(error, ScanStopped | LedgerError):
@@ -283,7 +283,7 @@ class _Run:
 
 
 def _failure_of(action: Callable[[], None]) -> BaseException | None:
-    """What the action raised; the run goes on to close what is open before it is raised again."""
+    """The exception that the action raised, None where it raised none; it is raised after everything is closed."""
     try:
         action()
     except BaseException as error:

@@ -1,4 +1,4 @@
-"""Run folder: each run has its own, with files of set names, and with logs that are begun and never gone on with."""
+"""Run folder: one folder for each run, with fixed file names; logs are created and never appended to later."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
 
 @contextmanager
 def new_log(path: Path) -> Iterator[TextIO]:
-    """A new text file. Its last words may be lost to a full disk, which must not replace why the run ended."""
+    """A new text file. An error when it is closed (full disk) is ignored: it must not replace the run's own error."""
     file = path.open("x", encoding="utf-8")
     try:
         yield file

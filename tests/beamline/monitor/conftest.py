@@ -22,7 +22,7 @@ DISCS = ((0.0, 0.0, 30.0, 0.02), (10.0, 5.0, 8.0, 0.05), (-12.0, 3.0, 6.0, 0.05)
 STEP = np.pi / 180
 
 
-class Bench:
+class FakeScan:
     """Makes frames one after the other, in file order; noise is seeded."""
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class Bench:
     def references(self) -> list[Frame]:
         return self.darks() + self.flats()
 
-    def watch(
+    def flags(
         self, frames: Iterable[Frame], period: float | None = PERIOD, checks: Sequence[Check] = CHECKS
     ) -> list[Flag]:
         """All flags of a fresh monitor that sees `frames`."""
@@ -89,5 +89,5 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def fake() -> FakeScan:
+    return FakeScan()

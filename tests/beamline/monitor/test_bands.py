@@ -20,47 +20,47 @@ def black(frame: Frame, first: int, n: int) -> Frame:
 
 
 @pytest.mark.parametrize(("n", "loss"), [(1, 0.25), (2, 0.5), (4, 1.0), (16, 1.0)])
-def test_black_rows_are_flagged_with_their_place(bench: Any, n: int, loss: float) -> None:
-    frames = bench.references() + bench.views(10)
+def test_black_rows_are_flagged_with_their_place(fake: Any, n: int, loss: float) -> None:
+    frames = fake.references() + fake.views(10)
     black(frames[18], 20, n)
-    flags = only(bench.watch(frames))
+    flags = only(fake.flags(frames))
     assert [(f.view, f.level) for f in flags] == [(18, Level.ALARM)]
     assert flags[0].score == pytest.approx(loss, abs=0.02)
     assert "from 5)" in flags[0].advice
 
 
-def test_a_band_in_a_flat(bench: Any) -> None:
-    frames = bench.darks() + bench.flats(8)
+def test_a_band_in_a_flat(fake: Any) -> None:
+    frames = fake.darks() + fake.flats(8)
     black(frames[11], 0, 4)
-    assert [f.view for f in only(bench.watch(frames))] == [11]
+    assert [f.view for f in only(fake.flags(frames))] == [11]
 
 
-def test_a_band_that_stays_is_flagged_until_it_is_old_news(bench: Any) -> None:
-    frames = bench.references() + bench.views(40)
+def test_a_band_that_stays_is_flagged_until_it_is_old_news(fake: Any) -> None:
+    frames = fake.references() + fake.views(40)
     for view in frames[20:]:
         black(view, 8, 4)
-    flags = only(bench.watch(frames))
+    flags = only(fake.flags(frames))
     assert [f.view for f in flags] == list(range(20, 40))
 
 
-def test_a_dimming_beam_is_no_band(bench: Any) -> None:
-    frames = bench.references() + bench.views(10) + bench.views(10, first=10, light=0.5)
-    assert only(bench.watch(frames)) == []
+def test_a_dimming_beam_is_no_band(fake: Any) -> None:
+    frames = fake.references() + fake.views(10) + fake.views(10, first=10, light=0.5)
+    assert only(fake.flags(frames)) == []
 
 
 @pytest.mark.parametrize("band", [False, True])
-def test_a_sample_with_an_upper_and_a_lower_edge_is_no_band(bench: Any, band: bool) -> None:
+def test_a_sample_with_an_upper_and_a_lower_edge_is_no_band(fake: Any, band: bool) -> None:
     """Half of the rows get a fifth of the light, always: the rows of a frame are compared with their own past."""
-    frames = bench.references() + bench.views(20)
+    frames = fake.references() + fake.views(20)
     for view in frames[10:]:
         view.counts[32:] = 200 + (view.counts[32:].clip(200) - 200) // 5
     if band:
         black(frames[25], 40, 4)
-    assert [f.view for f in only(bench.watch(frames))] == [25] * band
+    assert [f.view for f in only(fake.flags(frames))] == [25] * band
 
 
-def test_a_sample_seen_from_the_other_side_is_no_band(bench: Any) -> None:
-    frames = bench.references()
+def test_a_sample_seen_from_the_other_side_is_no_band(fake: Any) -> None:
+    frames = fake.references()
     for i in range(20):  # an angle plan that jumps
-        frames += bench.views(1, first=i * 137 % 180)
-    assert only(bench.watch(frames, period=None)) == []
+        frames += fake.views(1, first=i * 137 % 180)
+    assert only(fake.flags(frames, period=None)) == []

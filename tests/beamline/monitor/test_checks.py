@@ -59,9 +59,9 @@ def test_a_check_is_a_frozen_value_and_so_is_its_state(check: Check) -> None:
 
 
 @check_of_each_name
-def test_a_look_changes_neither_the_check_nor_the_state_it_was_given(bench: Any, check: Check) -> None:
+def test_a_look_changes_neither_the_check_nor_the_state_it_was_given(fake: Any, check: Check) -> None:
     state, context = check.start(), ScanContext(65535, 64 * 96, 0.1)
-    for frame in bench.flats(3) + bench.views(12) + bench.darks(2, light=1.0) + bench.views(12, light=0.5):
+    for frame in fake.flats(3) + fake.views(12) + fake.darks(2, light=1.0) + fake.views(12, light=0.5):
         found = digest(frame.counts, 65535, 4)
         first, again = check.look(state, frame, found, context), check.look(state, frame, found, context)
         assert first.flag == again.flag

@@ -21,43 +21,43 @@ def only(flags: list[Flag]) -> list[Flag]:
     return [f for f in flags if f.check == "mass"]
 
 
-def test_a_floater_is_flagged_from_its_third_view_with_its_mass(bench: Any) -> None:
+def test_a_floater_is_flagged_from_its_third_view_with_its_mass(fake: Any) -> None:
     floater = (5.0, -20.0, 5.0, 0.08)
     with_floater = (*SAMPLE, floater)
-    frames = bench.references() + bench.views(20) + bench.views(6, first=20, discs=with_floater)
-    flags = only(bench.watch(frames))
+    frames = fake.references() + fake.views(20) + fake.views(6, first=20, discs=with_floater)
+    flags = only(fake.flags(frames))
     assert [f.view for f in flags] == [32, 33, 34, 35]
     assert flags[0].level is Level.WARN
     assert flags[0].score == pytest.approx(total([floater]) / total(SAMPLE), rel=0.15)
     assert "entered" in flags[0].advice
 
 
-def test_a_sample_that_falls_off_its_holder(bench: Any) -> None:
-    frames = bench.references() + bench.views(20) + bench.views(4, first=20, discs=())
-    flags = only(bench.watch(frames))
+def test_a_sample_that_falls_off_its_holder(fake: Any) -> None:
+    frames = fake.references() + fake.views(20) + fake.views(4, first=20, discs=())
+    flags = only(fake.flags(frames))
     assert [f.view for f in flags] == [32, 33]
     assert flags[0].score == pytest.approx(-1, abs=0.05)
     assert "left" in flags[0].advice
 
 
-def test_two_views_are_not_enough(bench: Any) -> None:
-    frames = bench.references() + bench.views(20) + bench.views(2, first=20, discs=()) + bench.views(5, first=22)
-    assert only(bench.watch(frames)) == []
+def test_two_views_are_not_enough(fake: Any) -> None:
+    frames = fake.references() + fake.views(20) + fake.views(2, first=20, discs=()) + fake.views(5, first=22)
+    assert only(fake.flags(frames)) == []
 
 
-def test_a_beam_that_loses_three_percent_is_not_mass(bench: Any) -> None:
-    frames = bench.references() + bench.views(20) + bench.views(10, first=20, light=0.97)
-    assert only(bench.watch(frames)) == []
+def test_a_beam_that_loses_three_percent_is_not_mass(fake: Any) -> None:
+    frames = fake.references() + fake.views(20) + fake.views(10, first=20, light=0.97)
+    assert only(fake.flags(frames)) == []
 
 
-def test_a_truncated_sample_is_left_alone(bench: Any) -> None:
+def test_a_truncated_sample_is_left_alone(fake: Any) -> None:
     off_centre = ((40.0, 0.0, 30.0, 0.03),)
-    assert only(bench.watch(bench.references() + bench.views(180, discs=off_centre))) == []
+    assert only(fake.flags(fake.references() + fake.views(180, discs=off_centre))) == []
 
 
-def test_without_flats_there_is_nothing_to_compare(bench: Any) -> None:
-    assert only(bench.watch(bench.darks() + bench.views(20) + bench.views(5, first=20, discs=()))) == []
+def test_without_flats_there_is_nothing_to_compare(fake: Any) -> None:
+    assert only(fake.flags(fake.darks() + fake.views(20) + fake.views(5, first=20, discs=()))) == []
 
 
-def test_an_empty_field_has_no_mass_to_change(bench: Any) -> None:
-    assert only(bench.watch(bench.references() + bench.views(200, discs=()))) == []
+def test_an_empty_field_has_no_mass_to_change(fake: Any) -> None:
+    assert only(fake.flags(fake.references() + fake.views(200, discs=()))) == []

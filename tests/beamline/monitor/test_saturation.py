@@ -23,22 +23,22 @@ def only(flags: list[Flag]) -> list[Flag]:
 
 
 @pytest.mark.parametrize(("n", "level"), [(3, Level.WARN), (6, Level.WARN), (7, Level.ALARM), (3000, Level.ALARM)])
-def test_saturated_pixels_are_flagged(bench: Any, n: int, level: Level) -> None:
-    flags = only(bench.watch(bench.references() + burn(bench.views(1), n)))
+def test_saturated_pixels_are_flagged(fake: Any, n: int, level: Level) -> None:
+    flags = only(fake.flags(fake.references() + burn(fake.views(1), n)))
     assert len(flags) == 1
     assert flags[0].level is level
     assert flags[0].score == pytest.approx(n / PIXELS)
     assert "exposure" in flags[0].advice
 
 
-def test_a_pixel_or_two_are_a_cosmic_ray(bench: Any) -> None:
-    assert only(bench.watch(bench.references() + burn(bench.views(2), 2))) == []
+def test_a_pixel_or_two_are_a_cosmic_ray(fake: Any) -> None:
+    assert only(fake.flags(fake.references() + burn(fake.views(2), 2))) == []
 
 
-def test_pixels_that_are_hot_without_light_do_not_count(bench: Any) -> None:
-    frames = burn(bench.darks(), 100) + burn(bench.flats(), 100) + burn(bench.views(2), 100)
-    assert only(bench.watch(frames)) == []
+def test_pixels_that_are_hot_without_light_do_not_count(fake: Any) -> None:
+    frames = burn(fake.darks(), 100) + burn(fake.flats(), 100) + burn(fake.views(2), 100)
+    assert only(fake.flags(frames)) == []
 
 
-def test_saturated_flats_are_flagged(bench: Any) -> None:
-    assert len(only(bench.watch(bench.darks() + burn(bench.flats(2), 50)))) == 2
+def test_saturated_flats_are_flagged(fake: Any) -> None:
+    assert len(only(fake.flags(fake.darks() + burn(fake.flats(2), 50)))) == 2

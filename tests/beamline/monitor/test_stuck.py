@@ -14,22 +14,22 @@ def only(flags: list[Flag]) -> list[Flag]:
     return [f for f in flags if f.check == "stuck"]
 
 
-def test_a_repeated_buffer_is_flagged_each_time_and_counted(bench: Any) -> None:
-    frames = bench.references() + bench.views(6)
+def test_a_repeated_buffer_is_flagged_each_time_and_counted(fake: Any) -> None:
+    frames = fake.references() + fake.views(6)
     frames[13] = replace(frames[13], counts=frames[12].counts.copy())
     frames[14] = replace(frames[14], counts=frames[12].counts.copy())
-    flags = only(bench.watch(frames))
+    flags = only(fake.flags(frames))
     assert [(f.view, f.score, f.level) for f in flags] == [(13, 1, Level.ALARM), (14, 2, Level.ALARM)]
     assert "repeats a buffer" in flags[0].advice
 
 
-def test_one_changed_pixel_is_another_frame(bench: Any) -> None:
-    views = bench.views(2)
+def test_one_changed_pixel_is_another_frame(fake: Any) -> None:
+    views = fake.views(2)
     counts = views[0].counts.copy()
     counts[5, 5] += 1
-    assert only(bench.watch([views[0], replace(views[1], counts=counts)])) == []
+    assert only(fake.flags([views[0], replace(views[1], counts=counts)])) == []
 
 
-def test_darks_without_noise_are_all_equal_and_say_nothing(bench: Any) -> None:
-    darks = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in bench.darks(3)]
-    assert only(bench.watch(darks)) == []
+def test_darks_without_noise_are_all_equal_and_say_nothing(fake: Any) -> None:
+    darks = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
+    assert only(fake.flags(darks)) == []

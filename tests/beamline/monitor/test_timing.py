@@ -11,7 +11,7 @@ from beamline.monitor import watch as scan
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.digest import digest
 
-PERIOD = 0.1  # as the bench makes them
+PERIOD = 0.1  # of the fake scan
 
 
 def only(flags: list[Flag]) -> list[Flag]:
@@ -19,30 +19,30 @@ def only(flags: list[Flag]) -> list[Flag]:
 
 
 @pytest.mark.parametrize(("shift", "views"), [(0.2, []), (-0.2, []), (0.3, [4, 5]), (-0.3, [4, 5])])
-def test_a_frame_off_its_time(bench: Any, shift: float, views: list[int]) -> None:
-    frames = bench.views(8)
+def test_a_frame_off_its_time(fake: Any, shift: float, views: list[int]) -> None:
+    frames = fake.views(8)
     frames[4] = replace(frames[4], time=frames[4].time + shift * PERIOD)
-    flags = only(bench.watch(frames))
+    flags = only(fake.flags(frames))
     assert [f.view for f in flags] == views
     if flags:
         assert flags[0].score == pytest.approx(shift)
         assert flags[0].level is Level.WARN
 
 
-def test_a_missing_trigger_is_an_alarm_on_the_frame_after_it(bench: Any) -> None:
-    frames = bench.views(8)
+def test_a_missing_trigger_is_an_alarm_on_the_frame_after_it(fake: Any) -> None:
+    frames = fake.views(8)
     del frames[3:5]
-    flags = only(bench.watch(frames))
+    flags = only(fake.flags(frames))
     assert [(f.view, f.score, f.level) for f in flags] == [(5, 2, Level.ALARM)]
 
 
-def test_a_step_scan_has_no_rhythm(bench: Any) -> None:
-    frames = [replace(f, time=f.time + f.trigger**2) for f in bench.views(8)]
-    assert only(bench.watch(frames, period=None)) == []
+def test_a_step_scan_has_no_rhythm(fake: Any) -> None:
+    frames = [replace(f, time=f.time + f.trigger**2) for f in fake.views(8)]
+    assert only(fake.flags(frames, period=None)) == []
 
 
-def test_the_return_between_two_passes_is_no_finding(bench: Any) -> None:
-    frames = [replace(f, time=f.time + 30 * (f.trigger >= 4)) for f in bench.views(8)]
+def test_the_return_between_two_passes_is_no_finding(fake: Any) -> None:
+    frames = [replace(f, time=f.time + 30 * (f.trigger >= 4)) for f in fake.views(8)]
     flags = []
     for starts in (frozenset({0}), frozenset({0, 4})):
         state, found = scan.start(ScanContext(65535, 64 * 96, PERIOD, starts)), 0

@@ -16,33 +16,33 @@ from drivers.frame import Frame, FrameKind
 CONTEXT = ScanContext(saturation=65535, pixels=100)
 
 
-def test_a_clean_scan_raises_no_flag(bench: Any) -> None:
-    frames = bench.references() + bench.views(720) + bench.flats() + bench.darks()
-    assert bench.watch(frames) == []
+def test_a_clean_scan_raises_no_flag(fake: Any) -> None:
+    frames = fake.references() + fake.views(720) + fake.flats() + fake.darks()
+    assert fake.flags(frames) == []
 
 
-def test_a_clean_scan_in_jumping_order_raises_no_flag(bench: Any) -> None:
-    frames = bench.references()
+def test_a_clean_scan_in_jumping_order_raises_no_flag(fake: Any) -> None:
+    frames = fake.references()
     for i in range(300):
-        frames += [replace(frame, trigger=i) for frame in bench.views(1, first=i * 77 % 360)]
-    assert bench.watch(frames, period=None) == []
+        frames += [replace(frame, trigger=i) for frame in fake.views(1, first=i * 77 % 360)]
+    assert fake.flags(frames, period=None) == []
 
 
 @pytest.mark.parametrize("factor", [0.25, 4.0])
-def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(bench: Any, factor: float) -> None:
+def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(fake: Any, factor: float) -> None:
     def flats() -> list[Frame]:
-        return [replace(f, exposure=factor * f.exposure) for f in bench.flats(light=factor)]
+        return [replace(f, exposure=factor * f.exposure) for f in fake.flats(light=factor)]
 
-    clean = bench.darks() + flats() + bench.views(60) + flats() + bench.darks()
-    assert bench.watch(clean) == []
-    dimmed = bench.darks() + flats() + bench.views(20) + bench.views(2, first=20, light=0.9) + flats()
-    found = bench.watch(dimmed)
+    clean = fake.darks() + flats() + fake.views(60) + flats() + fake.darks()
+    assert fake.flags(clean) == []
+    dimmed = fake.darks() + flats() + fake.views(20) + fake.views(2, first=20, light=0.9) + flats()
+    found = fake.flags(dimmed)
     assert {flag.check for flag in found} == {"beam"}
     assert [flag.score for flag in found] == pytest.approx([0.1, 0.1], abs=0.01)
 
 
-def test_checks_compare_with_the_mean_of_the_latest_group_of_references(bench: Any) -> None:
-    groups = [bench.darks(3), bench.flats(4), bench.views(5), bench.flats(3, light=0.9), bench.darks(2)]
+def test_checks_compare_with_the_mean_of_the_latest_group_of_references(fake: Any) -> None:
+    groups = [fake.darks(3), fake.flats(4), fake.views(5), fake.flats(3, light=0.9), fake.darks(2)]
     state = scan.start(CONTEXT)
     for frames in groups:
         for frame in frames:
@@ -54,9 +54,9 @@ def test_checks_compare_with_the_mean_of_the_latest_group_of_references(bench: A
             np.testing.assert_allclose(found, mean, rtol=1e-5)
 
 
-def test_a_frame_may_have_several_flags(bench: Any) -> None:
-    frames = bench.references() + bench.views(12)
+def test_a_frame_may_have_several_flags(fake: Any) -> None:
+    frames = fake.references() + fake.views(12)
     frames[-1].counts[:] = 200
     frames[-1].counts[30:32] = 65535
-    checks = {flag.check for flag in bench.watch(frames)}
+    checks = {flag.check for flag in fake.flags(frames)}
     assert {"beam", "saturation"} <= checks

@@ -60,10 +60,10 @@ def test_readings_are_told_and_an_outage_is_told_once(monkeypatch: pytest.Monkey
     assert [data["value"] for event, data in told if event == "beam"] == [1.5, 2.5, 3.5]
     warnings = [data["message"] for event, data in told if event == "warning"]
     assert len(warnings) == 4
-    assert warnings[0] == f"{SILENT} The scan goes on; this is said once until it answers again."
-    assert "answers again, after 3 readings that failed" in warnings[1]
+    assert warnings[0] == f"{SILENT} The scan goes on without readings until it answers again."
+    assert "answers again after 3 failed readings." in warnings[1]
     assert "ZeroDivisionError: a defect" in warnings[2]
-    assert "after 1 reading that failed" in warnings[3]
+    assert "after 1 failed reading." in warnings[3]
 
 
 def test_no_monitor_is_no_thread() -> None:
