@@ -1,4 +1,4 @@
-"""`beamline bench`: what this machine does in which time, for comparing machines and versions."""
+"""`beamline bench`: measures times and qualities, to compare machines and versions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import json_events
+from beamline.cli.options import json_option
 from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
 from drivers.clock import SystemClock
@@ -26,17 +27,25 @@ def bench() -> None:
     """Measure this machine."""
 
 
-@bench.command()
+@bench.command(short_help="Measure kernels, a fit, and methods on a small sample.")
 @click.option(
-    "--gaussians", type=click.IntRange(min=1), default=N_GAUSSIANS, show_default=True, help="Of kernels and step."
+    "--gaussians",
+    type=click.IntRange(min=1),
+    default=N_GAUSSIANS,
+    show_default=True,
+    help="Number of Gaussians for kernels and fit.",
 )
-@click.option("--side", type=click.IntRange(min=16), default=SIDE, show_default=True, help="Pixels of a view's side.")
-@click.option("--volumes/--no-volumes", default=True, show_default=True, help="Reconstruct a small sample, too.")
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@click.option(
+    "--side", type=click.IntRange(min=16), default=SIDE, show_default=True, help="Rows and columns of a view, px."
+)
+@click.option(
+    "--volumes/--no-volumes", default=True, show_default=True, help="Also reconstruct a small sample with each method."
+)
+@json_option
 def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
-    """Kernels, a step of the fit, and the quality that a small simulated sample gets in a time.
+    """Measure the kernels, one step of the fit, and time and quality of each method on a small simulated sample.
 
-    Nothing is written. Run it on an idle machine; ratios within one run mean more than times.
+    Nothing is written. Run it on an idle machine; ratios within one run are more reliable than times.
     """
     clock = SystemClock()
     with json_events(as_json) as sinks:
@@ -49,7 +58,7 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
 
         found = machine()
         tell("bench_started", {"machine": found}, machine_line(found) + "\n")
-        click.echo("Compiling what is not in the cache yet.", err=True)
+        click.echo("Compiling kernels that are not in the cache.", err=True)
         warm_up()
         for timing in _timings(gaussians, side):
             tell("bench", {**asdict(timing), "ns_per_pair": timing.ns_per_pair}, _line(timing))

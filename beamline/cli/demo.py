@@ -10,10 +10,9 @@ import click
 
 from beamline.cli.demo_run import run_demo
 from beamline.cli.json_output import json_events
-from beamline.cli.narrate import results
-from beamline.cli.numbers import POSITIVE
+from beamline.cli.options import POSITIVE
 from beamline.cli.scan import stop_signals
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import Terminal, results
 from beamline.config.load import config_folder, load
 from beamline.core.events import Event
 from beamline.core.stop import StopRequest

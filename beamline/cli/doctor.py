@@ -1,4 +1,4 @@
-"""`beamline doctor`: is this computer fit for the instrument: camera, ports, disk and memory; nothing moves."""
+"""`beamline doctor`: checks this computer: camera, ports, disk and memory; nothing moves."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.options import set_option
 from beamline.config.load import load
 from beamline.core.events import Event
 from beamline.doctor.check import Check, Verdict
@@ -28,22 +28,28 @@ _STYLES = {
     Verdict.CANNOT_CHECK: "dim",
 }
 _WIDTH = 120
-"""Columns where stdout is no terminal."""
+"""Columns on a stdout that is no terminal."""
 
 
 @click.command()
 @click.argument("file", metavar="[CONFIG]", required=False, type=click.Path(path_type=Path))
-@click.option("--session", is_flag=True, help="Also ask the camera itself: seconds, and no other program may have it.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=OVERRIDE_HELP)
-@click.option("--json", "as_json", is_flag=True, help="One event a check on stdout, then the counts.")
+@click.option(
+    "--session",
+    is_flag=True,
+    help="Also open the camera; this takes seconds, and no other program may use the camera meanwhile.",
+)
+@set_option
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON event per check to stdout, then the counts.")
 def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Look at this computer: camera link, camera library, ports, disk and memory; nothing moves.
+    """Check this computer: camera link, camera library, ports, disk and memory. Nothing moves.
 
-    With CONFIG each is compared with what that scan needs. The disk is measured for a few seconds with a file of its
-    own that is gone afterwards. Exit code 1 where a check failed, 2 where CONFIG is wrong.
+    With CONFIG, each is compared with the needs of that scan. The speed of the disk is measured for a few seconds with
+    a temporary file.
+
+    Exit code: 0 no check failed, 1 a check failed, 2 wrong configuration.
     """
     if file is None and overrides:
-        raise click.UsageError("--set belongs to a CONFIG.")
+        raise click.UsageError("--set needs a CONFIG.")
     clock, checks = SystemClock(), list[Check]()
     with terminated_like_interrupted(), json_events(as_json) as sinks:
         config = None if file is None else load(file, overrides)

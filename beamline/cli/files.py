@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
-from beamline.cli.numbers import POSITIVE
+from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError

@@ -1,4 +1,4 @@
-"""What a command tells a program: one JSON event a line on stdout, the last of them `done` or `failed`."""
+"""JSON output of commands, one event per line on stdout, and the signals that end a command early."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from types import FrameType
 import click
 from click.exceptions import ClickException, Exit
 
-from beamline.core.errors import exit_code, in_words
+from beamline.core.errors import exit_code, user_message
 from beamline.core.events import Event, JsonLines, Sink
 from drivers.clock import SystemClock
 
 
 @contextmanager
 def json_events(wanted: bool) -> Iterator[list[Sink]]:
-    """The sinks for stdout, none where JSON is not wanted. What ends the block early becomes the event `failed`."""
+    """The sinks for JSON on stdout; none unless `wanted`. An error in the block becomes the event `failed`."""
     if not wanted:
         yield []
         return
@@ -36,38 +36,38 @@ def json_events(wanted: bool) -> Iterator[list[Sink]]:
         raise
     except (Exception, KeyboardInterrupt) as error:
         if last not in ("done", "failed"):
-            lines(Event("failed", SystemClock().now(), {"message": in_words(error), "exit_code": exit_code(error)}))
+            lines(Event("failed", SystemClock().now(), {"message": user_message(error), "exit_code": exit_code(error)}))
         raise
 
 
 class StopOnSignal:
-    """Ctrl-C, SIGTERM or SIGHUP during the work: the first asks for what there is so far, the second for nothing.
+    """A stop scope: the first Ctrl-C, SIGTERM or SIGHUP requests a stop with a partial result, the second interrupts.
 
     Args:
-        said: what the first one is answered with.
+        reply: printed on the first signal.
     """
 
-    def __init__(self, said: str = "Ending as soon as there is a volume; once more throws it away.") -> None:
-        self._asked, self._said = False, said
+    def __init__(self, reply: str = "Stopping as soon as there is a volume. Ctrl-C again discards it.") -> None:
+        self._requested, self._reply = False, reply
 
     @contextmanager
     def __call__(self) -> Iterator[Callable[[], bool]]:
         with ExitStack() as restore:
             for number in (signal.SIGINT, *_ending()):
-                restore.callback(signal.signal, number, signal.signal(number, self._ask))
-            yield lambda: self._asked
+                restore.callback(signal.signal, number, signal.signal(number, self._on_signal))
+            yield lambda: self._requested
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self._asked:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._requested:
             raise KeyboardInterrupt
-        self._asked = True
-        with suppress(OSError):  # a terminal that has hung up takes no words
-            click.echo(self._said, err=True)
+        self._requested = True
+        with suppress(OSError):  # the terminal was closed
+            click.echo(self._reply, err=True)
 
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM, and SIGHUP of a terminal that closes, end the command as Ctrl-C does: nothing half-written stays."""
+    """Within the context SIGTERM, and SIGHUP of a closed terminal, interrupt like Ctrl-C: no partial file stays."""
     with ExitStack() as restore:
         for number in _ending():
             restore.callback(signal.signal, number, signal.signal(number, signal.default_int_handler))
@@ -75,7 +75,7 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 
 def _ending() -> list[signal.Signals]:
-    """The signals that ask a process to end, as far as this system has them and `nohup` has not taken them away."""
+    """The signals that ask a process to end; SIGHUP only where the system has it and `nohup` does not ignore it."""
     if sys.platform == "win32" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         return [signal.SIGTERM]
     return [signal.SIGTERM, signal.SIGHUP]

@@ -1,4 +1,4 @@
-"""The command `beamline`: finds its commands by name, loads only the one asked for, and turns errors into exit codes.
+"""The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes.
 
 Exit codes: 0 done; 1 defect (with a traceback); 2 usage or configuration; 3 device; 4 stopped with reduced data;
 5 data or disk; 6 finished but a quality limit failed; 130 interrupted.
@@ -14,33 +14,33 @@ from typing import Any, NoReturn
 
 import click
 
-from beamline.core.errors import BeamlineError, exit_code, in_words
+from beamline.core.errors import BeamlineError, exit_code, user_message
 from beamline.core.version import version
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """Where a command lives. Its help line stands here so that `beamline --help` need not import it (and torch)."""
+    """The module of a command and its help line, which `beamline --help` prints without importing it (and torch)."""
 
     module: str
     help: str
 
 
 _COMMANDS = {
-    "demo": _Entry("demo", "Simulated scan with live reconstruction, ending in a volume and a report."),
-    "check": _Entry("check", "Validate a configuration; nothing moves."),
-    "doctor": _Entry("doctor", "Look at this computer: camera link, ports, disk, memory; nothing moves."),
-    "home": _Entry("home", "Search the stage's reference; the stage turns."),
-    "scan": _Entry("scan", "Run a scan (or, with --dry-run, say what it would do)."),
-    "simulate": _Entry("simulate", "Frames of a scene without an instrument: file, labels, truth, cost."),
-    "xafs": _Entry("xafs", "At which energy a material stands out most: absorption edge, white line, contrast."),
-    "recon": _Entry("recon", "Reconstruct a scan, finished or still growing."),
-    "tradeoff": _Entry("tradeoff", "What accuracy costs in time: many reconstructions of a scan, compared."),
-    "bench": _Entry("bench", "Measure this machine: kernels, fits, and the quality they give in a time."),
-    "info": _Entry("files", "Say what a scan file holds."),
-    "validate": _Entry("files", "Check a scan file against the rules that readers rely on."),
-    "ingest": _Entry("files", "Turn a multi-page TIFF into an HDF5 scan, page by page."),
-    "config": _Entry("config", "Make, show and describe configurations."),
+    "demo": _Entry("demo", "Run a simulated scan with live reconstruction; writes a volume and a report."),
+    "check": _Entry("check", "Validate a configuration. Nothing moves."),
+    "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves."),
+    "home": _Entry("home", "Search the stage's reference position. The stage turns."),
+    "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
+    "simulate": _Entry("simulate", "Simulate a scan of a scene, with labels and truth."),
+    "xafs": _Entry("xafs", "Find a material's absorption edge and the energy of its highest contrast."),
+    "recon": _Entry("recon", "Reconstruct a scan, finished or still running."),
+    "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
+    "bench": _Entry("bench", "Measure this machine: kernels, fits, and quality against time."),
+    "info": _Entry("files", "Describe a scan file."),
+    "validate": _Entry("files", "Check a scan file against the rules of its format."),
+    "ingest": _Entry("files", "Convert a multi-page TIFF into an HDF5 scan, page by page."),
+    "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema."),
 }
 
 
@@ -68,23 +68,23 @@ class LazyGroup(click.Group):
             code = exit_code(error)
             if code == BeamlineError.exit_code and not isinstance(error, BeamlineError):
                 raise  # a defect, or click's own
-            click.echo(f"beamline: {in_words(error)}", err=True)
+            click.echo(f"beamline: {user_message(error)}", err=True)
             ctx.exit(code)
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(version(), prog_name="beamline")
 def main() -> None:
-    """X-ray micro-tomography from trigger to volume: acquire, watch, reconstruct.
+    """X-ray micro-tomography from trigger to volume: acquire, monitor, reconstruct.
 
-    Results go to stdout, narration and progress to stderr.
+    Results go to stdout, messages and progress to stderr.
     """
 
 
 def run() -> NoReturn:
-    """The command as a process: what ends it is its exit code, whatever state a full disk left HDF5 in.
+    """Run the command as a process that always ends with its own exit code.
 
-    HDF5 crashes at the end of a process that holds a file which could not be closed; that code would be -11, not 5.
+    HDF5 crashes at exit where a file could not be closed, as on a full disk: the code would be -11 instead of 5.
     """
     try:
         main(prog_name="beamline")

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import click
 from click.core import ParameterSource
 
-from beamline.cli.numbers import POSITIVE
+from beamline.cli.options import POSITIVE
 from recon.assess.time_model import PRESETS, parse_budget
 from recon.base.method import Method
 from recon.methods import build, by_name, has_setting, taking, with_trait

@@ -14,10 +14,9 @@ import click
 
 from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
 from beamline.cli.method_options import SETTINGS, method_options, method_with, refuse_contradictions
-from beamline.cli.narrate import results
-from beamline.cli.numbers import NOT_NEGATIVE, SEED
+from beamline.cli.options import NOT_NEGATIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.reconstruct.checkpoints import Keeper

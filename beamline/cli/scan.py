@@ -1,4 +1,4 @@
-"""`beamline scan`: run the scan that a configuration describes, or say what it would do."""
+"""`beamline scan`: runs the scan of a configuration, or prints its plan."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from types import FrameType
 
 import click
 
-from beamline.cli.config import OVERRIDE_HELP
 from beamline.cli.json_output import json_events
+from beamline.cli.options import config_argument, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.config.load import Config, load
 from beamline.core.events import Event, Sink
@@ -27,20 +27,27 @@ from recon.methods import streams
 
 
 @click.command()
-@click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
-@click.option("--dry-run", "dry", is_flag=True, help="Print timeline, limits and free disk; no device is touched.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=OVERRIDE_HELP)
-@click.option("--no-live", is_flag=True, help="No live reconstruction.")
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
-@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), help="Where runs get their folders.")
+@config_argument
+@click.option(
+    "--dry-run", "dry", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
+)
+@set_option
+@click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
+@json_option
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the folders of runs. Default: storage.folder of CONFIG.",
+)
 def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_json: bool, output: Path | None) -> None:
     """Run the scan in CONFIG.
 
-    Each run has its own folder (UTC time and sample). The first Ctrl-C stops cleanly, the second aborts; SIGTERM
-    stops. All of them leave a readable file.
+    Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, or SIGTERM, stops the scan
+    cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
-    Exit code: 0 done, 2 configuration or a violated limit, 3 device, 4 stopped, 5 frames missing or disk, 130
-    interrupted before anything was acquired, or aborted.
+    Exit code: 0 done, 2 wrong configuration or violated limit, 3 device failed, 4 stopped, 5 frames missing or disk
+    error, 130 aborted, or interrupted before the first frame.
     """
     with json_events(as_json) as json_sinks:
         config = load(file, overrides)
@@ -72,7 +79,8 @@ def _live(config: Config, no_live: bool) -> LiveCommand | None:
         return None
     if not streams(config.recon.method):
         click.echo(
-            f"No live volume: {config.recon.method} needs the whole scan; use beamline recon afterwards.", err=True
+            f"No live reconstruction: {config.recon.method} needs the complete scan. Run `beamline recon` after it.",
+            err=True,
         )
         return None
     return follow_command(config)
@@ -80,7 +88,7 @@ def _live(config: Config, no_live: bool) -> LiveCommand | None:
 
 @contextmanager
 def stop_signals(stop: StopRequest) -> Iterator[None]:
-    """Ctrl-C: first stop, then abort. SIGTERM: stop."""
+    """Within the context the first Ctrl-C requests a stop, the second an abort; SIGTERM requests a stop."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if stop.stopping:
@@ -88,10 +96,10 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
             click.echo("Aborting.", err=True)
         else:
             stop.stop("Ctrl-C was pressed")
-            click.echo("Stopping cleanly; Ctrl-C again aborts.", err=True)
+            click.echo("Stopping cleanly. Press Ctrl-C again to abort.", err=True)
 
     def terminate(number: int, frame: FrameType | None) -> None:
-        stop.stop("the process was asked to end (SIGTERM)")
+        stop.stop("the process received SIGTERM")
 
     with ExitStack() as restore:
         for number, handler in ((signal.SIGINT, interrupt), (signal.SIGTERM, terminate)):

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from beamline.cli.numbers import POSITIVE
+from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import SourceOptions

@@ -1,4 +1,4 @@
-"""Terminal: events for the operator: a bar where a terminal is, plain lines where there is none."""
+"""Output for people: events as a progress bar or plain lines on stderr, the result of a reconstruction as text."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from beamline.core.events import Event
 from beamline.core.narration import sentence
+from beamline.report.metrics import METRICS, formatted
 from drivers.manual import Ask
 
 PLAIN_EVERY = 5.0
-"""Real s between progress lines where there is no terminal."""
+"""Real s between progress lines on a stream that is no terminal."""
 
 
 class Terminal:
-    """A sink; use it as a context manager, so that the bar is gone before anything else is printed.
+    """A sink that prints events. Leaving it as a context manager removes the progress bar.
 
     Args:
-        stream: where it goes (stderr: results belong to stdout). A terminal gets a bar, anything else plain lines.
+        stream: to print to (stderr: results belong to stdout). A terminal gets a bar, anything else plain lines.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -40,7 +41,7 @@ class Terminal:
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._said: dict[str, tuple[float, int]] = {}  # real s, and how far it was
+        self._printed: dict[str, tuple[float, int]] = {}  # real s and frame or step of the last line
         self._last_text = ""
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
@@ -51,11 +52,11 @@ class Terminal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with _hung_up_is_no_failure():
+        with _closed_terminal_ignored():
             self._bar.stop()
 
     def ask(self, request: str, put: Ask) -> None:
-        """Put a request to the operator, with the bar out of the way."""
+        """Show a request to the operator without the progress bar, and wait until `put` returns."""
         with self._lock:
             self._bar.stop()
             self._asking = True
@@ -65,7 +66,7 @@ class Terminal:
             self._asking = False
 
     def __call__(self, event: Event) -> None:
-        with self._lock, _hung_up_is_no_failure():
+        with self._lock, _closed_terminal_ignored():
             self._take(event)
 
     def _take(self, event: Event) -> None:
@@ -77,9 +78,9 @@ class Terminal:
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))
         elif event.event == "progress":
             self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
-        elif event.event not in ("failed", "done"):  # the command has the last word
+        elif event.event not in ("failed", "done"):  # the command prints these itself
             text = sentence(event)
-            if text and text != self._last_text:  # a snapshot of the same views takes the place of the one before
+            if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                 self._last_text = text
                 self._console.print(text)
 
@@ -93,17 +94,17 @@ class Terminal:
             self._bar.update(self._tasks[what], completed=done, total=total or None, note=note)
             return
         now = time.monotonic()
-        last, at = self._said.get(what, (-PLAIN_EVERY, -1))
+        last, at = self._printed.get(what, (-PLAIN_EVERY, -1))
         if done == at == total:
             return
         if now - last >= PLAIN_EVERY or done == total:
-            self._said[what] = now, done
+            self._printed[what] = now, done
             self._console.print(f"{what}: {note}")
 
 
 @contextmanager
-def _hung_up_is_no_failure() -> Iterator[None]:
-    """A terminal that has closed takes no words; the work goes on without it."""
+def _closed_terminal_ignored() -> Iterator[None]:
+    """Errors from a terminal that was closed are ignored, so that the work goes on."""
     try:
         yield
     except OSError as error:
@@ -118,12 +119,12 @@ def rates(data: Mapping[str, Any]) -> str:
 
 
 def copied(data: Mapping[str, Any]) -> str:
-    """n/N, frames/s and the time left, of a `progress` event of frames that are copied, or taken at one energy each."""
+    """n/N, frames/s and the time left, of a `progress` event of a copy or an energy scan."""
     return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
 
 
 def trials(data: Mapping[str, Any]) -> str:
-    """n/N, trials/min, the time left where it is known, and which one runs, of a trade-off's `progress` event."""
+    """n/N, trials/min, the time left if it is known, and the running trial, of a `progress` event of a trade-off."""
     parts = [f"{data['n']}/{data['of']}"]
     if data["eta_s"] is not None:
         parts += [f"{data['per_min']:.1f} trials/min", f"{_clock_time(data['eta_s'])} left"]
@@ -131,8 +132,7 @@ def trials(data: Mapping[str, Any]) -> str:
 
 
 def fit(data: Mapping[str, Any]) -> str:
-    """n/N, rate, what there is, residuals and, where the end is known, the time left, of a `progress` event of a fit
-    (or of iterations, which have no Gaussians)."""
+    """n/N, rate, views, Gaussians (iterations have none), residuals and time left, of a `progress` event of a fit."""
     step, steps = data["step"], data["steps"]
     word = "steps" if data["n_gaussians"] else "iterations"
     parts = [f"{step}/{steps} {word}"] if steps else []
@@ -147,6 +147,31 @@ def fit(data: Mapping[str, Any]) -> str:
     if data.get("eta_s") is not None:
         parts.append(f"{_clock_time(data['eta_s'])} left")
     return ", ".join(parts)
+
+
+def results(data: Mapping[str, Any]) -> str:
+    """The result of a reconstruction, from its `done` event: files, grid, then a table of metrics by method."""
+    lines = [f"{'output':<10}{data['output']}"]
+    if data.get("report"):
+        lines.append(f"{'report':<10}{data['report']}")
+    lines.append(f"{'volume':<10}{' x '.join(str(n) for n in data['shape'])} in {data['units']}")
+    lines.append(f"{'axis_col':<10}{data['axis_col']:.2f}")
+    for name, key in (("chosen", "chosen"), ("next dB", "next_db_said")):
+        if key in data:
+            lines.append(f"{name:<10}{data[key]}")
+    columns = {str(data["method"]): data}
+    if "fbp" in data:
+        columns["fbp"] = data["fbp"]
+    lines.append("")
+    lines.append(f"{'':<30}" + "".join(f"{name:>14}" for name in columns))
+    for name, metric in METRICS.items():
+        if any(name in values for values in columns.values()):
+            cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
+            label = metric.label
+            if name == "seconds" and "resumed_from" in data:
+                label += ", since resumed"
+            lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
+    return "\n".join(lines)
 
 
 def _clock_time(seconds: float) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
-from beamline.cli.numbers import POSITIVE, SEED
+from beamline.cli.options import POSITIVE, SEED
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.cli.json_output import json_events
-from beamline.cli.numbers import POSITIVE, SEED, FiniteRange
+from beamline.cli.options import POSITIVE, SEED, FiniteRange
 from beamline.cli.scan import stop_signals
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal

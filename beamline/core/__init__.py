@@ -1,1 +1,1 @@
-"""What everything else stands on: errors, events, stop requests, text, memory, files written whole or not at all."""
+"""The base of all folders: errors, events, stop requests, child processes, memory, text, atomic files."""

@@ -1,4 +1,4 @@
-"""Events: the one vocabulary of what happens in a run; terminal, events.jsonl and report are its sinks."""
+"""Events: everything that happens in a run, in one vocabulary; terminal, events.jsonl and log are sinks of them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from drivers.clock import Clock
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
+    """One event.
 
     Attributes:
-        event: what, one word of the vocabulary below.
+        event: its kind, one word of the vocabulary below.
         time: s since the Unix epoch.
-        data: numbers and strings that belong to it.
+        data: its values, by name.
 
     Vocabulary: run_started, state, block_started, frame (throttled), block_done, beam, flag, warning, snapshot,
     progress, scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, explain, check, done,
     failed.
-    What a live reconstruction says carries source="recon".
+    Events of a live reconstruction have source="recon".
     """
 
     event: str
@@ -60,7 +60,7 @@ def _plain(value: Any) -> Any:
 
 
 class JsonLines:
-    """A sink that writes one JSON line per event and flushes it, so that a crash loses nothing said before."""
+    """A sink that writes one JSON line per event and flushes it, so that a crash loses no earlier event."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -71,7 +71,7 @@ class JsonLines:
 
 
 def fan_out(*sinks: Sink) -> Sink:
-    """One sink that feeds all of `sinks`, in order."""
+    """A sink that passes each event to all of `sinks`, in order."""
 
     def send(event: Event) -> None:
         for sink in sinks:
@@ -81,10 +81,11 @@ def fan_out(*sinks: Sink) -> Sink:
 
 
 Emit = Callable[[str, Mapping[str, Any]], None]
+"""(kind of event, data): the event happened now."""
 
 
 class Warnings:
-    """Collects warnings for the report while it sends them on as events."""
+    """Sends each warning on as an event, once, and keeps it in `messages` for the report."""
 
     def __init__(self, sink: Sink, clock: Clock) -> None:
         self._sink, self._clock = sink, clock
@@ -97,9 +98,9 @@ class Warnings:
 
 
 class Announcer:
-    """Use as a context manager: leaving it waits until the sinks have had everything.
+    """Passes events to sinks in a thread of its own. Leaving the context waits until all events have been passed on.
 
-    A sink that raises (a closed pipe, a full disk) gets nothing more; the others are told.
+    A sink that raises (a closed pipe, a full disk) gets no further events; the others get a warning.
     """
 
     def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:
@@ -118,7 +119,7 @@ class Announcer:
         self._thread.join()
 
     def __call__(self, event: str, data: Mapping[str, Any]) -> None:
-        """Say that `event` happened now. Returns at once."""
+        """Queue the event with the current time; returns at once."""
         self._queue.put(Event(event, self._clock.now(), data))
 
     def _deliver(self) -> None:
@@ -127,11 +128,11 @@ class Announcer:
 
     def _send(self, event: Event) -> None:
         for sink in list(self._sinks):
-            if sink not in self._sinks:  # given up while the others were told of another
+            if sink not in self._sinks:  # removed while an earlier event was passed on
                 continue
             try:
                 sink(event)
             except Exception as error:
                 self._sinks.remove(sink)
-                message = f"an output of events was given up: {error}"
+                message = f"An output of events failed and gets no further events: {error}"
                 self._send(Event("warning", event.time, {"message": message}))

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and never over another."""
+"""Atomic files: written completely or not at all, and never over an existing one unless asked."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def refuse_existing(path: Path) -> None:
         raise DataError(f"{path} exists and results are never overwritten. Name another output, or move it away.")
     if not path.parent.is_dir():
         raise DataError(
-            f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Make it first."
+            f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Create it first."
         )
 
 
 @contextmanager
 def named_on_failure(path: Path) -> Iterator[None]:
-    """What the disk refuses while the block writes `path` is told with its name, which a full disk leaves out.
+    """An OSError while the block writes `path` becomes a DataError with the path, which the system leaves out.
 
     Raises:
         DataError: instead of OSError.
@@ -35,14 +35,14 @@ def named_on_failure(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A temporary sibling to write to; it becomes `path` when the block ends well and vanishes when it does not.
+    """A temporary file beside `path` to write to. It becomes `path` at the end of the block; an error removes it.
 
     Args:
-        path: the file to make. Without `replace` it must not exist.
-        replace: put it in place of an older one, in one step; a reader sees either the old or the new file, whole.
+        path: the file to write. Without `replace` it must not exist.
+        replace: an existing file is replaced in one step; a reader sees either the old or the new file.
 
     Raises:
-        DataError: `path` is in the way, or the system does not let it be replaced.
+        DataError: `path` exists, or the system does not allow to replace it.
     """
     if not replace:
         refuse_existing(path)

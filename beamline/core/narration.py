@@ -1,4 +1,4 @@
-"""Narration: an event as a sentence for people, or nothing where people need not be told."""
+"""Narration: events as sentences for people."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beamline.core.text import size, spans
 
 
 def sentence(event: Event) -> str | None:
-    """What happened, in words; None for the events that only move a progress display."""
+    """The event as a sentence; None for events that only update a progress display."""
     data = event.data
     match event.event:
         case "run_started":
@@ -36,7 +36,7 @@ def sentence(event: Event) -> str | None:
         case "trial":
             return _trial(data)
         case "snapshot":
-            return f"Volume so far, from {data['n_views']} views: {data['path']}"
+            return f"Volume from {data['n_views']} views so far: {data['path']}"
         case "scan_done":
             return (
                 f"Scan {data['status']}: {data['n_frames']} frames, {size(data['bytes'])}, {data['seconds']:.1f} s: "
@@ -52,7 +52,7 @@ def sentence(event: Event) -> str | None:
 
 
 class UserLog:
-    """A sink that writes plain sentences with their UTC time."""
+    """A sink that writes each event's sentence with its UTC time."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -39,15 +39,16 @@ class StopLatch:
 
 
 class ScanAborted(ScanStopped):
-    """Ended at once, or before anything was acquired; what was acquired is in the file."""
+    """Aborted, or interrupted before the first frame; the frames acquired so far are in the file."""
 
     exit_code = INTERRUPTED
 
 
 class StopRequest:
-    """Two wishes that cannot be taken back: stop (finish cleanly with what there is) and abort (end at once).
+    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once); it stays requested.
 
-    Plain flags, each set by one assignment: a signal handler may interrupt another one in here, and a lock would hang.
+    Can be set from any thread and from signal handlers: each flag is set by one assignment, without a lock, because a
+    handler may interrupt another one here.
     """
 
     def __init__(self) -> None:
@@ -55,19 +56,19 @@ class StopRequest:
         self._reason = ""
 
     def stop(self, reason: str = "the operator asked for it") -> None:
-        """End cleanly: frames on their way are taken, references still owed are taken, the stage goes back."""
+        """End cleanly: pending frames and missing references are still acquired, the stage returns."""
         self._reason = self._reason or reason
         self._stop = True
 
     def abort(self, reason: str = "the operator aborted it") -> None:
-        """End at once: the stage stands, the shutter closes, nothing else is taken."""
+        """End at once: the stage stops, the shutter closes, no further frame is acquired."""
         self._reason = reason
         self._abort = True
         self._stop = True
 
     @property
     def stopping(self) -> bool:
-        """Stop or abort was asked for."""
+        """A stop or an abort was requested."""
         return self._stop
 
     @property

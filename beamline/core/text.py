@@ -1,4 +1,4 @@
-"""Quantities as text for people."""
+"""Text for people: angles, sizes, index ranges."""
 
 from __future__ import annotations
 

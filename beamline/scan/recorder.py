@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from beamline.core.errors import BeamlineError, DataError, in_words
+from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import Emit
 from beamline.core.stop import StopRequest
 from beamline.monitor.check import Flag, Level
@@ -121,7 +121,9 @@ class Recorder:
         if isinstance(cause, BeamlineError):
             raise cause
         if cause is not None:
-            raise DataError(f"A frame could not be written: {in_words(cause).rstrip('.')}. {self._safe()}") from cause
+            raise DataError(
+                f"A frame could not be written: {user_message(cause).rstrip('.')}. {self._safe()}"
+            ) from cause
 
     def _safe(self) -> str:
         return f"The first {self._writer.committed} frames are safe in {self._writer.path}."

@@ -13,7 +13,7 @@ from typing import Any
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, resolved_yaml
-from beamline.core.errors import DataError, ScanStopped, exit_code, in_words
+from beamline.core.errors import DataError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.narration import UserLog
 from beamline.core.stop import ScanAborted, StopRequest
@@ -151,7 +151,7 @@ class _Run:
             result = self._scan(live, release)
         except BaseException as error:
             self._enter(State.FAILED)
-            self.emit("failed", {"message": in_words(error), "exit_code": exit_code(error), "folder": self.folder})
+            self.emit("failed", {"message": user_message(error), "exit_code": exit_code(error), "folder": self.folder})
             raise
         self._enter(State.DONE)
         self.emit("done", {**asdict(result), "folder": self.folder})

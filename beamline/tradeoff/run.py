@@ -76,7 +76,7 @@ def run_tradeoff(
     if folder.exists():
         raise DataError(f"{folder} exists and results are never overwritten. Name another folder, or move it away.")
     if not folder.parent.is_dir():
-        raise DataError(f"The folder {folder.parent} does not exist. Make it first.")
+        raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:

@@ -26,7 +26,7 @@ def test_a_good_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.chdir(tmp_path)
     result = run(DEMO)
     assert (result.exit_code, result.stderr) == (0, "")
-    for part in ("20-199", "1° = 1000 counts of 0.001°", "10°/s", "taxi", "blur", "skew", "0:00:2", "free", "is good"):
+    for part in ("20-199", "1° = 1000 counts of 0.001°", "10°/s", "taxi", "blur", "skew", "0:00:2", "free", "is valid"):
         assert part in result.stdout
     assert list(tmp_path.iterdir()) == []  # no run folder, nothing
 
@@ -47,7 +47,7 @@ def test_violations() -> None:
     broken = ("--set", "scan.period_s=0.02", "--set", "scan.angles.start_deg=190")
     result = run(DEMO, *broken)
     assert result.exit_code == 2
-    assert "is good" not in result.stdout
+    assert "is valid" not in result.stdout
     assert "VIOLATION period_s 0.02 is below the camera's least" in result.stdout
     assert "limits are violated, nothing was started" in result.stderr
     result = run(DEMO, "--json", *broken)

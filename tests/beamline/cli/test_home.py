@@ -25,13 +25,13 @@ def run(*arguments: str, answer: str = "") -> Result:
 def test_a_stage_finds_its_reference(kind: str) -> None:
     result = run("--yes", "--set", f"devices.stage={{kind: {kind}, port: 'sim://{kind}', {FIGURES}}}")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == "The stage has its reference and stands at 0.0000 deg.\n"
+    assert result.stdout == "The stage has found its reference and is at 0.0000 deg.\n"
 
 
 def test_a_home_switch_gets_its_angle() -> None:
     result = run("--yes", "--set", "devices.stage.home_deg=12.5")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert "stands at 12.5000 deg" in result.stdout
+    assert "is at 12.5000 deg" in result.stdout
 
 
 def test_a_stage_without_a_reference_refuses() -> None:
@@ -48,7 +48,7 @@ def test_nothing_turns_before_somebody_says_so(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(PM16CStage, "start_home", moved)
     result = run(answer=answer)
     assert result.exit_code == 130
-    assert "Is the way free?" in result.stderr
+    assert "May it turn?" in result.stderr
     assert "was not confirmed. Nothing has moved" in result.stderr
 
 

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 from beamline.cli import main as module
 from beamline.core import errors
-from beamline.core.errors import in_words
+from beamline.core.errors import user_message
 from drivers.errors import DeviceError, DeviceTimeout
 
 
@@ -60,7 +60,7 @@ def test_each_failure_has_its_code_and_one_sentence(
     assert result.stdout == ""
     assert result.stderr.strip()
     if str(error) and not isinstance(error, click.ClickException):
-        assert in_words(error) in result.stderr
+        assert user_message(error) in result.stderr
         assert "Errno" not in result.stderr
 
 

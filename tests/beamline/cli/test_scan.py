@@ -188,7 +188,7 @@ def test_130_an_abort(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     on(monkeypatch, instrument)
     result = scan("-o", str(tmp_path))
     assert result.exit_code == 130
-    assert "Stopping cleanly; Ctrl-C again aborts." in result.stderr
+    assert "Stopping cleanly. Press Ctrl-C again to abort." in result.stderr
     assert "Aborting." in result.stderr
     assert "abort stage" in instrument.log
     assert rows(tmp_path) == 9
@@ -247,7 +247,7 @@ def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monk
     assert runner.invoke(main, ["scan", SIMULATED, "--no-live"]).exit_code == 130
     assert runner.invoke(main, ["scan", SIMULATED, "--set", "recon.live=false"]).exit_code == 130
     fbp = runner.invoke(main, ["scan", SIMULATED, "--set", "recon.method=fbp"])
-    assert "needs the whole scan" in fbp.stderr
+    assert "needs the complete scan" in fbp.stderr
     assert asked[1:] == [None, None, None]
     command = asked[0]
     assert command[1:5] == ["-m", "beamline.cli.main", "recon", "scan.h5"]

@@ -237,7 +237,7 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
         (("scene.yaml", "--out", "there.h5", "--truth", "t.h5"), 5, "there.h5 exists"),
         (("scene.yaml", "--out", "new.png"), 2, "new.png would be both the scan and the picture"),
         (("scene.yaml", "--out", "new.h5", "--truth", "./new.h5"), 2, "new.h5 would be both the scan and the truth"),
-        (("scene.yaml", "--out", "nowhere/new.h5"), 5, "new.h5 cannot be written there. Make it first"),
+        (("scene.yaml", "--out", "nowhere/new.h5"), 5, "new.h5 cannot be written there. Create it first"),
         (("scene.yaml", "--explain", "--truth-bin", "2"), 2, "--truth-bin is of --truth's voxels"),
         (("scene.yaml", "--out", "new.h5", "--seed", str(2**64)), 2, "--seed"),
         (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),

@@ -164,7 +164,7 @@ EVENTS = [
         {"method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
         "r2 again, from the start: 40 views, rotation axis at column 82.50",
     ),
-    ("snapshot", {"n_views": 40, "path": "v.h5"}, "Volume so far, from 40 views: v.h5"),
+    ("snapshot", {"n_views": 40, "path": "v.h5"}, "Volume from 40 views so far: v.h5"),
     (
         "scan_done",
         {"status": "complete", "n_frames": 3, "bytes": 2e3, "seconds": 1, "path": "s.h5"},
