@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import yaml
 
@@ -16,12 +17,14 @@ from beamline.core.text import size
 from beamline.storage.volume_file import read_volume
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
-from simulators.samples.voxels.stored import ReadVolume, Stored
 from simulators.scenes.explain import Explained, explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
 from simulators.scenes.settings import MOST_FRAMES
 from simulators.scenes.shots import Scan
+
+if TYPE_CHECKING:
+    from simulators.samples.voxels.volume import ReadVolume
 
 __all__ = [
     "MOST_FRAMES",
@@ -122,6 +125,8 @@ def cost_table(found: Explained) -> str:
 
 def volumes_beside(folder: Path) -> ReadVolume:
     """A reader of the volumes that a scene in `folder` names, by full or relative paths. It raises DataError."""
+
+    from simulators.samples.voxels.volume import Stored
 
     def read_beside(file: str, dataset: str | None) -> Stored:
         return Stored(*read_volume(folder / file, dataset))  # a full path stays itself

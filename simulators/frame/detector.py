@@ -1,4 +1,4 @@
-"""Detector: where a frame's rays run, for a parallel beam or a cone."""
+"""Detector: the rays of a frame in a parallel beam or a cone."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Detector:
-    """Pixel (j, i) looks along the ray through u = (i - axis_col) * pitch, v = (j - axis_row) * pitch.
+    """Pixel (j, i) has the ray through u = (i - axis_col) * pitch, v = (j - axis_row) * pitch.
 
     Attributes:
         shape: (rows, cols).
-        pitch: mm at the sample: on the plane of the rotation axis, whatever the magnification.
+        pitch: mm at the sample: in the plane of the rotation axis, for any magnification.
         axis_col: column of the rotation axis, 0 at the centre of the first column.
         axis_row: row of z = 0 (of the source's height in a cone), 0 at the centre of the first row.
         sod: mm from the source to the rotation axis; infinite for a parallel beam.

@@ -1,4 +1,4 @@
-"""Domain: what an effect acts on, in the order of physics."""
+"""Domain: the quantity that an effect acts on, in the order of physics."""
 
 from __future__ import annotations
 

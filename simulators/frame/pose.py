@@ -1,8 +1,8 @@
-"""Pose: how the sample stands while each row of a frame is exposed: turned, and, where a scene asks, displaced.
+"""Pose: rotation and displacement of the sample while each row of a frame is exposed.
 
 The laboratory's axes are u (along the rows), b (along the beam, away from the source) and v (up the columns' index).
-A point p = (x, y, z) of the sample is at angle θ seen at u = x cos θ + y sin θ, b = y cos θ - x sin θ, v = z; the tilt
-turns that about the laboratory's u and b through the origin, and the shift is added last.
+A point p = (x, y, z) of the sample at angle θ is at u = x cos θ + y sin θ, b = y cos θ - x sin θ, v = z; the tilt
+rotates that about the laboratory's u and b through the origin, and the shift is added last.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where the sample is, row by row; None costs nothing.
+    """Rotation and displacement of the sample for each row; None: none.
 
     Attributes:
         angle: float64 [row], radians.
@@ -31,7 +31,7 @@ class Pose:
 
     @classmethod
     def turned(cls, angle: ArrayLike, rows: int) -> Pose:
-        """Turned only; `angle` in radians, one for the frame or one a row [row]."""
+        """Rotation only; `angle` in radians, one for the frame or one a row [row]."""
         return cls(np.ascontiguousarray(np.broadcast_to(np.asarray(angle, dtype=np.float64), (rows,))))
 
     def turned_by(self, angle: ArrayLike) -> Pose:
@@ -47,8 +47,12 @@ class Pose:
         return Pose(self.angle, self.shift, _added(self.tilt, tilt, (self.angle.size, 2)))
 
     def frames(self) -> tuple[Reals, Reals]:
-        """The laboratory seen from the sample: axes float64 [row, 3, 3], whose columns are u, b and v in (x, y, z), and
-        the laboratory's origin, float64 [row, 3] in mm."""
+        """The laboratory in the sample's coordinates.
+
+        Returns:
+            Axes float64 [row, 3, 3], whose columns are u, b and v in (x, y, z), and the laboratory's origin,
+            float64 [row, 3] in mm.
+        """
         zero, one = np.zeros_like(self.angle), np.ones_like(self.angle)
         c, s = np.cos(self.angle), np.sin(self.angle)
         to_lab = _matrices([[c, s, zero], [-s, c, zero], [zero, zero, one]])

@@ -1,13 +1,13 @@
-"""Sensor: ORCA-Quest's figures, and how electrons become counts.
+"""Sensor: figures of the ORCA-Quest, and the conversion of electrons to counts.
 
-A beam's photons are those detected, so that one photon is one electron, unless a scene names the quantum efficiency.
+A beam's photons are the detected ones, so that a photon is an electron, unless a scene names the quantum efficiency.
 The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000 electrons.
 Binning is digital: charge and noise of the summed pixels add up.
 
-Photon number resolving is a readout of the camera and follows from three figures, without an effect: a count is an
-electron, there is no offset, and so `digitise` gives round(max(electrons, 0)). That the camera subtracts its offset
-pixel by pixel, reads with the noise of ultra quiet and counts to about 200 is from memory, to be checked on a camera.
-A binned pixel is rounded once, after its sum; the camera rounds each pixel first, which leaves a little less noise.
+Photon number resolving is a readout of the camera and needs no effect: a count is an electron and there is no offset,
+so that `digitise` gives round(max(electrons, 0)). To check on a camera: that it subtracts the offset of each pixel,
+reads with the noise of ultra quiet and counts to about 200. A binned pixel is rounded once, after its sum; the camera
+rounds each pixel first, which leaves slightly less noise.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ FULL_WELL = 7000.0
 
 
 def largest_count(readout: str, binning: int) -> int:
-    """What the converter ends at."""
+    """Largest count of the converter."""
     whole = 2**BITS - 1
     return min(LARGEST_PHOTON_NUMBER * binning**2, whole) if readout == "photon_number" else whole
 
 
 def digitise(counts: NDArray[np.float64], largest: int = 2**BITS - 1) -> NDArray[np.uint16]:
-    """Round to whole counts and clip to what the converter has; `counts` is written over."""
+    """Round to whole counts and clip to the converter's range; `counts` is overwritten."""
     np.rint(counts, out=counts)
     return np.clip(counts, 0, largest, out=counts).astype(np.uint16)

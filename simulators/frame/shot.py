@@ -1,4 +1,4 @@
-"""Shot: the circumstances of one exposure, when it looks at the sample, and the random numbers that belong to it."""
+"""Shot: the conditions of one exposure, its moments, and its random numbers."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ AngleAt = Callable[[float], float]
 
 
 class CannotExposeError(ValueError):
-    """The scene cannot be exposed in this way, though each of its values is legal; the message says what would help."""
+    """The scene cannot be exposed, though each of its values is legal; the message says what would help."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """The circumstances of one exposure.
+    """The conditions of one exposure.
 
     Attributes:
-        detector: where the frame's pixels are (after ROI and binning).
+        detector: the frame's pixels (after ROI and binning).
         exposure: s.
         time: s since the Unix epoch, at the trigger.
         angle: true angle of the stage at the trigger, radians.
-        angle_at: true angle of the stage in radians at a time in s; asked only by effects of motion.
-        elapsed: s since the camera was connected; what drifts runs on it.
+        angle_at: true angle of the stage in radians at a time in s; called by effects of motion only.
+        elapsed: s since the camera was connected; the time of all drifts.
         row_period: s by which each row starts later than the one above.
         roi: (row0, col0, rows, cols) of the sensor.
         binning: sensor pixels summed per side.
@@ -39,7 +39,7 @@ class Shot:
         sample: the sample is in the beam (otherwise a flat).
         radius: mm from the rotation axis to the farthest matter of the sample.
         seed: of all random numbers.
-        frame: number over the camera's life, whatever it shows.
+        frame: number since the camera was connected, of any kind.
         view: projections exposed before this frame.
     """
 
@@ -62,7 +62,7 @@ class Shot:
     view: int
 
     def later(self, seconds: float) -> Shot:
-        """The same shot as the sample is seen `seconds` after the trigger: at another time and angle."""
+        """The same shot with time and angle `seconds` after the trigger."""
         if seconds == 0:
             return self
         time = self.time + seconds
@@ -71,7 +71,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """When the rows of a frame see the sample.
+    """The times at which the rows of a frame sample the exposure.
 
     Attributes:
         times: float64 [moment, row], s after the trigger.
@@ -87,14 +87,14 @@ class Moments:
 
 
 def draws(effect: str, shot: Shot) -> np.random.Generator:
-    """The generator of (seed, effect, frame): any frame can be made again alone, and an effect that is added changes
-    no other's draw."""
+    """The generator of (seed, effect, frame): any frame can be computed alone, and an added effect does not change the
+    others' numbers."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
 
 
 def lasting(effect: str, seed: int) -> np.random.Generator:
-    """The generator of (effect, its own seed): of what stays from frame to frame.
+    """The generator of (effect, its own seed), for all that is the same in every frame.
 
-    It is a branch of its own: without one, numpy takes (seed, effect) for (seed, effect, frame 0), as zeros at the end
-    say nothing to it."""
+    It has a spawn key: without one, numpy makes (seed, effect) equal to (seed, effect, frame 0), since it ignores
+    zeros at the end."""
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(effect.encode())], spawn_key=(0,)))

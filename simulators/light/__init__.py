@@ -1,1 +1,1 @@
-"""Light: beams, the energies that they have, and the materials that tell these apart."""
+"""Light: beams, their energies, and materials whose attenuation depends on them."""

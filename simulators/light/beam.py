@@ -1,4 +1,4 @@
-"""Beam: the light that meets the sample, where it comes from and which energies it has."""
+"""Beam: flux, source distance and energies of the light."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 NEAREST, FARTHEST = 1e-6, 1e9
-"""mm, of a cone's source: squares of far larger ones are no numbers, and its frames were black."""
+"""mm, of a cone's source: squares of far larger distances overflow."""
 
 
 @dataclass(frozen=True)
 class Tube:
     """An X-ray tube: the bremsstrahlung of a thick target, (kv - E) / E photons an energy interval at E (Kramers, Phil.
-    Mag. 46, 836, 1923), behind filters. It has no characteristic lines: a table of [keV, weight] has what it holds.
+    Mag. 46, 836, 1923), behind filters. It has no characteristic lines; for these give the spectrum as a table.
 
     Attributes:
         kv: the voltage, and the highest energy in keV.
@@ -34,15 +34,15 @@ class Tube:
 class Beam:
     """A parallel beam, or a cone where the distances are given.
 
-    Its energies matter to materials only: a grey solid attenuates all of them alike. Weights are shares of the photons
-    that are detected where nothing stands in the way, so that `photons_per_s` means the same for any light. A detector
-    that sees energies unlike is part of the table's weights.
+    Its energies affect materials only: a grey solid attenuates all energies equally. Weights are shares of the photons
+    detected in the open beam, so that `photons_per_s` has the same meaning for any spectrum. The detector's response to
+    energies is part of the weights.
 
     Attributes:
-        photons_per_s: detected a second by each (unbinned) sensor pixel where nothing stands in the way.
+        photons_per_s: detected a second by each (unbinned) sensor pixel in the open beam.
         sod: mm from the source to the rotation axis; None for a parallel beam.
         sdd: mm from the source to the detector.
-        energy_kev: of a monochromatic beam; of its middle, where there is a bandwidth.
+        energy_kev: of a monochromatic beam, or the middle of its bandwidth.
         bandwidth: full width at half maximum over energy of a Gaussian line: 1e-4 behind Si 111, 0.01 to 0.05 for pink
             beams. None: none.
         harmonics: shares of the light at multiples of the energy: {3: 0.01}. None: none.
@@ -71,12 +71,12 @@ class Beam:
                 f"sod and sdd must lie in {NEAREST:g} ... {FARTHEST:g} mm, got {self.sod} and {self.sdd}; a beam from "
                 "farther is parallel: leave both out"
             )
-        said = [name for name in ("energy_kev", "spectrum", "tube") if getattr(self, name) is not None]
-        if len(said) > 1:
-            raise ValueError(f"{' and '.join(said)} are different lights; name one of them")
+        given = [name for name in ("energy_kev", "spectrum", "tube") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
         for name in ("bandwidth", "harmonics"):
             if getattr(self, name) is not None and self.energy_kev is None:
-                raise ValueError(f"{name} belongs to an energy_kev, which is missing")
+                raise ValueError(f"{name} needs an energy_kev, which is missing")
         if self.energy_kev is not None and not 0 < self.energy_kev < math.inf:
             raise ValueError(f"energy_kev must be positive, got {self.energy_kev}")
         if self.bandwidth is not None and not 0 < self.bandwidth <= 0.2:
@@ -97,5 +97,5 @@ class Beam:
 
     @property
     def has_energy(self) -> bool:
-        """Whether it says which energies it has, as materials ask."""
+        """Whether it states its energies, as materials need."""
         return any(light is not None for light in (self.energy_kev, self.spectrum, self.tube))

@@ -1,14 +1,14 @@
-"""Edge: the K edge of a transition metal in an oxide, with its white line, where the tables have a bare step.
+"""Edge: the K edge of a transition metal in an oxide, with its white line, in place of the tables' bare step.
 
-Tables of free atoms end at a step; a solid has a rise as wide as the core hole's level (Campbell & Papp, At. Data Nucl.
-Data Tables 77, 1, 2001, which xraylib has: Mn 1.11, Co 1.28, Ni 1.39 eV) and, in an oxide, a line of bound final states
-above it. The usual form of both is
+Tables of free atoms have a step; a solid has a rise as wide as the core-hole level (Campbell & Papp, At. Data Nucl.
+Data Tables 77, 1, 2001, included in xraylib: Mn 1.11, Co 1.28, Ni 1.39 eV) and, in an oxide, a line of bound final
+states above it. The usual form of both is
 
     f(E) = 1/2 + arctan((E - E_step) / (Γ/2)) / π + h / (1 + ((E - E_line) / (γ/2))²)        (Teo, EXAFS, 1986, ch. 2)
 
 and the attenuation is that of the other electrons plus f times the jump, both continued through the edge by power laws.
-Oxidation moves E_step and E_line up. Beyond 60 eV from the edge this goes over, smoothly, into the table, which is what
-stands from 150 eV on: the jump of the edge is the table's.
+Oxidation moves E_step and E_line up. From 60 to 150 eV from the edge this is blended into the table, which holds
+beyond: the jump of the edge is the table's.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ Table = Callable[[Reals], Reals]
 
 NEAR, FAR = 60.0, 150.0
 MOST_SHIFT = 20.0
-"""eV by which an edge may move: more, and it leaves the range in which the form stands for the table."""
+"""eV by which an edge may move, so that it stays in the range where the form replaces the table."""
 CLEAR = 1.0
-"""eV from the edge at which a table is read: nearer, a spline through it may still be on its way up."""
+"""eV from the edge at which a table is read: closer, an interpolating spline may still be rising."""
 
 
 @dataclass(frozen=True)
 class KEdge:
-    """How an element's K edge looks in a layered oxide.
+    """Shape of an element's K edge in a layered oxide.
 
     Attributes:
         white_line: keV, of the fully charged oxide.
@@ -57,15 +57,15 @@ K_EDGES: Mapping[int, KEdge] = MappingProxyType(
         28: KEdge(8.3485, shift=2.0),
     }
 )
-"""By atomic number. The Ni line of the charged state is where the battery thesis that this instrument follows has its
-peak (figure 2.1: 8348.5 eV, said of LiCoO2, but next to the K edge of nickel and 640 eV above that of cobalt); Co and
-Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most of the charge and cobalt hardly moves
-(Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths are nominal: of the right size, of no one
-sample; and every monochromator has an offset of its own of an eV or so."""
+"""By atomic number. The Ni line of the charged state is the peak in the battery thesis that this instrument
+follows (figure 2.1: 8348.5 eV, given for LiCoO2, but next to the K edge of nickel and 640 eV above that of cobalt); Co
+and Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most of the charge and cobalt hardly moves
+(Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths are nominal: of the right order, not of
+one sample; and every monochromator has an offset of about an eV."""
 
 
 def near_edge(energies: Reals, table: Table, edge: float, level_width: float, shape: KEdge, charge: float) -> Reals:
-    """Mass attenuation in cm²/g with the near-edge structure in it, float64 [energy].
+    """Mass attenuation in cm²/g with the near-edge structure, float64 [energy].
 
     Args:
         energies: keV.
@@ -73,7 +73,7 @@ def near_edge(energies: Reals, table: Table, edge: float, level_width: float, sh
         edge: keV, where the table has its step.
         level_width: eV, Γ: full width of the K level.
         shape: of the edge.
-        charge: state of charge, 0 (all lithium in) to 1.
+        charge: state of charge, 0 (fully lithiated) to 1.
     """
     tabulated = table(energies)
     away = (energies - edge) * 1e3
@@ -92,7 +92,7 @@ def near_edge(energies: Reals, table: Table, edge: float, level_width: float, sh
 
 
 def profile(from_line: Reals, level_width: float, shape: KEdge) -> Reals:
-    """f of this module's head: 0 far below the edge, 1 far above; `from_line` is E - E_line in eV."""
+    """f of the module's docstring: 0 far below the edge, 1 far above; `from_line` is E - E_line in eV."""
     step = 0.5 + np.arctan((from_line + shape.below) / (level_width / 2)) / np.pi
     return step + shape.height / (1 + (from_line / (shape.width / 2)) ** 2)
 

@@ -1,6 +1,6 @@
-"""Effective depth: what a detector that adds up the light of all energies sees of a sample.
+"""Effective depth: the optical depth measured by a detector that integrates over all energies.
 
-It is -log(sum_e w_e exp(-sum_m mu_m(e) L_m)): the thicknesses L_m are paid for once, whatever the number of energies.
+It is -log(sum_e w_e exp(-sum_m mu_m(e) L_m)); the thicknesses L_m are computed once for any number of energies.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from simulators.pixels.bands import share_rows
 Reals = NDArray[np.float64]
 
 DARK = 1e-25
-"""Of the open beam: from here on each ray is summed for itself, so that any depth is told as it is."""
+"""Of the open beam: below it each ray is summed separately, without underflow."""
 ROUNDING = 1e-14
-"""Of the open beam: what differs from it by less has met no matter."""
+"""Of the open beam: a smaller difference from it counts as no matter."""
 
 
 def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Reals:
@@ -41,7 +41,7 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
 
 @njit(cache=True, nogil=True)
 def _effective_depth(row: int, end: int, thickness: Reals, attenuation: Reals, weights: Reals, out: Reals) -> None:
-    """Of the rows from `row` to before `end`; air left and right of the sample costs nothing."""
+    """Rows from `row` to before `end`; columns of air left and right of the sample are skipped."""
     cols = out.shape[1]
     spare = np.empty((2, cols))
     for j in range(row, end):
@@ -57,16 +57,16 @@ def _effective_depth(row: int, end: int, thickness: Reals, attenuation: Reals, w
             last = max(last, i)
         if first >= last:
             continue
-        depth, seen = spare[0, : last - first], spare[1, : last - first]
-        seen[:] = 0.0
+        depth, light = spare[0, : last - first], spare[1, : last - first]
+        light[:] = 0.0
         for e in range(weights.size):
             _put_depths(depth, thickness, j, first, attenuation[e])
-            _add_light(seen, depth, weights[e])
-        for i in range(seen.size):
-            if abs(seen[i] - 1.0) < ROUNDING:
-                continue  # no matter: exactly nothing
+            _add_light(light, depth, weights[e])
+        for i in range(light.size):
+            if abs(light[i] - 1.0) < ROUNDING:
+                continue  # no matter: exactly 0
             out[j, first + i] = (
-                -math.log(seen[i]) if seen[i] > DARK else _deep(thickness[:, j, first + i], attenuation, weights)
+                -math.log(light[i]) if light[i] > DARK else _deep(thickness[:, j, first + i], attenuation, weights)
             )
 
 
@@ -84,10 +84,10 @@ def _put_depths(depth: Reals, thickness: Reals, j: int, first: int, attenuation:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_light(seen: Reals, depth: Reals, weight: float) -> None:
-    """Add weight x exp(-depth), to 1e-13 of itself: Taylor's series of a 256th, squared eight times, which the compiler
-    does for several columns at once, as it cannot do the library's exp. What is deeper than 80 counts as 80."""
-    for i in range(seen.size):
+def _add_light(light: Reals, depth: Reals, weight: float) -> None:
+    """Add weight x exp(-depth), to a relative 1e-13: Taylor's series of a 256th, squared eight times; the compiler
+    vectorises it, unlike the library's exp. Depths above 80 count as 80."""
+    for i in range(light.size):
         r = -(depth[i] if depth[i] < 80.0 else 80.0) * (1.0 / 256.0)
         p = 1.0 + r * (1.0 / 12.0)
         p = 1.0 + r * (1.0 / 11.0) * p
@@ -108,19 +108,19 @@ def _add_light(seen: Reals, depth: Reals, weight: float) -> None:
         p *= p
         p *= p
         p *= p
-        seen[i] += weight * (p * p)
+        light[i] += weight * (p * p)
 
 
 @njit(cache=True, nogil=True)
 def _deep(thickness: Reals, attenuation: Reals, weights: Reals) -> float:
-    """The effective depth of one ray with the hardest energy taken out of the sum, so that none is too deep for exp."""
+    """The effective depth of one ray with the hardest energy factored out of the sum, against underflow."""
     least = np.inf
     for e in range(weights.size):
         least = min(least, _dot(attenuation[e], thickness))
-    seen = 0.0
+    light = 0.0
     for e in range(weights.size):
-        seen += weights[e] * math.exp(least - _dot(attenuation[e], thickness))
-    return least - math.log(seen)
+        light += weights[e] * math.exp(least - _dot(attenuation[e], thickness))
+    return least - math.log(light)
 
 
 @njit(cache=True, nogil=True)

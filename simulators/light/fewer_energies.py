@@ -1,9 +1,9 @@
-"""Fewer energies: a spectrum on a few of its own energies that lets through the same light, whatever the sample holds.
+"""Fewer energies: reduces a spectrum to a few of its energies with the same transmission for any sample.
 
-exp(-mu(E) t) of different energies are nearly dependent on one another, so that a sum over many of them is a sum over a
-few to any practical accuracy. Which, and with what weights, is found by non-negative least squares (Lawson & Hanson,
-Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and all of them: first those that
-let through the very same light, a hundred or so of however many there are, then as few of these as the tolerance asks.
+exp(-mu(E) t) of different energies are nearly linearly dependent, so that a sum over many of them equals a sum over a
+few to any practical accuracy. The energies and weights are found by non-negative least squares (Lawson & Hanson,
+Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and all of them: first a set of
+about a hundred with exactly the same transmission, then as few of these as the tolerance allows.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from scipy.optimize import nnls
 Reals = NDArray[np.float64]
 
 STEPS = 40
-"""Rays are taken from the full thickness down to a 8000th of it."""
+"""Number of thicknesses, from the full one down to a 8000th of it."""
 SHARES = (0.125, 0.5, 0.875)
-"""Of the first of each pair of materials. With halves alone the light of one sample in a thousand, with an edge in each
-of two materials, was off by ten times the tolerance between them."""
+"""Shares of the first of each pair of materials. With halves alone the error for one sample in a thousand, with an edge
+in each of two materials, was ten times the tolerance."""
 
 
 def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float) -> tuple[NDArray[np.intp], Reals]:
-    """Positions of the energies that are kept, and their weights, of sum 1.
+    """Indices of the kept energies, and their weights, of sum 1.
 
     Args:
         attenuation: 1/mm, float64 [energy, material].
         weights: float64 [energy], of sum 1.
-        thickness: mm, the longest way through matter.
-        tolerance: share of the open beam to which the light stays the same.
+        thickness: mm, the longest path through matter.
+        tolerance: largest change of the transmitted light, as a share of the open beam.
     """
     n_materials = attenuation.shape[1]
     ways = [np.eye(n_materials)]

@@ -1,4 +1,4 @@
-"""Materials: what a sample is made of, and how it attenuates X-rays of any energy.
+"""Materials: composition, density and attenuation at any X-ray energy.
 
 Cross sections, edges and level widths are those of xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011): the
 total mass attenuation, photoelectric and both kinds of scattering, from 0.1 to 800 keV. This module is imported only
@@ -23,17 +23,17 @@ AVOGADRO = 0.602214076  # 1e24 / mol
 
 @dataclass(frozen=True)
 class Material:
-    """What one kind of matter is made of.
+    """Composition and density of a kind of matter.
 
     Attributes:
-        name: as scenes and labels say it.
+        name: in scenes and labels.
         density: g/cm³.
         fractions: (atomic number, share of the mass), of each element once.
-        state_of_charge: of a cathode material, 0 (all lithium in) to 1: it then has the near-edge structure of
-            simulators.light.edge; None: the bare tables. Composition and density stay those of the discharged state:
-            lithium carries about a thousandth of an oxide's attenuation.
+        state_of_charge: of a cathode material, 0 (fully lithiated) to 1: it then has the near-edge structure of
+            simulators.light.edge; None: the tables. Composition and density stay those of the discharged state:
+            lithium contributes about a thousandth of an oxide's attenuation.
         edge_shift_ev: eV from the edge of state 0 to that of state 1, the same for Mn, Co and Ni, -20 ... 20; None:
-            as simulators.light.edge has it.
+            the value in simulators.light.edge.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Material:
             raise ValueError(f"{self.name}: density must lie between 0 and 100 g/cm3, got {self.density}")
         if self.state_of_charge is None:
             if self.edge_shift_ev is not None:
-                raise ValueError(f"{self.name}: edge_shift_ev moves nothing without a state_of_charge; say that, too")
+                raise ValueError(f"{self.name}: edge_shift_ev needs a state_of_charge")
             return
         if not 0 <= self.state_of_charge <= 1:
             raise ValueError(f"{self.name}: state_of_charge must lie in 0 ... 1, got {self.state_of_charge}")
@@ -55,7 +55,7 @@ class Material:
             raise ValueError(f"{self.name}: edge_shift_ev must lie in -20 ... 20 eV, got {self.edge_shift_ev}")
         if not K_EDGES.keys() & dict(self.fractions).keys():
             symbols = ", ".join(xraylib.AtomicNumberToSymbol(z) for z in K_EDGES)
-            raise ValueError(f"{self.name}: state_of_charge is that of an oxide with {symbols}; this has none of them")
+            raise ValueError(f"{self.name}: state_of_charge is for an oxide with {symbols}; this has none of them")
 
     def attenuation(self, energies: ArrayLike) -> Reals:
         """Linear attenuation in 1/mm at `energies` in keV, float64, of their shape.
@@ -89,7 +89,7 @@ def of_formula(name: str, formula: str, density: float) -> Material:
     """A material by chemical formula ("LiNi0.6Mn0.2Co0.2O2") and density in g/cm³.
 
     Raises:
-        ValueError: not a formula, or no density.
+        ValueError: not a formula, or not a density.
     """
     return Material(name, density, _fractions(formula))
 

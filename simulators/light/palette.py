@@ -1,4 +1,4 @@
-"""Palette: materials by name, with their densities, and how a scene changes them or adds its own."""
+"""Palette: materials by name with their densities, and a scene's changes and additions to them."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ class _Properties:
 
 @dataclass(frozen=True)
 class Palette:
-    """The materials that a scene can name: those known here, and its own.
+    """The materials that a scene can name: the known ones and its own.
 
     Attributes:
-        own: by name; these come first.
+        own: by name; they take precedence.
     """
 
     own: Mapping[str, Material] = field(default_factory=lambda: MappingProxyType({}))
@@ -104,7 +104,7 @@ def palette_of(where: str, entry: Any) -> Palette:
 
 
 def known(name: str) -> Material | None:
-    """A material that needs no more than its name; None where there is none of that name."""
+    """A known material by its name; None where there is none."""
     return _KNOWN[name]() if name in _KNOWN else _nmc(name)
 
 
@@ -113,7 +113,7 @@ def _own(where: str, name: str, settings: Any) -> Material:
     base = known(name)
     density = given.density if given.density is not None else base.density if base else None
     if density is None or (base is None and given.formula is None):
-        raise SceneError(f"{where}: {name!r} is no known material; give formula and density (g/cm3)")
+        raise SceneError(f"{where}: {name!r} is not a known material; give formula and density (g/cm3)")
     with located(where):
         if base is None or given.formula is not None:
             base = of_formula(name, str(given.formula), density)

@@ -1,4 +1,4 @@
-"""Spectrum: a beam's energies and their weights, only as many as its sample needs."""
+"""Spectrum: a beam's energies and weights, as few as its sample needs."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Attenuation = Callable[[ArrayLike], Reals]
 
 NODES = (3, 5, 9, 17, 33, 65, 129, 257, 513)
 ENOUGH = 1e-5
-"""Of the open beam: far below the noise of a pixel that holds 7000 electrons."""
+"""Tolerance, as a share of the open beam: far below the noise of a pixel with 7000 electrons."""
 _FWHM = math.sqrt(8 * math.log(2))
 _LEAST_KEV = 1.0
-_NOTHING = 1e-7  # of the light: what a filter lets through of the lowest energies
+_NOTHING = 1e-7  # of the light: weights below are dropped, of the energies that a filter stops
 _FEW = 9
 _A_FEW = 4
 _REACH = 4.5  # standard deviations; 7e-6 of a line are beyond
@@ -28,7 +28,7 @@ _REACH = 4.5  # standard deviations; 7e-6 of a line are beyond
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Light of some energies.
+    """Energies of a beam and their weights.
 
     Attributes:
         energies: keV, float64 [energy].
@@ -40,16 +40,16 @@ class Spectrum:
 
     @classmethod
     def of(cls, energies: ArrayLike, weights: ArrayLike) -> Spectrum:
-        """Of weights of any sum; energies without weight are left out."""
+        """From weights of any sum; energies without weight are dropped."""
         e, w = np.asarray(energies, dtype=np.float64), np.asarray(weights, dtype=np.float64)
         return cls(e[w > 0], w[w > 0] / w.sum())
 
     def mean(self, attenuation: Attenuation) -> float:
-        """Attenuation in 1/mm that a thin layer shows: the mean over the photons that are detected."""
+        """Effective attenuation of a thin layer in 1/mm: the mean over the detected photons."""
         return float(self.weights @ attenuation(self.energies))
 
     def transmission(self, attenuation: Attenuation, thickness: ArrayLike) -> Reals:
-        """Share of the light that comes through `thickness` mm, of its shape."""
+        """Transmitted share of the light through `thickness` mm, of its shape."""
         through = np.exp(-np.multiply.outer(np.asarray(thickness, dtype=np.float64), attenuation(self.energies)))
         return np.asarray(through @ self.weights)
 
@@ -59,42 +59,42 @@ def light(
 ) -> Spectrum:
     """The spectrum of a beam, with as many energies as these materials need.
 
-    The nodes of a line or a tube are doubled until up to `thickness` mm of each material let through the same light to
-    1e-5 of the open beam (513 are the end of it: a bare step within a line leaves half a node's weight open, 0.4 % of
-    the light). Of these, or of a table's, are then kept the few that let through the same light, to about 1e-5 again.
+    The nodes of a line or a tube are doubled until the transmission of up to `thickness` mm of each material is stable
+    to 1e-5 of the open beam (up to 513 nodes: with a bare step within a line half a node's weight is uncertain, 0.4 %
+    of the light). Of these, or of a table's energies, the few are kept that have the same transmission to about 1e-5.
 
     Args:
         filters: the attenuation of a material by its name, for a tube.
 
     Raises:
-        ValueError: the beam does not say its energies, or nothing comes through its filters.
+        ValueError: the beam does not state its energies, or its filters stop all light.
     """
     if not beam.has_energy:
         raise ValueError("materials need the beam's energy: give it energy_kev, spectrum or tube")
-    judges = list(materials)
+    attenuations = list(materials)
     if beam.spectrum is not None:
         found = Spectrum.of(*zip(*beam.spectrum, strict=True))
     elif beam.bandwidth is None and beam.tube is None:
         found = _nodes(beam, 1, filters)
     else:
-        found = _converged(beam, judges, thickness, filters)
-    if found.energies.size <= _A_FEW or not judges:
+        found = _converged(beam, attenuations, thickness, filters)
+    if found.energies.size <= _A_FEW or not attenuations:
         return found
     from simulators.light.fewer_energies import fewer
 
-    attenuation = np.stack([material(found.energies) for material in judges], axis=1)
+    attenuation = np.stack([material(found.energies) for material in attenuations], axis=1)
     kept, weights = fewer(attenuation, found.weights, thickness, ENOUGH / 5)
     return Spectrum(found.energies[kept], weights)
 
 
 def _converged(
-    beam: Beam, judges: Sequence[Attenuation], thickness: float, filters: Callable[[str], Attenuation]
+    beam: Beam, attenuations: Sequence[Attenuation], thickness: float, filters: Callable[[str], Attenuation]
 ) -> Spectrum:
     ladder = thickness * 4.0 ** np.arange(-6, 1)
     before = _nodes(beam, NODES[0], filters)
     for n in NODES[1:]:
         now = _nodes(beam, n, filters)
-        changes = [np.abs(now.transmission(m, ladder) - before.transmission(m, ladder)).max() for m in judges]
+        changes = [np.abs(now.transmission(m, ladder) - before.transmission(m, ladder)).max() for m in attenuations]
         if max(changes, default=0.0) <= ENOUGH:
             return before
         before = now
@@ -102,10 +102,10 @@ def _converged(
 
 
 def _nodes(beam: Beam, n: int, filters: Callable[[str], Attenuation]) -> Spectrum:
-    """The spectrum on n nodes a line."""
+    """The spectrum with n nodes a line."""
     if beam.tube is not None:
         return _tube(beam.tube, n, filters)
-    assert beam.energy_kev is not None  # the beam says its energies
+    assert beam.energy_kev is not None  # the beam states its energies
     energies, weights = np.array([beam.energy_kev]), np.ones(1)
     if beam.bandwidth is not None:
         x, w = _gaussian(n)
@@ -119,8 +119,8 @@ def _nodes(beam: Beam, n: int, filters: Callable[[str], Attenuation]) -> Spectru
 
 
 def _gaussian(n: int) -> tuple[Reals, Reals]:
-    """Nodes and weights for a normal distribution: Gauss's where few do, evenly spaced ones where an edge asks for
-    many; those converge as fast for what is smooth and spend none on the far ends."""
+    """Nodes and weights for a normal distribution: a Gauss rule for few nodes, evenly spaced ones where an edge needs
+    many: these converge as fast for smooth integrands and have no nodes in the far tails."""
     if n <= _FEW:
         x, w = np.polynomial.hermite_e.hermegauss(n)
     else:
@@ -137,7 +137,5 @@ def _tube(tube: Tube, n: int, filters: Callable[[str], Attenuation]) -> Spectrum
     for name, mm in (tube.filters or {}).items():
         weights = weights * np.exp(-mm * filters(name)(energies))
     if not weights.sum() > 1e-30 * open_beam:
-        raise ValueError(
-            f"nothing of the tube's {tube.kv:g} kV comes through its filters {dict(tube.filters or {})} mm"
-        )
+        raise ValueError(f"no light of the tube's {tube.kv:g} kV passes its filters {dict(tube.filters or {})} mm")
     return Spectrum.of(energies, np.where(weights > _NOTHING * weights.sum(), weights, 0.0))

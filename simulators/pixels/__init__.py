@@ -1,1 +1,1 @@
-"""Pixels: random numbers, fixed patterns and wide blurs over a frame, for effects to build on."""
+"""Pixels: random numbers, fixed patterns and wide blurs of frames, used by effects."""

@@ -1,4 +1,4 @@
-"""Bands: the rows of a frame shared out among threads; what a row becomes does not depend on who does it."""
+"""Bands: divides the rows of a frame among threads; results do not depend on their number."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ SMALL = 1 << 16
 
 
 def share_rows(work: Callable[[int, int], None], shape: tuple[int, int]) -> None:
-    """Call `work(first, end)` for bands that make up all rows of a frame of `shape`, at once in NUMBA_NUM_THREADS
-    threads (its default is one a core); `work` releases the interpreter's lock. Not numba's own threads: those may not
-    be entered by two threads at once, and a camera is read while other threads compute."""
+    """Call `work(first, end)` for bands that cover all rows of a frame of `shape`, in NUMBA_NUM_THREADS threads (by
+    default one a core); `work` releases the interpreter's lock. Not numba's own threads: two threads must not use those
+    at once, and a camera is read while other threads compute."""
     threads = config.NUMBA_NUM_THREADS if shape[0] * shape[1] > SMALL else 1
     if threads == 1:
         return work(0, shape[0])

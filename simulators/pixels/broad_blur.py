@@ -1,9 +1,9 @@
-"""Broad blur: a wide, round blur worked out on a smaller image, since what is wide has no fine detail.
+"""Broad blur: a wide, round blur computed on a smaller image, since its result has no fine detail.
 
-Edges are mirrors, so that light is neither lost nor made: the sum of the image is kept to rounding. A blur is given by
-its transfer as a function of (ω width)², ω the angular frequency; in its place stands the discrete Laplacian's symbol,
-(2 - 2 cos ω_x) + (2 - 2 cos ω_y). Each transfer of this module is a mixture of Gaussians, so that its kernel is then
-a mixture of discrete Gaussians (Lindeberg 1990), which are nowhere negative at any width: nor are the photons.
+Edges are mirrors, so that the sum of the image is conserved to rounding. A blur is given by its transfer function of
+(ω width)², ω the angular frequency, in which ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +
+(2 - 2 cos ω_y). Each transfer function of this module is a mixture of Gaussians, so that its kernel is a mixture of
+discrete Gaussians (Lindeberg 1990), which are nonnegative at any width, and so are the photons.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from simulators.pixels.bands import share_rows
 Image = NDArray[np.float64]
 Transfer = Callable[[Image], Image]
 COARSE = 4
-"""Pixels of the smaller image in the width of a blur, at least; more are finer and slower."""
+"""Least width of a blur in pixels of the smaller image; larger is finer and slower."""
 FAR = 1e6
-"""Frames in the width of a blur, at most: the light is even then."""
+"""Largest width of a blur in frames: the light is even then."""
 
 
 def gaussian(s: Image) -> Image:
@@ -62,7 +62,7 @@ def broad_blur(image: Image, width: float, transfer: Transfer) -> Image:
     spectrum = fft.dctn(small, overwrite_x=True, workers=threads)
     spectrum *= transfer(laplacian * (width / factor) ** 2)
     blurred = fft.idctn(spectrum, overwrite_x=True, workers=threads)
-    return np.maximum(blurred, 0.0, out=blurred)  # rounding alone: the kernel is nowhere negative
+    return np.maximum(blurred, 0.0, out=blurred)  # negative by rounding only: the kernel is nonnegative
 
 
 def _symbol(n: int) -> NDArray[np.float64]:
@@ -71,7 +71,7 @@ def _symbol(n: int) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def _shrink(begin: int, end: int, image: Image, small: Image) -> None:
-    """Means over the blocks of `image` that rows begin ... end of `small` have pixels for."""
+    """Rows begin ... end of `small`: means over blocks of `image`."""
     factor = image.shape[0] // small.shape[0]
     for j in range(begin, end):
         line = np.zeros(image.shape[1])
@@ -83,16 +83,16 @@ def _shrink(begin: int, end: int, image: Image, small: Image) -> None:
 
 
 def add_enlarged(image: Image, small: Image, share: float) -> None:
-    """image += share x small, drawn straight from centre to centre of its pixels and level at the edges.
+    """image += share x small, interpolated linearly between the centres of its pixels and constant at the edges.
 
-    The sum grows by share x sum of small x pixels in one of its blocks, to rounding: straight lines keep the mean.
+    The sum grows by share x sum of small x pixels of a block, to rounding: linear interpolation preserves the mean.
     """
     share_rows(lambda first, end: _add_enlarged(first, end, image, small, share), image.shape)
 
 
 @njit(cache=True, nogil=True)
 def _add_enlarged(begin: int, end: int, image: Image, small: Image, share: float) -> None:
-    """The rows begin ... end of it."""
+    """Rows begin ... end of add_enlarged."""
     factor = image.shape[0] // small.shape[0]
     rows, cols = small.shape
     for j in range(begin, end):

@@ -1,9 +1,9 @@
-"""Noise: Poisson and normal noise on a frame, exact, row by row; each row has a stream of its own.
+"""Noise: exact Poisson and normal noise of a frame, row by row; each row has its own random stream.
 
-A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution: no
-rejection, so that a row is done in lanes. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
-"Algorithm 955") unless that lies closer to a whole number than its error, a case in thousands: then the
-distribution itself is summed and decides. Expectations below 2 look up a uniform number in the distribution.
+A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution: without
+rejection, so that rows can be vectorised. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
+"Algorithm 955"), unless the expansion is closer to a whole number than its error, one case in thousands: then the
+distribution itself is summed. For expectations below 2 a uniform number is looked up in the distribution.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from simulators.pixels.streams import STEP, begin, mix, normal
 LEAST = 2.0
 """Least expectation for the expansion; below, a uniform number is looked up in the distribution from 0 up."""
 EASY = 8
-"""Numbers up to this one are compared all at once; of small expectations, 2 in 10 000 are larger."""
+"""Numbers up to this one are compared in a vectorised loop; of small expectations, 2 in 10 000 are larger."""
 LARGEST = 1e9
 """Largest expectation: rounding of the expansion is far below its error up to there."""
 
@@ -90,7 +90,7 @@ def searched(u, mean):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """image[row, col] becomes Poisson around itself for the rows of a band."""
+    """Replaces image[row, col] by a Poisson number of this expectation, for the rows of a band."""
     cols = image.shape[1]
     w, u, k = np.empty(cols), np.empty(cols), np.empty(cols)
     for row in range(first, end):
@@ -99,7 +99,7 @@ def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pr
         for col in range(cols):
             few |= mean[col] < LEAST
             w[col], state = normal(state)
-        for col in range(cols):  # in lanes: no branch, no call
+        for col in range(cols):  # vectorised: no branch, no call
             m = mean[col]
             x, error = expansion(w[col], m, math.sqrt(m))
             low = math.floor(x - error)
@@ -114,12 +114,12 @@ def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pr
 
 @njit(cache=True, nogil=True)
 def _small(state, mean, u, k):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """The quantile of uniform numbers u [col], which are drawn here, for the small expectations of a row; -1 where it
-    is more than EASY. The others' k [col] stay."""
+    """Draws uniform numbers u [col] and sets k [col] to their quantiles for the small expectations of a row, or to -1
+    where that exceeds EASY. Other columns of k are unchanged."""
     share = np.empty(mean.size)
     for col in range(mean.size):
         share[col] = math.exp(-mean[col])
-    for col in range(mean.size):  # in lanes
+    for col in range(mean.size):  # vectorised
         u[col] = (mix(state + np.uint64(col + 1) * STEP) >> np.uint64(11)) * 2.0**-53
         m, part, total, n = mean[col], share[col], share[col], 0.0
         for j in range(1, EASY + 1):
@@ -141,13 +141,13 @@ def _normal_rows(key, first, end, rms, stride, image):  # type: ignore[no-untype
 
 
 def poisson(image: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """`image` [row, col] of expectations is written over by Poisson numbers, and given back.
+    """Replaces expectations [row, col] by Poisson numbers in place, and returns them.
 
     Args:
-        rng: one number of it is the key of all rows' streams.
+        rng: one number drawn from it is the key of all rows' streams.
 
     Raises:
-        CannotExposeError: an expectation is negative, not a number or beyond LARGEST; the image is as it was.
+        CannotExposeError: an expectation is negative, not a number or beyond LARGEST; the image is unchanged.
     """
     low, high = image.min(initial=0.0), image.max(initial=0.0)
     if not (low >= 0 and high <= LARGEST):
@@ -161,7 +161,7 @@ def poisson(image: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.
 
 
 def add_normal(image: NDArray[np.float64], rms: NDArray[np.float64] | float, rng: np.random.Generator) -> None:
-    """Add normal noise to `image` [row, col]; `rms` is one number or as large as the image."""
+    """Add normal noise to `image` [row, col]; `rms` is a number or has the image's shape."""
     key, each = rng.integers(2**64, dtype=np.uint64), np.asarray(rms, dtype=np.float64).reshape(-1)
     stride = (0, 0) if each.size == 1 else (image.shape[1], 1)
     share_rows(lambda first, end: _normal_rows(key, first, end, each, stride, image), image.shape)

@@ -1,6 +1,6 @@
-"""Pattern: what differs from pixel to pixel of the sensor and stays: a hash of (effect, seed, row, column).
+"""Pattern: fixed differences between the sensor's pixels: a hash of (effect, seed, row, column).
 
-Only the pixels that a frame shows are computed, and they are the same whatever the ROI and the binning.
+Only the pixels of the frame are computed; they are the same for any ROI and binning.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def binned(pixels: Image, binning: int) -> Image:
 def places(
     effect: str, seed: int, fraction: float, shot: Shot
 ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]:
-    """Scattered sensor pixels, a `fraction` of all, as far as the frame shows them.
+    """Random sensor pixels, a `fraction` of all, as far as they are in the frame.
 
     Returns:
         Their (rows, columns) in the frame, and a number of each that is even in 0 ... 1. A binned pixel comes as often

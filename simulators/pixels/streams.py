@@ -1,8 +1,8 @@
-"""Streams: uniform and normal random numbers for compiled loops; a stream is one 64-bit state, wherever it begins.
+"""Streams: uniform and normal random numbers for compiled loops; the state of a stream is one 64-bit number.
 
-A stream is splitmix64 (Steele, Lea & Flood 2014): the state goes on by a fixed step and each number is a hash of it, so
-that a row of a frame or a pixel of the sensor begins a stream of its own by hashing its name. Streams that begin at
-random places of a circle of 2^64 hardly ever meet, and where two do they share a few numbers and no more.
+A stream is splitmix64 (Steele, Lea & Flood 2014): the state advances by a fixed step and each number is its hash, so
+that a row of a frame or a pixel of the sensor gets its own stream by hashing its index. Streams that begin at random
+places of a period of 2^64 hardly ever overlap, and where two do they share only a few numbers.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Samples: what stands in the beam, as solids, voxels and parts, and how its rays and its truth are worked out."""
+"""Samples: solids, voxels and materials in the beam, their line integrals and their true attenuation."""

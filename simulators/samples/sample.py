@@ -1,4 +1,4 @@
-"""Sample: what every phantom can do, whether it is made of solids, of voxels or of materials under a spectrum."""
+"""Sample: the interface of all phantoms, of solids, of voxels or of materials under a spectrum."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Sample(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the labels 1, 2, ... stand for; 0 is air."""
+        """Names of the labels 1, 2, ...; 0 is air."""
         ...
 
     def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> NDArray[np.float64]:
@@ -33,19 +33,19 @@ class Sample(Protocol):
         ...
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
-        """True attenuation in 1/mm, float32 [z, y, x]; voxels on a surface carry the share that is filled, counted on
+        """True attenuation in 1/mm, float32 [z, y, x]; voxels on a surface are weighted by the filled share, counted on
         supersample³ points."""
         ...
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
-        """What is at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
+        """Label at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
         ...
 
 
 @runtime_checkable
 class Counted(Protocol):
-    """A sample that also tells the counts behind it where there is nothing but Beer-Lambert: sooner than by its line
-    integrals, and the same to the count."""
+    """A sample that also computes counts where nothing but Beer-Lambert is simulated: faster than from its line
+    integrals, and equal to them."""
 
     def counts(
         self,
@@ -54,12 +54,12 @@ class Counted(Protocol):
         open_beam: float,
         rule: Callable[[NDArray[np.float64]], NDArray[np.uint16]],
     ) -> NDArray[np.uint16]:
-        """What `rule` makes of the line integrals, uint16 [row, col].
+        """rule(line integrals), uint16 [row, col].
 
         Args:
             angle: as for line_integrals.
             open_beam: counts where the line integral is 0, before they are rounded.
-            rule: counts of line integrals float64 [row, col], which it may write over: rounded and clipped open_beam x
-                exp(-line integral). It has the last word.
+            rule: counts of line integrals float64 [row, col], which it may overwrite: rounded and clipped open_beam x
+                exp(-line integral). It defines the result.
         """
         ...

@@ -1,7 +1,7 @@
-"""Explain: what a scene computes for one frame, in order, and what each step costs; and what it does not compute.
+"""Explain: the steps of one frame of a scene in order, with their cost, and the effects that are not computed.
 
-Steps are timed where they run, but for effects of motion, which make the others run again: what one of these costs is
-the time of a frame with it less that of a frame without it.
+Steps are timed where they run. Effects of motion make the others run several times: the cost of such an effect is the
+time of a frame with it less that of a frame without it.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ STEPS = {
     "beer_lambert": "photons x exp(-depth)",
     "digitise": "electrons to whole counts",
 }
-"""What every frame of a sample needs, whatever the scene names."""
+"""Steps of every frame, independent of effects."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a step of a frame costs.
+    """Cost of a step of a frame.
 
     Attributes:
         name: of the step or effect.
-        domain: what it acts on; None for the steps that every frame needs.
+        domain: what it acts on; None for the steps of every frame.
         ms: median.
-        size: bytes of memory taken at most while it ran.
+        size: peak memory in bytes while it ran.
         summary: what happens.
     """
 
@@ -52,12 +52,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class Explained:
-    """What a frame of a scene costs.
+    """Cost of a frame of a scene.
 
     Attributes:
         costs: in the order in which the steps run.
         ms: median of a whole frame.
-        unused: effects of the catalogue that the scene does not name, with what they would do.
+        unused: (name, summary) of the catalogue's effects that the scene does not name.
     """
 
     costs: tuple[Cost, ...]
@@ -66,18 +66,18 @@ class Explained:
 
 
 def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explained:
-    """Make the frame `repeats` times in each way that is needed, after one that does not count (it compiles).
+    """Compute the frame `repeats` times in each variant, after one round that is not counted (it compiles).
 
     Args:
         now: s, of a clock for short times.
     """
     motion = [effect for effect in scene.chain.effects if effect.domain is Domain.MOTION]
     rest = [effect for effect in scene.chain.effects if effect.domain is not Domain.MOTION]
-    # From the standing sample to the whole scene, one effect of motion more each time.
-    growing = [replace(scene, chain=Chain.of([*motion[:n], *rest])) for n in range(len(motion) + 1)]
-    rounds = [_round(growing, shot, now) for _ in range(repeats + 1)][1:]
+    # From the standing sample to the whole scene, with one more effect of motion each.
+    variants = [replace(scene, chain=Chain.of([*motion[:n], *rest])) for n in range(len(motion) + 1)]
+    rounds = [_round(variants, shot, now) for _ in range(repeats + 1)][1:]
     seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
-    sizes, peaks = _sizes(growing[0], shot), [_peak(each, shot) for each in growing]
+    sizes, peaks = _sizes(variants[0], shot), [_peak(each, shot) for each in variants]
     costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
     for n, effect in enumerate(motion):
         more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
@@ -107,7 +107,7 @@ class _Round:
 
 
 def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> _Round:
-    """All that is compared in turns, so that a machine that slows down does so for all of it."""
+    """Times all variants once, in turns, so that a change of the machine's speed affects all of them."""
     steps: dict[str, float] = defaultdict(float)
 
     @contextmanager
@@ -126,7 +126,7 @@ def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> _Round:
 
 
 def _sizes(scene: Scene, shot: Shot) -> dict[str, int]:
-    """Bytes that each step of a frame takes at most."""
+    """Peak memory of each step of a frame in bytes."""
     sizes: dict[str, int] = defaultdict(int)
 
     @contextmanager
@@ -149,7 +149,7 @@ def _peak(scene: Scene, shot: Shot) -> int:
 
 @contextmanager
 def _traced() -> Iterator[None]:
-    """Memory is followed within, and as before after it."""
+    """Memory is traced within; afterwards the tracer is in its previous state."""
     if tracemalloc.is_tracing():
         tracemalloc.reset_peak()
         yield

@@ -1,6 +1,6 @@
-"""Exposure: one frame of a scene, from the turning sample to counts; only the effects that it names are computed.
+"""Expose: computes one frame of a scene, from the turning sample to counts, with the effects that it names only.
 
-Without effects a frame is photons x exposure x exp(-line integral) / conversion, rounded: Beer-Lambert and no more.
+Without effects a frame is photons x exposure x exp(-line integral) / conversion, rounded: Beer-Lambert.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.u
     """One frame, counts uint16 [row, col].
 
     Args:
-        shot: the circumstances; the same shot makes the same frame again.
+        shot: the conditions; the same shot gives the same frame.
         watch: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
-            or "ideal", where there are no effects and the sample can make a frame in one go, with the same counts.
+            or "ideal", where there are no effects and the sample computes the same counts in one step.
     """
     chain = scene.chain
     if not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):
@@ -45,7 +45,7 @@ def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.u
 
 
 def _ideal(scene: Scene, sample: Counted, shot: Shot) -> NDArray[np.uint16]:
-    """The same as step by step, by a sample that can do it in one go."""
+    """The same counts in one step."""
     open_beam = _open_beam(scene, shot)
 
     def rule(depth: Image) -> NDArray[np.uint16]:
@@ -57,34 +57,34 @@ def _ideal(scene: Scene, sample: Counted, shot: Shot) -> NDArray[np.uint16]:
 
 
 def _open_beam(scene: Scene, shot: Shot) -> float:
-    """Photons that a pixel gets where nothing stands in the way."""
+    """Photons of a pixel in the open beam."""
     return scene.beam.photons_per_s * shot.exposure * shot.binning**2
 
 
 def _photons(scene: Scene, shot: Shot, watch: Watch) -> Image:
-    """Photons that arrive, averaged over the moments at which the effects of motion look; float64 [row, col]."""
+    """Photons behind the sample, averaged over the moments of the effects of motion; float64 [row, col]."""
     open_beam = _open_beam(scene, shot)
     if not shot.sample:
         with watch("beer_lambert"):
             return np.full(shot.detector.shape, open_beam)
     if not scene.chain.moves:
         angle = np.full(shot.detector.shape[0], shot.angle)
-        return _seen(scene, shot, angle, np.zeros_like(angle), open_beam, watch)
+        return _transmission(scene, shot, angle, np.zeros_like(angle), open_beam, watch)
     moments = scene.chain.moments(shot)
-    seen = (
-        _seen(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
+    parts = (
+        _transmission(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
         for times, weight in zip(moments.times, moments.weights, strict=True)
     )
-    photons = next(seen)
-    for more in seen:
-        photons += more
+    photons = next(parts)
+    for part in parts:
+        photons += part
     return photons
 
 
-def _seen(
+def _transmission(
     scene: Scene, shot: Shot, angles: NDArray[np.float64], times: NDArray[np.float64], open_beam: float, watch: Watch
 ) -> Image:
-    """open_beam x exp(-line integral) with the sample as it stands at one moment of each row."""
+    """open_beam x exp(-line integral) with the sample's pose at one moment of each row."""
     pose = scene.chain.pose(Pose(angles), times, shot)
     with watch("line_integrals"):
         depth = scene.sample.line_integrals(pose, shot.detector)
@@ -94,7 +94,7 @@ def _seen(
 
 
 def _transmitted(depth: Image, open_beam: float) -> Image:
-    """open_beam x exp(-line integral), written over the line integrals."""
+    """open_beam x exp(-line integral), in place."""
     np.exp(np.negative(depth, out=depth), out=depth)
     depth *= open_beam
     return depth
@@ -103,8 +103,8 @@ def _transmitted(depth: Image, open_beam: float) -> Image:
 def _row_angles(times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
     """Angles of the rows at `times` after the trigger, float64 [row].
 
-    Only the first and the last row are asked for: within the milliseconds of a readout the angle is straight to 1e-5
-    rad even while the stage speeds up at 1 rad/s2.
+    Only the angles of the first and the last row are read: within the milliseconds of a readout the angle is linear to
+    1e-5 rad even while the stage accelerates at 1 rad/s2.
     """
     first, last = shot.angle_at(shot.time + times[0]), shot.angle_at(shot.time + times[-1])
     span = times[-1] - times[0]

@@ -1,10 +1,10 @@
-"""Scene: what stands in the beam and which departures from Beer-Lambert are simulated; read from a YAML mapping.
+"""Scene: the sample, the beam and the simulated departures from Beer-Lambert, read from a YAML mapping.
 
 Only what a scene names is imported. Keys are the field names of the dataclasses; mm, s, 1/mm and electrons throughout:
 
     phantom: {kind: battery, field_of_view: [0.9, 0.9], n_particles: 150, seed: 7}
     # or:    {kind: solids, solids: [{kind: cylinder, radius: 0.3, height: 0.6, attenuation: 1.5}, ...]}
-    # or:    kind cathode, foam or resolution (samples.builders.cathode, ...), or volume, from a file (voxels.scene)
+    # or:    kind cathode, foam or resolution (samples.builders.cathode, ...), or volume, from a file (voxels.volume)
     beam: {photons_per_s: 1.0e5}        # detected a second and sensor pixel (quantum efficiency included)
     axis_offset_px: 3.4                 # rotation axis right of the sensor's middle, in sensor pixels
     effects: [photon_noise, {kind: zingers, rate: 5.0}]
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
@@ -24,20 +24,22 @@ from simulators.frame.mapping import build, located, named
 from simulators.light.beam import Beam
 from simulators.samples.composed.phantoms import build_sample
 from simulators.samples.sample import Sample
-from simulators.samples.voxels.stored import ReadVolume
 from simulators.scenes.settings import DetectorSettings, ScanSettings
+
+if TYPE_CHECKING:
+    from simulators.samples.voxels.volume import ReadVolume
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands in the beam.
+    """Sample, beam and effects.
 
     Attributes:
-        sample: what is looked at.
+        sample: in the beam.
         beam: the light.
-        chain: the effects, in order; with none a frame is exactly Beer-Lambert.
+        chain: the effects in order; without any a frame is exactly Beer-Lambert.
         axis_offset_px: columns by which the rotation axis lies right of the sensor's middle, in sensor pixels.
-        detector, scan: how `beamline simulate` looks at it; a configured run has settings of its own.
+        detector, scan: settings of `beamline simulate`; a configured run has its own.
     """
 
     sample: Sample
@@ -61,13 +63,13 @@ class _SceneKeys:
 
 
 def load_scene(mapping: Mapping[str, Any], read: ReadVolume | None = None) -> Scene:
-    """A scene from a mapping as YAML gives it; the keys are shown at the head of this module.
+    """A scene from a mapping of YAML; see the module's docstring for the keys.
 
     Args:
-        read: reads the files of volumes that the scene names; None: none can be named.
+        read: reads the file of a volume; None: the sample cannot be a volume.
 
     Raises:
-        SceneError: an unknown or missing key, a wrong value, or effects in an order that physics does not allow.
+        SceneError: an unknown or missing key, a wrong value, or a wrong order of effects.
     """
     keys = build(_SceneKeys, "scene", mapping)
     effects = []

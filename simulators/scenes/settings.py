@@ -1,4 +1,4 @@
-"""Shooting: how a scene is looked at where no instrument is configured: the detector's and the scan's settings."""
+"""Settings: detector and scan of a scene that is simulated without a configured instrument."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class DetectorSettings:
     exposure_s: of a frame.
     binning: sensor pixels summed per side.
     readout: the camera's mode.
-    electrons_per_count: in place of the camera's.
+    electrons_per_count: None: the camera's.
     """
 
     shape: tuple[int, int] = (512, 512)
@@ -53,8 +53,8 @@ class ScanSettings:
     """Attributes:
     views: evenly spaced over the range, its end excluded.
     range_deg: degrees.
-    period_s: s from one trigger to the next; the stage turns steadily, unless `fly` is false: then it stands while
-        a view is exposed.
+    period_s: s from one trigger to the next.
+    fly: the stage turns steadily; false: it stands while a view is exposed.
     darks, flats: taken before the views.
     """
 

@@ -1,4 +1,4 @@
-"""Shots: the frames of a scan of a scene, as the scene's own settings ask for them: darks, flats, then the views."""
+"""Shots: the frames of a scan by the scene's own settings: darks, flats, then views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from simulators.scenes.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A frame to be made: any alone, in any order, by `exposure.expose(scene, shot)`."""
+    """A frame of a scan, computed alone and in any order by `expose(scene, shot)`."""
 
     kind: FrameKind
     shot: Shot
@@ -24,13 +24,13 @@ class Planned:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A scan of a scene. Make one with `Scan.of`.
+    """A scan of a scene. Created by `Scan.of`.
 
     Attributes:
         seed: of all random numbers.
         start: s since the Unix epoch, of the first frame.
-        views: projections, spread over the scene's range whatever their number. Fewer than the scene's come after
-            longer periods where the stage flies: it turns no faster, so that a view is blurred as the scene has it.
+        views: number of projections, spread over the scene's range. Where the stage flies, fewer views have longer
+            periods: the stage turns no faster, so that the blur of a view is that of the scene.
     """
 
     scene: Scene
@@ -50,7 +50,7 @@ class Scan:
 
     @property
     def detector(self) -> Detector:
-        """Where the pixels are: the frame lies in the middle of the sensor."""
+        """The frame's pixels, in the middle of the sensor."""
         settings = self.scene.detector
         rows, cols = settings.shape
         return Detector(
@@ -78,13 +78,13 @@ class Scan:
         return math.radians(self.scene.scan.range_deg) * view / self.views
 
     def frame(self, number: int) -> Planned:
-        """Frame `number` of 0 ... len - 1, alone.
+        """Frame `number` of 0 ... len - 1.
 
         Raises:
             IndexError: there is no such frame.
         """
         if not 0 <= number < len(self):
-            raise IndexError(f"frame {number} is none of the scan's 0 ... {len(self) - 1}")
+            raise IndexError(f"frame {number} is not one of the scan's 0 ... {len(self) - 1}")
         settings, scan = self.scene.detector, self.scene.scan
         view = number - scan.darks - scan.flats
         beam, sample = number >= scan.darks, view >= 0

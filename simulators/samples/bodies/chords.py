@@ -1,10 +1,11 @@
-"""Chords: how far the rays of one row of a detector run inside one body, in a parallel beam and in a cone.
+"""Chords: lengths of the rays of one detector row inside one body, in a parallel beam and in a cone.
 
 In the laboratory's axes (u, b, v) a parallel ray is (u, 0, v) + t (0, 1, 0) and a cone's (0, -sod, 0) + t (u, sod, v),
 t = 1 being the plane of the rotation axis; `axes` [3, 3] has these axes as columns, in the sample's (x, y, z). Each
-function adds attenuation x length in t to the pixels in the body's shadow and tells which these are: from the first to
-the one after the last. `u` has the columns in mm, `per_mm` of them a mm. In a cone the caller multiplies by the length
-of (u, sod, v). All is reckoned from the body's middle, so that no digits cancel where the source is far.
+function adds attenuation x length in t to the pixels in the body's shadow and returns their range: the first and the
+one after the last. `u` has the positions of the columns in mm, `per_mm` is the number of columns a mm. In a cone the
+caller multiplies by the length of (u, sod, v). Positions are relative to the body's middle, so that no digits cancel
+where the source is far.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ Span = tuple[int, int]
 
 EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an axis
 KERNEL = {"nogil": True, "error_model": "numpy", "_nrt": False}
-"""Options of these kernels. Without reference counts (_nrt): arrays come from outside; counting who holds each slice
-takes longer than a short chord. They are kept on disk as parts of those that are called from Python (see rows)."""
+"""Options of these kernels. Without reference counts (_nrt): arrays are allocated outside, and counting references to
+slices takes longer than a short chord. They are cached on disk within the kernels called from Python (see rows)."""
 
 
 @njit(**KERNEL)
-def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: Reals, facets: Reals) -> None:
-    """What all rows share that see the sample alike: `place` float64 [7] of a body, `facets` float64 [face, 4] of all.
+def locate(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: Reals, facets: Reals) -> None:
+    """Computes what is common to all rows of one pose: `place` float64 [7] of a body, `facets` float64 [face, 4].
 
-    place: the middle (u, b, v); of a polyhedron also how far it reaches from there, least and greatest u, then b; of an
+    place: the middle (u, b, v); for a polyhedron also its bounds relative to it, least and greatest u, then b; for an
     ellipsoid in a parallel beam su, suv / su, sv - suv² / su and 2 attenuation / |D|, where the shadow is su u² + 2 suv
     u v + sv v² <= 1 (Schur complement of the ray's direction). facets, in a parallel beam: t = f0 - f1 v + f2 u on the
     face, and in f3 whether rays enter (-1), leave (1) or run along it (0).
@@ -42,7 +43,7 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
     if p.kind[b] == POLYHEDRON:
         place[3], place[4], place[5], place[6] = np.inf, -np.inf, np.inf, -np.inf
         for i in range(p.first_vertex[b], p.first_vertex[b + 1]):
-            across, deep, _ = seen(p.vertices[i], axes)
+            across, deep, _ = in_lab(p.vertices[i], axes)
             place[3], place[4] = min(place[3], across), max(place[4], across)
             place[5], place[6] = min(place[5], deep), max(place[6], deep)
     if not parallel:
@@ -52,12 +53,12 @@ def look(p: Packed, b: int, axes: Reals, origin: Reals, parallel: bool, place: R
         X, Y, dd, det = _cross(D, U), _cross(D, V), _dot(D, D), 1.0
         for k in range(3):  # of W W^T, which is diagonal
             det *= p.matrix[b, k, 0] ** 2 + p.matrix[b, k, 1] ** 2 + p.matrix[b, k, 2] ** 2
-        # Products, not differences as the complement is defined by: of those nothing is left for a needle.
+        # Products instead of the differences in the complement's definition, which cancel for a needle.
         place[3], place[4], place[5] = _dot(X, X) / dd, _dot(X, Y) / _dot(X, X), det / _dot(X, X)
         place[6] = 2.0 * p.attenuation[b] / math.sqrt(dd)
     elif p.kind[b] == POLYHEDRON:
         for f in range(p.first_face[b], p.first_face[b + 1]):
-            nu, nb, nv = seen(p.faces[f], axes)
+            nu, nb, nv = in_lab(p.faces[f], axes)
             if abs(nb) < EDGE_ON:
                 facets[f, 0], facets[f, 1], facets[f, 2], facets[f, 3] = p.faces[f, 3], nv, nu, 0.0
             else:
@@ -78,7 +79,7 @@ def upright_cylinder(row: Reals, u: Reals, per_mm: float, middle: float, radius:
 
 @njit(**KERNEL)
 def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Span:
-    """Parallel rays; `place` as `look` left it."""
+    """Parallel rays; `place` from `locate`."""
     dv = v - place[2]
     rest = 1.0 - place[5] * dv * dv
     if rest <= 0.0:
@@ -99,7 +100,7 @@ def cone_ellipsoid(
     place: Reals,
 ) -> Span:  # fmt: skip
     """A cone's rays, in the space where the ellipsoid is the unit ball: half a chord squared is |D|² - |R x D|² over
-    |D|⁴, with R where the ray comes by the middle and D its direction, both linear in u."""
+    |D|⁴, with R the ray's point next to the middle and D its direction, both linear in u."""
     near = (sod + place[1]) / sod
     middle, w = place[0] / near, near * v - place[2]
     U, B, V = _times(matrix, axes, 0), _times(matrix, axes, 1), _times(matrix, axes, 2)
@@ -168,7 +169,7 @@ def leaning_cylinder(
 
 @njit(**KERNEL)
 def columns(u: Reals, per_mm: float, low: float, high: float) -> Span:
-    """First column whose centre lies in low..high, and the one after the last; none where these are no numbers."""
+    """First column whose centre lies in low..high, and the one after the last; none where these are not numbers."""
     cols = float(u.size)
     left, right = (low - u[0]) * per_mm, (high - u[0]) * per_mm
     if not left <= right:
@@ -190,8 +191,8 @@ def _times(matrix: Reals, axes: Reals, k: int) -> Triple:
 
 
 @njit(**KERNEL)
-def seen(q: Reals, axes: Reals) -> Triple:
-    """The first three numbers of q, a vector in the sample's axes, along (u, b, v)."""
+def in_lab(q: Reals, axes: Reals) -> Triple:
+    """The first three numbers of q, a vector in the sample's axes, in the laboratory's (u, b, v)."""
     return (
         q[0] * axes[0, 0] + q[1] * axes[1, 0] + q[2] * axes[2, 0],
         q[0] * axes[0, 1] + q[1] * axes[1, 1] + q[2] * axes[2, 1],

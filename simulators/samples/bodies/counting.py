@@ -1,6 +1,6 @@
-"""Counting: counts of line integrals by an exponential in the processor's lanes (numba's own is scalar).
+"""Counting: counts of line integrals by a vectorised exponential (numba's own is scalar).
 
-numpy's is as fast, but not to be had inside a kernel, where a row is still in the cache.
+numpy's is as fast, but cannot be called inside a kernel, where a row is still in the cache.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from simulators.samples.bodies.chords import KERNEL, Reals
 
 Counts = NDArray[np.uint16]
 
-# 2^x on [-1/2, 1/2] by Chebyshev's points, of degree 9: relative error 2e-14.
+# 2^x on [-1/2, 1/2], interpolated at Chebyshev points, degree 9: relative error 2e-14.
 _EXP2 = (
     1.000000000000014, 0.6931471805599526, 0.24022650695631514, 0.05550410866428854, 0.009618129195951041,
     0.001333355825801874, 0.00015403432339553542, 1.5252640059770786e-05, 1.3259945262689143e-06,
@@ -25,9 +25,9 @@ _EXP2 = (
 )  # fmt: skip
 _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = _EXP2
 _LOG2E = math.log2(math.e)
-_ROUND = 1.5 * 2.0**52  # added, it leaves the nearest whole number in the last bits
-_FAR = 1000.0  # binary orders of magnitude: beyond, there is no light, or too much
-DOUBT = 1e-7  # counts from the middle between two: 70 times the error of all steps here at full range
+_ROUND = 1.5 * 2.0**52  # adding it puts the nearest integer into the last bits
+_FAR = 1000.0  # binary orders of magnitude: beyond, there is no light or too much
+DOUBT = 1e-7  # counts from a half-integer: 70 times the error of this module at full range
 
 
 @intrinsic
@@ -44,13 +44,13 @@ def _real(context, x):  # type: ignore[no-untyped-def]
 
 @njit(fastmath={"contract"}, **KERNEL)
 def to_counts(depth: Reals, open_beam: float, top: float, out: Counts) -> bool:
-    """Counts of line integrals; whether one of them lies so close to the middle of two that it is in doubt."""
+    """Counts of line integrals; returns whether any is so close to a half-integer that its rounding is in doubt."""
     doubts = 0
     for i in range(depth.size):
         x = min(max(depth[i] * -_LOG2E, -_FAR), _FAR)
         whole = x + _ROUND
         f = x - (whole - _ROUND)
-        # Estrin's scheme: the processor has several multiply-adds under way at once
+        # Estrin's scheme: several independent multiply-adds at once
         f2 = f * f
         f4 = f2 * f2
         low = (_C0 + _C1 * f) + (_C2 + _C3 * f) * f2

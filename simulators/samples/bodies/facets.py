@@ -1,9 +1,9 @@
-"""Facets: chords of one row's rays in a polyhedron: the gap between faces they leave by and enter by.
+"""Facets: chords of one row's rays in a polyhedron: the gap between the faces where they leave and where they enter.
 
-See chords for rays, units and arguments. Where a ray leaves by a face is a straight line over the row (of t in a
-parallel beam, of 1/t in a cone), and so is where it enters. The chord is what lies between the lowest of the first,
-`lines` [0:2] (value at the middle, slope), and the highest of the others, `lines` [2:4]: a concave function of the
-column. In a cone, where 1/t turns them round, [0:2] are those by which rays enter.
+See chords for rays, units and arguments. The t (in a cone 1/t) at which a ray crosses a face is linear in the column.
+The chord is the gap between the lowest line of the faces where rays leave, `lines` [0:2] (value at the middle, slope),
+and the highest of those where they enter, `lines` [2:4]: a concave function of the column. In a cone, where 1/t
+reverses the order, [0:2] are the faces where rays enter.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from simulators.samples.bodies.chords import EDGE_ON, KERNEL, Reals, Span, columns, seen
+from simulators.samples.bodies.chords import EDGE_ON, KERNEL, Reals, Span, columns, in_lab
 from simulators.samples.bodies.packing import Packed
 
 
@@ -19,7 +19,7 @@ from simulators.samples.bodies.packing import Packed
 def polyhedron(
     row: Reals, u: Reals, per_mm: float, v: float, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals
 ) -> Span:
-    """Parallel rays; `lines` float64 [4, faces] is room to work in."""
+    """Parallel rays; `lines` float64 [4, faces] is scratch memory."""
     dv = v - place[2]
     left, right, high, low = place[3], place[4], 0, 0
     for f in range(p.first_face[b], p.first_face[b + 1]):
@@ -59,7 +59,7 @@ def cone_polyhedron(
     left, right = min(left * front, left * back) - middle, max(right * front, right * back) - middle
     high = low = 0
     for f in range(p.first_face[b], p.first_face[b + 1]):
-        nu, nb, nv = seen(p.faces[f], axes)
+        nu, nb, nv = in_lab(p.faces[f], axes)
         inside = p.faces[f, 3] + nu * place[0] + nb * (sod + place[1]) + nv * place[2]
         at_middle = nu * middle + nb * sod + nv * v
         if abs(inside) < EDGE_ON * sod:
@@ -78,8 +78,8 @@ def cone_polyhedron(
 def _opened(
     u: Reals, per_mm: float, middle: float, lines: Reals, high: int, low: int, left: float, right: float
 ) -> Span:
-    """Columns within left..right in which the gap is open: by Newton's steps from both ends, which never go too far."""
-    if high == 0 or low == 0:  # all faces edge-on: a sliver that rounding leaves
+    """Columns within left..right where the gap is positive: by Newton's steps from both ends, which never overshoot."""
+    if high == 0 or low == 0:  # all faces edge-on: a sliver left by rounding
         return 0, 0
     left = _step(lines, high, low, left, right, 1.0)
     if left < right:
@@ -91,7 +91,7 @@ def _opened(
 
 @njit(**KERNEL)
 def _step(lines: Reals, high: int, low: int, at: float, end: float, way: float) -> float:
-    """Where the gap opens on the way from `at` to `end`, or `end`; u - middle is way x at."""
+    """The first position between `at` and `end` where the gap is positive, or `end`; u - middle is way x at."""
     k = m = -1
     for _ in range(high + low):
         above, below, last_k, last_m = np.inf, -np.inf, k, m
@@ -116,7 +116,7 @@ def _step(lines: Reals, high: int, low: int, at: float, end: float, way: float) 
 
 @njit(**KERNEL)
 def _add_gap(row: Reals, u: Reals, middle: float, attenuation: float, lines: Reals, high: int, low: int) -> None:
-    """Add attenuation x the gap; up to four lines of each kind, or eight: a fixed number, for the processor's lanes."""
+    """Add attenuation x the gap; four or eight lines of each kind: a fixed number, for the processor's vector lanes."""
     most = 4 if max(high, low) <= 4 else 8
     for i in range(high, most):
         lines[0, i], lines[1, i] = np.inf, 0.0

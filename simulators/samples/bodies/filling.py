@@ -1,4 +1,4 @@
-"""Filling: which share of a voxel packed solids fill, and which solid is at its centre."""
+"""Filling: the share of each voxel that packed solids fill, and the solid at its centre."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False} 
 def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, out: Reals) -> None:
     """Add attenuation x filled share to `out`, float64 [z, y, x].
 
-    The share is counted on supersample³ points, only in voxels that the surface can cross.
+    The share is counted on supersample³ points, only in voxels that a surface can cross.
 
     Args:
         corner: (z, y, x) of voxel (0, 0, 0)'s centre, mm.
@@ -46,7 +46,8 @@ def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, 
 
 @njit(**_KERNEL)
 def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Triple, out: NDArray[np.uint8]) -> None:
-    """Write label[solid] where a voxel's centre lies in a solid, later ones over earlier; a tube's bore is not tube.
+    """Write label[solid] where a voxel's centre lies in a solid; later ones replace earlier ones, and a tube's bore
+    is not part of it.
 
     `out` is uint8 [z, y, x]; corner and edges as for add_attenuation.
     """
@@ -73,8 +74,8 @@ def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Tripl
 
 @njit(**_KERNEL)
 def _line(p: Packed, b: int, y: float, z: float, limit: float, left: float, edge: float, n: int) -> tuple[int, int]:
-    """Voxels first to stop of a line along x whose centres have a level <= limit: bodies are convex, so they are
-    neighbours. In closed form, and then by the level itself at both ends."""
+    """Range of voxels of a line along x whose centres have a level <= limit; contiguous, since bodies are convex. In
+    closed form, then corrected by the level itself at both ends."""
     low, high = -np.inf, np.inf
     if p.kind[b] == CYLINDER:
         radius = p.size[b, 0] + limit
@@ -117,7 +118,7 @@ def _line(p: Packed, b: int, y: float, z: float, limit: float, left: float, edge
 
 @njit(**_KERNEL)
 def _level(p: Packed, b: int, x: float, y: float, z: float) -> float:
-    """Negative inside, positive outside; changes by at most 1 mm per mm, so it bounds the distance to the surface."""
+    """Negative inside, positive outside; its slope is 1 at most, so that it bounds the distance to the surface."""
     if p.kind[b] == CYLINDER:
         return max(math.sqrt(x * x + y * y) - p.size[b, 0], abs(z) - p.size[b, 1])
     if p.kind[b] == ELLIPSOID:

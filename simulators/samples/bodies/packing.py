@@ -31,7 +31,7 @@ CYLINDER, ELLIPSOID, POLYHEDRON = 0, 1, 2
 
 
 class Packed(NamedTuple):
-    """Solids as flat arrays, one entry a body (a tube is two: outer and, negative, its bore). Numba takes it as it is.
+    """Solids as flat arrays for numba, one entry a body (a tube is two: outer and, negative, its bore).
 
     Attributes:
         kind: int64 [n], CYLINDER, ELLIPSOID or POLYHEDRON.
@@ -97,7 +97,7 @@ def pack(solids: Sequence[Solid]) -> Packed:
 
 def rotation(quaternion: Quaternion) -> Reals:
     """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any length but zero."""
-    length = math.hypot(*quaternion)  # numpy's norm squares, and of 1e200 and 1e-200 nothing is left
+    length = math.hypot(*quaternion)  # numpy's norm overflows or underflows for 1e200 and 1e-200
     w, x, y, z = (part / length for part in quaternion)
     return np.array(
         [
@@ -132,5 +132,5 @@ def _hull(solid: Faceted) -> polyhedra.Hull:
 
 
 def _starts(parts: list[Reals]) -> Wholes:
-    """Where each part begins once they stand one after the other, and where the last ends."""
+    """Start of each part in their concatenation, and the end of the last."""
     return np.cumsum([0] + [len(part) for part in parts], dtype=np.int64)

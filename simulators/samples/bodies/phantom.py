@@ -1,4 +1,4 @@
-"""Phantom: analytic solids seen with exact chord lengths, and their true attenuation on a grid."""
+"""Phantom: analytic solids with exact chord lengths, and their true attenuation on a grid."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ MOST_NAMES = 255  # labels are uint8, and 0 is air
 
 @dataclass(frozen=True, eq=False)
 class Phantom:
-    """Solids ready to be seen. Make one with Phantom.of.
+    """Solids prepared for the kernels. Created by Phantom.of.
 
     Attributes:
-        solids: in the order in which they fill space: later ones lie over earlier ones.
-        solid_names: what each is called, in the labels.
-        packed: the same for the kernels.
+        solids: in the order in which they fill space: in labels, later ones replace earlier ones.
+        solid_names: name of each in the labels.
+        packed: the solids as flat arrays.
     """
 
     solids: tuple[Solid, ...]
@@ -40,7 +40,7 @@ class Phantom:
         """A phantom.
 
         Args:
-            names: one a solid, for the labels; several may share one. By default each is called by its kind.
+            names: one a solid, for the labels; several may share one. None: the names of the kinds.
 
         Raises:
             ValueError: not as many names as solids, or more than 255 different ones.
@@ -54,12 +54,12 @@ class Phantom:
 
     @cached_property
     def radius(self) -> float:
-        """mm from the rotation axis to the farthest matter; an ellipsoid counts as the upright elliptic cylinder around
-        it turned with its longer axis outwards."""
+        """mm from the rotation axis to the farthest matter; an ellipsoid is bounded by the upright elliptic cylinder
+        around it, turned with its longer axis outwards."""
         p = self.packed
         out = np.hypot(p.centre[:, 0], p.centre[:, 1])
         round_ = p.kind == ELLIPSOID
-        across = np.linalg.inv(p.matrix[round_])[:, :2]  # columns: the semi-axes, seen from above
+        across = np.linalg.inv(p.matrix[round_])[:, :2]  # columns: the semi-axes, projected along z
         half = np.linalg.norm(across, ord=2, axis=(1, 2))
         corners = np.repeat(p.centre, np.diff(p.first_vertex), axis=0)[:, :2] + p.vertices[:, :2]
         reaches = (
@@ -98,7 +98,7 @@ class Phantom:
         return out.astype(np.float32)
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
-        """See Sample.labels; where solids overlap, the later one is what is there; a tube's bore is not tube."""
+        """See Sample.labels; where solids overlap, the later one counts; a tube's bore is not part of it."""
         out = np.zeros(grid.shape, np.uint8)
         index = {name: i + 1 for i, name in enumerate(self.names)}
         label = np.array([index[name] for name in self.solid_names], dtype=np.uint8)

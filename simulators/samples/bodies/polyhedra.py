@@ -1,4 +1,4 @@
-"""Polyhedra: convex bodies as face planes and corners, from either, and what is no such body refused."""
+"""Polyhedra: convex bodies as face planes and corners, computed from either; others are refused."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 Reals = NDArray[np.float64]
 
-FLAT = 1e-9  # of the body's size: corners closer than this to a plane lie in it
+FLAT = 1e-9  # of the body's size: corners closer than this to a plane count as in it
 MOST = 64  # corners or faces: all triples of them are tried
 
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A bounded convex body with an inside, in its own axes.
+    """A bounded convex body with a volume, in its own axes.
 
     Attributes:
         normals: float64 [face, 3], unit, outward.
@@ -78,7 +78,7 @@ def hull_of_vertices(vertices: Sequence[Sequence[float]]) -> Hull:
     """The convex polyhedron with these corners, mm.
 
     Raises:
-        ValueError: fewer than 4 or too many, all in a plane, or one that is no corner of their hull.
+        ValueError: fewer than 4 or too many, all in a plane, or one that is not a corner of their hull.
     """
     points = _numbers("vertices", vertices, 3)
     size = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
@@ -99,7 +99,7 @@ def hull_of_vertices(vertices: Sequence[Sequence[float]]) -> Hull:
     for i, point in enumerate(points):
         if np.linalg.matrix_rank(normals[on[:, i]], tol=1e-6) < 3:
             raise ValueError(
-                f"polyhedron: not convex: vertex {i} at {tuple(point.tolist())} mm is no corner of the hull of all; "
+                f"polyhedron: not convex: vertex {i} at {tuple(point.tolist())} mm is not a corner of the hull of all; "
                 f"leave it out, or describe the body by several convex ones"
             )
     return Hull(normals, distances, points)
@@ -107,7 +107,7 @@ def hull_of_vertices(vertices: Sequence[Sequence[float]]) -> Hull:
 
 def hull_of_faces(faces: Sequence[Sequence[float]]) -> Hull:
     """The convex polyhedron inside these half-spaces (nx, ny, nz, distance): n · p <= distance in mm for the unit
-    normal; one that cuts nothing off is left out.
+    normal; redundant ones are dropped.
 
     Raises:
         ValueError: a normal of length zero, fewer than 4 faces or too many, nothing inside all of them, or a body
@@ -117,10 +117,13 @@ def hull_of_faces(faces: Sequence[Sequence[float]]) -> Hull:
     largest = np.abs(planes[:, :3]).max(axis=1)
     if not largest.all():
         raise ValueError(f"polyhedron: face {int(largest.argmin())} has a normal of length zero")
-    normals, distances = planes[:, :3] / largest[:, None], planes[:, 3]  # first, for their squares may be no numbers
+    normals, distances = (
+        planes[:, :3] / largest[:, None],
+        planes[:, 3],
+    )  # scaled first, since their squares may overflow
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # Bounded where no direction leads away from all faces: the normals then span space with positive weights. The
-    # extreme directions are among those along two faces.
+    # Bounded if no direction leads away from all faces: the normals then span space with positive weights. The extreme
+    # directions are among those along two faces.
     i, j = np.array(list(combinations(range(len(normals)), 2))).T
     along = np.cross(normals[i], normals[j])
     reach = np.linalg.norm(along, axis=1)
@@ -138,7 +141,7 @@ def hull_of_faces(faces: Sequence[Sequence[float]]) -> Hull:
         raise ValueError(f"polyhedron: nothing is inside all of its {len(normals)} faces")
     size = float(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).max())
     if np.linalg.matrix_rank(vertices - vertices[0], tol=1e-6 * size) < 3:
-        raise ValueError(f"polyhedron: what is inside its {len(normals)} faces is flat; a body has a volume")
+        raise ValueError(f"polyhedron: the space inside its {len(normals)} faces is flat; a body has a volume")
     normals, distances = _distinct(normals, distances, size)
     on = np.abs(normals @ vertices.T - distances[:, None]) <= 10 * FLAT * size
     needed = [np.linalg.matrix_rank(vertices[row] - vertices[row][:1], tol=1e-6 * size) == 2 for row in on]

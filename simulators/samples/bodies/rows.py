@@ -1,7 +1,7 @@
-"""Rows: a frame's line integrals, and its counts where nothing but Beer-Lambert happens, row by row while in the cache.
+"""Rows: a frame's line integrals, and its counts where nothing but Beer-Lambert is simulated, row by row in the cache.
 
-Each row is the sum over the bodies that shadow it, in their order, so that threads and neighbours change no bit of it.
-Upright cylinders (in a parallel beam) come first: what they add is kept from row to row while they are the same.
+Each row is the sum over the bodies that shadow it, in their order, so that it does not depend on threads or other rows.
+Upright cylinders (in a parallel beam) come first: their sum is reused from row to row while they are the same.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from simulators.samples.bodies import chords, counting, facets, packing
 from simulators.samples.bodies import view as views
-from simulators.samples.bodies.chords import KERNEL, cone_ellipsoid, ellipsoid, leaning_cylinder, look, upright_cylinder
+from simulators.samples.bodies.chords import (
+    KERNEL,
+    cone_ellipsoid,
+    ellipsoid,
+    leaning_cylinder,
+    locate,
+    upright_cylinder,
+)
 from simulators.samples.bodies.counting import Counts, to_counts
 from simulators.samples.bodies.facets import cone_polyhedron, polyhedron
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed
@@ -27,35 +34,35 @@ from simulators.samples.bodies.view import View
 
 Reals = NDArray[np.float64]
 
-TILE = 64  # columns: a row's bodies touch some, and only these are looked at
-SMALL = 2**16  # pixels: a thread takes longer to start than so many to compute
-_BRIGHT = 600.0  # e to this is more than any converter takes, and less than float64 does
+TILE = 64  # columns: only tiles that a body shadows are converted to counts
+SMALL = 2**16  # pixels that are computed faster than a thread starts
+_BRIGHT = 600.0  # exp of it exceeds any converter's range and fits into float64
 
 Kernel = Callable[..., None]
 
 
 def _entries(version: int) -> tuple[Kernel, Kernel]:
-    """What is called from Python, kept on disk with all that it calls.
+    """The kernels that are called from Python, cached on disk with all that they call.
 
-    Numba keeps a kernel until its own file changes, whatever becomes of the files of those it calls. It does look at
-    the values that a kernel takes from around it: here the version of all the files.
+    Numba recompiles a cached kernel when its own file changes, not when those of the kernels that it calls do. It also
+    compares the values of closure variables: here the version of all the files.
     """
 
     @njit(cache=True, **KERNEL)
-    def depth_rows(p, view, room, rows, out):  # type: ignore[no-untyped-def]
+    def depth_rows(p, view, scratch, rows, out):  # type: ignore[no-untyped-def]
         if version != 0:
-            _depth_rows(p, view, room, rows, out)
+            _depth_rows(p, view, scratch, rows, out)
 
     @njit(cache=True, **KERNEL)
-    def count_rows(p, view, room, start, step, open_beam, air, top, out, doubtful):  # type: ignore[no-untyped-def]
+    def count_rows(p, view, scratch, start, step, open_beam, air, top, out, doubtful):  # type: ignore[no-untyped-def]
         if version != 0:
-            _count_rows(p, view, room, start, step, open_beam, air, top, out, doubtful)
+            _count_rows(p, view, scratch, start, step, open_beam, air, top, out, doubtful)
 
     return depth_rows, count_rows
 
 
 def _version() -> int:
-    """Of the files that the kernels are made of; not 0."""
+    """Checksum of the kernels' files; not 0."""
     files = [__file__, *(str(module.__file__) for module in (chords, counting, facets, packing, views))]
     return zlib.crc32(b"".join(Path(file).read_bytes() for file in files)) or 1
 
@@ -63,38 +70,39 @@ def _version() -> int:
 def depths(p: Packed, view: View) -> Reals:
     """Line integrals, float64 [row, col]."""
     out = np.empty((view.v.size, view.u.size))
-    _shared(lambda first, step: depth_rows(p, view, _room(p, view), np.arange(first, view.v.size, step), out), out.size)
+    _shared(
+        lambda first, step: depth_rows(p, view, _scratch(p, view), np.arange(first, view.v.size, step), out), out.size
+    )
     return out
 
 
 def counts(p: Packed, view: View, open_beam: float, rule: Callable[[Reals], Counts]) -> Counts:
-    """open_beam x exp(-line integral), rounded and clipped, uint16 [row, col]: to the count what `rule` makes of the
-    line integrals.
+    """open_beam x exp(-line integral), rounded and clipped, uint16 [row, col]: equal to rule(line integrals).
 
-    The exponential here is a polynomial; the rows where it leaves a count in doubt are left to the rule.
+    The exponential here is a polynomial; rows where the rounding of a count is in doubt are computed by the rule.
 
     Args:
         open_beam: counts without a sample, not rounded.
-        rule: counts of line integrals [row, col], which it may write over.
+        rule: counts of line integrals [row, col], which it may overwrite.
     """
     out, doubtful = np.empty((view.v.size, view.u.size), np.uint16), np.zeros(view.v.size, np.bool_)
     air, top = (int(rule(np.full((1, 1), depth))[0, 0]) for depth in (0.0, -_BRIGHT))
     _shared(
-        lambda first, step: count_rows(p, view, _room(p, view), first, step, open_beam, air, top, out, doubtful),
+        lambda first, step: count_rows(p, view, _scratch(p, view), first, step, open_beam, air, top, out, doubtful),
         out.size,
     )
     rows = np.flatnonzero(doubtful)
     if rows.size:
         again = np.empty((rows.size, view.u.size))
-        depth_rows(p, view, _room(p, view), rows, again)
+        depth_rows(p, view, _scratch(p, view), rows, again)
         out[rows] = rule(again)
     return out
 
 
 def _shared(work: Callable[[int, int], None], pixels: int) -> None:
-    """Do work(first row, step) in as many threads as numba may have.
+    """Run work(first row, step) in as many threads as numba may use.
 
-    Threads of Python, not numba's: those would start OpenMP before torch does, which slows torch down.
+    Python's threads, not numba's: those would start OpenMP before torch does, which slows torch down.
     """
     threads = int(config.NUMBA_NUM_THREADS) if pixels > SMALL else 1
     if threads == 1:
@@ -108,10 +116,10 @@ def _shared(work: Callable[[int, int], None], pixels: int) -> None:
 
 
 @njit(**KERNEL)
-def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out: Reals) -> None:
-    """Line integrals of some rows into the rows of `out`, or into its row of the same number where it has them all."""
-    place, facets, lines, touched, base = room.place, room.facets, room.lines, room.touched, room.base
-    _look_once(p, view, place, facets)
+def _depth_rows(p: Packed, view: View, scratch: Scratch, rows: NDArray[np.int64], out: Reals) -> None:
+    """Line integrals of some rows, into the rows of `out`, or into the rows of the same numbers of a whole frame."""
+    place, facets, lines, touched, base = scratch.place, scratch.facets, scratch.lines, scratch.touched, scratch.base
+    _locate_all(p, view, place, facets)
     whole = out.shape[0] == view.v.size
     known = -1
     for r in range(rows.size):
@@ -124,12 +132,12 @@ def _depth_rows(p: Packed, view: View, room: Room, rows: NDArray[np.int64], out:
 
 @njit(**KERNEL)
 def _count_rows(
-    p: Packed, view: View, room: Room, start: int, step: int, open_beam: float, air: int, top: float, out: Counts,
+    p: Packed, view: View, scratch: Scratch, start: int, step: int, open_beam: float, air: int, top: float, out: Counts,
     doubtful: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Every step-th row of counts; marks the rows in which one is in doubt."""
-    place, facets, lines, touched, row, base, of_base = room
-    _look_once(p, view, place, facets)
+    """Counts of every step-th row; marks the rows in which the rounding of a count is in doubt."""
+    place, facets, lines, touched, row, base, of_base = scratch
+    _locate_all(p, view, place, facets)
     known, base_in_doubt = -1, False
     for j in range(start, view.v.size, step):
         before = known
@@ -155,8 +163,8 @@ def _count_rows(
         doubtful[j] = doubt
 
 
-class Room(NamedTuple):
-    """Arrays to work in, one set a thread: kernels here make none of their own."""
+class Scratch(NamedTuple):
+    """Scratch arrays of one thread; the kernels here allocate none."""
 
     place: Reals
     facets: Reals
@@ -167,8 +175,8 @@ class Room(NamedTuple):
     of_base: Counts
 
 
-def _room(p: Packed, view: View) -> Room:
-    return Room(
+def _scratch(p: Packed, view: View) -> Scratch:
+    return Scratch(
         np.zeros((p.kind.size, 7)),
         np.zeros((p.faces.shape[0], 4)),
         np.empty((4, max(8, int(np.diff(p.first_face).max(initial=0))))),
@@ -192,17 +200,17 @@ def _fill(out: NDArray[Any], value: float) -> None:
 
 
 @njit(**KERNEL)
-def _look_once(p: Packed, view: View, place: Reals, facets: Reals) -> None:
-    """Look at all bodies where all rows see them alike."""
+def _locate_all(p: Packed, view: View, place: Reals, facets: Reals) -> None:
+    """Locate all bodies where all rows have the same pose."""
     if view.axes.shape[0] == 1:
         for b in range(p.kind.size):
-            look(p, b, view.axes[0], view.origin[0], view.sod == np.inf, place[b], facets)
+            locate(p, b, view.axes[0], view.origin[0], view.sod == np.inf, place[b], facets)
 
 
 @njit(**KERNEL)
 def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) -> tuple[int, int, int]:
-    """What upright cylinders add to row j; kept where row `known` has the same. The row it is known from, and where it
-    is not air (of a new one)."""
+    """The sum of upright cylinders in row j, reused where row `known` has the same ones. Returns the row that it was
+    computed for and, where it is new, the range of columns that is not air."""
     start, stop = view.first_round[j], view.first_round[j + 1]
     alike = view.axes.shape[0] == 1 and known >= 0
     if alike:
@@ -219,7 +227,7 @@ def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) 
     for k in range(start, stop):
         b = view.round[k]
         if view.axes.shape[0] > 1:
-            look(p, b, view.axes[j], view.origin[j], True, place[b], place[:0])
+            locate(p, b, view.axes[j], view.origin[j], True, place[b], place[:0])
         if abs(view.v[j] - place[b, 2]) <= p.size[b, 1] + 1e-9 * view.pitch:
             first, end = upright_cylinder(base, view.u, 1.0 / view.pitch, place[b, 0], p.size[b, 0], p.attenuation[b])
             left, right = min(left, first), max(right, end)
@@ -239,7 +247,7 @@ def _add_bodies(
         b = view.bodies[k]
         kind, a = p.kind[b], p.attenuation[b]
         if not one:
-            look(p, b, axes, origin, parallel, place[b], facets)
+            locate(p, b, axes, origin, parallel, place[b], facets)
         if kind == CYLINDER:
             first, stop = leaning_cylinder(row, u, per_mm, v, sod, p.size[b, 0], p.size[b, 1], a, axes, place[b])
         elif kind == ELLIPSOID and parallel:

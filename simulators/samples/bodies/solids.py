@@ -22,9 +22,9 @@ Face = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 LEAST, MOST = 1e-9, 1e9
-"""mm: with lengths far beyond, squares and quotients in the kernels are no numbers, and no place in a frame."""
+"""mm: with lengths far beyond, squares and quotients in the kernels overflow."""
 DENSEST = 1e12
-"""1/mm: sums of far larger ones over chords are no numbers."""
+"""1/mm: with far larger ones, sums over chords overflow."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ class Plate:
 class TruncatedOctahedron:
     """Octahedron whose corners are cut off, the habit of well-grown spinel and layered oxides; any orientation.
 
-    |x|/a + |y|/b + |z|/c <= 1 and |x|/a, |y|/b, |z|/c <= `cut` in its own axes, (a, b, c) being `half_diagonals`: 1/2
-    leaves squares that touch at their corners, 2/3 equal edges, and towards 1 the octahedron is whole.
+    |x|/a + |y|/b + |z|/c <= 1 and |x|/a, |y|/b, |z|/c <= `cut` in its own axes, (a, b, c) being `half_diagonals`:
+    at 1/2 the squares touch at their corners, at 2/3 all edges are equal, and towards 1 the octahedron is whole.
     """
 
     half_diagonals: Vector
@@ -179,9 +179,9 @@ class Polyhedron:
     def __post_init__(self) -> None:
         _check(self)
         if (self.vertices is None) == (self.faces is None):
-            raise ValueError("polyhedron: give either vertices or faces, not both and not neither")
+            raise ValueError("polyhedron: give either vertices or faces")
         given = [c for p in self.vertices or () for c in p] or [face[-1] for face in self.faces or () if face]
-        self._check_size(max(map(abs, given), default=1.0))  # first, for their products may be no numbers
+        self._check_size(max(map(abs, given), default=1.0))  # first, since their products may overflow
         corners = self.hull().vertices
         self._check_size(float(np.ptp(corners, axis=0).max()))
         self._check_size(float(np.abs(corners).max()))
@@ -226,8 +226,7 @@ def kind_of(solid: Solid) -> str:
 
 
 def _check(solid: Solid, **lengths: float | Vector) -> None:
-    """Raises ValueError for a length that is not positive or not of this world, a non-finite number or a zero
-    quaternion."""
+    """Raises ValueError for a length that is not positive or out of range, a non-finite number or a zero quaternion."""
     name = kind_of(solid)
     for key, value in lengths.items():
         each = value if isinstance(value, tuple) else (value,)

@@ -1,4 +1,4 @@
-"""View: the rays of a frame as the kernels take them, and which bodies may cast a shadow on which rows."""
+"""View: the rays of a frame for the kernels, and the bodies that may shadow each row."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Wholes = NDArray[np.int64]
 
 
 class View(NamedTuple):
-    """Numba takes it as it is.
+    """The rays of a frame, for numba.
 
     Attributes:
         u, v: float64 [col], [row], mm.
@@ -28,7 +28,7 @@ class View(NamedTuple):
         sod: mm, infinite in a parallel beam.
         axes: float64 [pose, 3, 3] and
         origin: float64 [pose, 3], see Pose.frames; one pose for the frame, or one a row.
-        upright: parallel beam, and the sample's z is the laboratory's v: rows see a cylinder alike.
+        upright: parallel beam and the sample's z is the laboratory's v: a cylinder's shadow is the same in all rows.
         first: int64 [row + 1]; the bodies first[j] to first[j + 1] of the next may shadow row j.
         bodies: int64, in their order.
         first_round, round: the same for upright cylinders, which are in `bodies` where the view is not upright.
@@ -51,16 +51,16 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
     """The rays of a frame.
 
     Args:
-        names: what each solid is called, for messages.
+        names: of the solids, for messages.
 
     Raises:
-        ValueError: a pose that is not one a row.
+        ValueError: the pose has not one angle a row.
         CannotExposeError: a body at or behind the source of a cone.
     """
     rows = detector.shape[0]
     if pose.angle.shape != (rows,):
         raise ValueError(f"the pose has {pose.angle.size} angles and the detector {rows} rows; give one a row")
-    axes, origin = (pose if not _alike(pose) else _of_row(pose, 0)).frames()
+    axes, origin = (pose if not _one_pose(pose) else _of_row(pose, 0)).frames()
     upright = math.isinf(detector.sod) and (pose.tilt is None or not pose.tilt.any())
     low, high = _reach(p, axes, origin, 2)
     ahead = np.ones(p.kind.size, dtype=np.bool_)
@@ -80,8 +80,8 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
     )  # fmt: skip
 
 
-def _alike(pose: Pose) -> bool:
-    """Whether all rows see the sample alike."""
+def _one_pose(pose: Pose) -> bool:
+    """Whether all rows have the same pose."""
     return all(a is None or bool((a == a[:1]).all()) for a in (pose.angle, pose.shift, pose.tilt))
 
 
@@ -95,8 +95,8 @@ def _of_row(pose: Pose, j: int) -> Pose:
 
 
 def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]:
-    """Bounds of each body along the laboratory's k-th axis in all poses, mm: its box in the first pose, and as much
-    more as the poses differ."""
+    """Bounds of each body along the laboratory's k-th axis in all poses, mm: its box in the first pose, widened
+    by the difference of the poses."""
     axis, at = axes[:, :, k], np.einsum("ri,ri->r", axes[:, :, k], origin)
     drift = np.linalg.norm(axis - axis[0], axis=1).max(initial=0.0)
     far = np.linalg.norm(p.centre, axis=1) + np.linalg.norm(p.extent, axis=1)
@@ -106,7 +106,7 @@ def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]
 
 
 def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, sod: float, doubtful: Wholes) -> None:
-    """Raises CannotExposeError where one of the doubtful bodies, seen exactly, is not wholly in front of the source."""
+    """Raises CannotExposeError where the exact shape of a doubtful body is not wholly in front of the source."""
     for i in doubtful:
         axis = axes[:, :, 1]
         if p.kind[i] == CYLINDER:
@@ -119,7 +119,7 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
         gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
         if not gap > 1e-9 * sod:
             raise CannotExposeError(
-                f"solid {p.owner[i]} ({names[p.owner[i]]}) reaches {-gap:.3g} mm behind the source, which stands "
+                f"solid {p.owner[i]} ({names[p.owner[i]]}) reaches {-gap:.3g} mm behind the source, which is "
                 f"{sod:g} mm before the rotation axis; it must lie wholly in front: move it, or raise sod. "
                 f"No frame was computed"
             )
@@ -127,7 +127,7 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
 
 @njit(cache=True)
 def _by_row(above: Wholes, below: Wholes, wanted: NDArray[np.bool_], rows: int) -> tuple[Wholes, Wholes]:
-    """The wanted bodies that touch each row, and where each row's begin: as much work as there are entries."""
+    """The wanted bodies that touch each row, and the start of each row's; the work is linear in the entries."""
     first = np.zeros(rows + 1, np.int64)
     for b in range(above.size):
         if wanted[b]:

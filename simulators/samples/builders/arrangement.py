@@ -1,9 +1,9 @@
-"""Arrangement: convex bodies put at random places in a cylinder and moved apart until no two of them overlap.
+"""Arrangement: places convex bodies at random in a cylinder and moves them apart until no two overlap.
 
-A force-biased packing (Mościński, Bargieł, Rycerz and Jacobs, Mol. Simul. 3, 1989): all bodies stand at their full size
-from the beginning, and each pair that overlaps is pushed apart along the direction in which it overlaps least; random
-sequential addition stalls at 0.38 of the volume where this goes beyond 0.5. Bodies keep their orientation. Two bodies
-are taken for apart only where a plane between them is known: none that overlap are ever let pass.
+A force-biased packing (Mościński, Bargieł, Rycerz and Jacobs, Mol. Simul. 3, 1989): all bodies have their full size
+from the beginning, and each pair that overlaps is pushed apart along the direction in which it overlaps least. It
+reaches beyond 0.5 of the volume, where random sequential addition stalls at 0.38. Bodies keep their orientation. Two
+bodies count as apart only where a separating plane is known, so that no overlap is missed.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Wholes = NDArray[np.int64]
 
 SWEEPS = 600
 SPARE = 0.03
-"""Of the median reach: what bodies are moved apart more than they need."""
+"""Extra distance by which bodies are moved apart, over the median reach."""
 SKIN = 0.3
-"""Of the median reach: how far beyond a body its neighbours are looked for, so that they need not be each time."""
-LOOKS, FALL = 12, 0.8
-"""Directions tried for a plane between two bodies, before they are taken to overlap; each turns this much less."""
+"""Margin within which a body's neighbours are listed, over the median reach, so that the list serves several sweeps."""
+TRIALS, DECAY = 12, 0.8
+"""Directions tried for a separating plane before two bodies count as overlapping, and the ratio of successive turns."""
 
 
 class Bodies(NamedTuple):
@@ -36,7 +36,7 @@ class Bodies(NamedTuple):
 
     Attributes:
         reach: float64 [n], mm, of the sphere around each.
-        across, up: float64 [n], mm, farthest from its own upright axis, and half its height.
+        across, up: float64 [n], mm, largest distance from its own vertical axis, and half its height.
         spread: float64 [n, 3, 3], mm: an ellipsoid is this matrix times the unit ball; not used for others.
         first: int64 [n + 1]; corners of body i are first[i] to first[i + 1] of `corners`, none of an ellipsoid.
         corners: float64 [corner, 3], mm from the centre.
@@ -51,7 +51,7 @@ class Bodies(NamedTuple):
 
 
 def bodies_of(solids: Sequence[Solid]) -> Bodies:
-    """Ellipsoids and polyhedra without their places. Raises ValueError for others, and for a body without symmetry."""
+    """Ellipsoids and polyhedra without centres. Raises ValueError for others, and for bodies without point symmetry."""
     p = pack(solids)
     n = len(solids)
     if not np.isin(p.kind, (ELLIPSOID, POLYHEDRON)).all():
@@ -78,21 +78,21 @@ def arrange(
     """Centres (x, y, z), float64 [n, 3] in mm, in an upright cylinder around the origin; wholly inside it.
 
     Args:
-        gap: mm at least between two bodies.
-        sweeps: over all bodies, before it is given up.
+        gap: mm between two bodies, at least.
+        sweeps: largest number of passes over all bodies.
 
     Raises:
-        ValueError: a body is larger than the cylinder, the gaps alone are, or they do not come apart.
+        ValueError: a body or the sum of gaps is larger than the cylinder, or bodies still overlap at the end.
     """
     room, tall = radius - bodies.across, height / 2 - bodies.up
     if min(room.min(), tall.min()) < 0:
         raise ValueError(
             f"a particle of {2e3 * bodies.reach.max():.3g} um does not fit into {2 * radius:.3g} x {height:.3g} mm "
-            "(diameter x height); make the room larger or the particles smaller"
+            "(diameter x height); make the cell larger or the particles smaller"
         )
     n = room.size
-    # Balls of the gap's width around the centres do not overlap either. Asked first: with all of them neighbours of all
-    # it would take hours to find that out.
+    # Balls of the gap's width around the centres do not overlap either. Checked first: with each a neighbour of all
+    # others the search would take hours.
     if n * gap**3 / 6 > (radius + gap / 2) ** 2 * (height + gap):
         raise ValueError(
             f"a gap of {1e3 * gap:.3g} um between {n} particles is more than {2 * radius:.3g} x {height:.3g} mm "
@@ -115,8 +115,8 @@ def arrange(
 def _part(
     centres: Reals, bodies: Bodies, room: Reals, tall: Reals, gap: float, wanted: float, skin: float, sweeps: int
 ) -> int:
-    """Move the bodies apart, in place; how many are still closer than `gap`. Each pair is moved apart as far as
-    `wanted`, so that it need not be met exactly."""
+    """Moves the bodies apart, in place; returns how many are still closer than `gap`. Pairs are moved to a distance of
+    `wanted`, so that the gap need not be met exactly."""
     n = centres.shape[0]
     room_for = wanted + skin
     pairs = _near(centres, bodies.reach, room_for)
@@ -149,14 +149,14 @@ def _part(
             pairs = _near(centres, bodies.reach, room_for)
             ways = np.zeros((pairs.shape[0], 3))
             listed[:] = centres
-        elif not close.any() and _proved(centres, bodies, pairs, ways, gap, work):
+        elif not close.any() and _all_apart(centres, bodies, pairs, ways, gap, work):
             return 0
     return max(close.sum(), 2)
 
 
 @njit(cache=True, nogil=True)
-def _proved(centres: Reals, bodies: Bodies, pairs: Wholes, ways: Reals, gap: float, work: Reals) -> bool:
-    """Whether all pairs, where they now stand, are known to be apart."""
+def _all_apart(centres: Reals, bodies: Bodies, pairs: Wholes, ways: Reals, gap: float, work: Reals) -> bool:
+    """Whether all pairs are known to be apart at their present places."""
     for p in range(pairs.shape[0]):
         if _apart(centres, bodies, pairs[p, 0], pairs[p, 1], gap, ways[p], work) < gap:
             return False
@@ -165,7 +165,7 @@ def _proved(centres: Reals, bodies: Bodies, pairs: Wholes, ways: Reals, gap: flo
 
 @njit(cache=True, nogil=True)
 def _near(centres: Reals, reach: Reals, room: float) -> Wholes:
-    """Pairs of bodies [pair, 2] between whose spheres there is less than `room`: by cells, in order."""
+    """Pairs of bodies [pair, 2] whose bounding spheres are closer than `room`: by cells, in order."""
     n = centres.shape[0]
     edge = 2 * reach.max() + room
     low, cells, size = np.empty(3), np.empty(3, np.int64), np.empty(3)
@@ -177,7 +177,7 @@ def _near(centres: Reals, reach: Reals, room: float) -> Wholes:
             size[a] = max(span / cells[a], 1e-300)
         if cells[0] * cells[1] * cells[2] <= 8 * n + 64:
             break
-        edge *= 1.25  # where bodies are few and far between, most cells were empty
+        edge *= 1.25  # for few bodies most cells would be empty
     head, follow = np.full(cells[0] * cells[1] * cells[2], -1), np.empty(n, np.int64)
     home = np.empty((n, 3), np.int64)
     pairs, found = np.empty((32 * n, 2), np.int64), 0
@@ -205,7 +205,7 @@ def _near(centres: Reals, reach: Reals, room: float) -> Wholes:
 
 @njit(cache=True, nogil=True)
 def _keep_in(centres: Reals, bodies: Bodies, i: int, room: Reals, tall: Reals) -> None:
-    """Move a body back into the cylinder, by its corners; or by the farthest of them, where they are at odds."""
+    """Moves a body back into the cylinder by its corners; by its largest radius where that does not succeed."""
     c = centres[i]
     c[2] = min(max(c[2], -tall[i]), tall[i])
     first, last = bodies.first[i], bodies.first[i + 1]
@@ -229,11 +229,11 @@ def _keep_in(centres: Reals, bodies: Bodies, i: int, room: Reals, tall: Reals) -
 
 @njit(cache=True, nogil=True)
 def _apart(centres: Reals, bodies: Bodies, i: int, j: int, enough: float, way: Reals, work: Reals) -> float:
-    """mm that a known plane across `way` leaves between i and j, negative where they overlap; sought no further once
-    it is `enough`. `way` (unit, from i to j, or zero) is where the search begins and becomes the best one found.
+    """Largest known gap in mm between i and j along a direction, negative where they overlap; the search ends at
+    `enough`. It begins at `way` (unit, from i to j, or zero), which becomes the best direction found.
 
-    The gap along a direction n is n · w, where w joins the points of the two that face each other along n: where n
-    turns towards w it grows. That is a subgradient, and this its ascent on the sphere with falling steps.
+    The gap along a direction n is n · w, where w joins the support points of the two bodies along n; it grows where n
+    turns towards w. This is subgradient ascent on the sphere with decreasing steps.
     """
     d, w, n = work[0], work[1], work[2]
     distance = 0.0
@@ -250,7 +250,7 @@ def _apart(centres: Reals, bodies: Bodies, i: int, j: int, enough: float, way: R
             way[k] = d[k] / distance if distance > 0.0 else 1.0 if k == 2 else 0.0
     best = -np.inf
     n[:] = way
-    for _ in range(LOOKS):
+    for _ in range(TRIALS):
         gap = _gap(bodies, i, j, d, n[0], n[1], n[2], w)
         if gap > best:
             best = gap
@@ -269,15 +269,15 @@ def _apart(centres: Reals, bodies: Bodies, i: int, j: int, enough: float, way: R
             norm += n[k] * n[k]
         for k in range(3):
             n[k] /= math.sqrt(norm)
-        turn *= FALL
+        turn *= DECAY
     return best
 
 
 @njit(cache=True, nogil=True)
 def _gap(bodies: Bodies, i: int, j: int, d: Reals, x: float, y: float, z: float, w: Reals) -> float:
-    """mm between i and j, `d` apart, along a direction; `w` becomes the difference of the points that face there."""
+    """Gap in mm along a direction between i and j, centres `d` apart; `w` becomes the difference of support points."""
     w[0], w[1], w[2] = d[0], d[1], d[2]
-    for body in (i, j):  # symmetric bodies: what faces back is what faces on, turned round
+    for body in (i, j):  # symmetric bodies: the support point backwards is the negative of that forwards
         first, last = bodies.first[body], bodies.first[body + 1]
         if first == last:
             m = bodies.spread[body]

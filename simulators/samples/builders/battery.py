@@ -1,4 +1,4 @@
-"""A battery in miniature: a can with a wall, filled with electrolyte and ~150 dense particles that do not overlap."""
+"""Battery: a small can with a wall, filled with electrolyte and about 150 dense particles that do not overlap."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
 
-# Attenuation times the can's radius. Whatever the can's size, its largest line integral lies between 1.5 and 3, so that
-# at least 5 % of the beam comes through.
+# Attenuation times the can's radius: for any size of the can the largest line integral is between 1.5 and 3, so that at
+# least 5 % of the beam is transmitted.
 WALL, ELECTROLYTE, PARTICLE = 0.9, 0.15, 1.9
 
 CANDIDATES, ROUNDS = 256, 40
 MOST_PARTICLES = 5000
-"""Each looks at all that have their places: so many take a minute."""
+"""The work grows as their square: this many take a minute."""
 
 
 @dataclass(frozen=True)
 class Battery:
-    """Arguments of `battery`, with the seed of its generator, as a scene gives them."""
+    """Arguments of `battery` and the seed of its generator, as keys of a scene."""
 
     field_of_view: tuple[float, float]
     n_particles: int = 150
@@ -44,12 +44,12 @@ def battery(
 
     Args:
         field_of_view: (width, height) in mm.
-        n_particles: how many.
+        n_particles: number of particles.
         fill: share of the electrolyte's volume that spheres of the particles' median radius would take.
 
     Raises:
-        ValueError: for a field of view that is not positive or not of this world, too many particles, or where they do
-            not fit without overlap.
+        ValueError: a field of view that is not positive or out of range, too many particles, or no room for
+            them without overlap.
     """
     width, height = field_of_view
     if not (width > 0 and height > 0):
@@ -90,11 +90,11 @@ def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tupl
 def _place(
     rng: np.random.Generator, reach: NDArray[np.float64], radius: float, half_height: float, gap: float
 ) -> NDArray[np.float64]:
-    """Centres (x, y, z) [n, 3] of spheres that keep `gap` between each other and the wall: random sequential addition,
-    in the order given (large ones first fill best).
+    """Centres (x, y, z) [n, 3] of spheres with `gap` between each other and to the wall: random sequential addition in
+    the given order (the largest first fill best).
 
     Raises:
-        ValueError: no room is found for one of them.
+        ValueError: one of them finds no room.
     """
     centres = np.empty((reach.size, 3))
     for i, own in enumerate(reach):

@@ -16,7 +16,7 @@ from simulators.samples.builders.grains import HABITS, Sizes, core, crack, grain
 from simulators.samples.builders.piece import Piece, check_roles
 
 WIDEST = 2.0
-"""Of the logarithm of the grains' diameters: the largest are 20 000 times the smallest."""
+"""Largest spread of the logarithm of the grains' diameters: the largest are then 20 000 times the smallest."""
 
 MADE_OF: Mapping[str, str] = MappingProxyType(
     {
@@ -29,37 +29,36 @@ MADE_OF: Mapping[str, str] = MappingProxyType(
         "crack": "electrolyte",
     }
 )
-"""What each part is made of where the scene does not say."""
+"""Material of each part by default."""
 
 GREY: Mapping[str, float] = MappingProxyType(
     {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
 )
-"""Attenuation times the can's radius, in a beam without energies: whatever the can's size, about 5 % come through where
-a cathode of 0.45 is thickest."""
+"""Attenuation times the can's radius, in a beam without energies: for any size of the can about 5 % are transmitted
+where a cathode with a fill of 0.45 is thickest."""
 
 
 @dataclass(frozen=True)
 class Cathode:
     """A cell around the rotation axis.
 
-    How much fits depends on the grains: spheres go up to a fill of 0.55, the default habits to 0.45, octahedra or
-    plates alone to 0.35.
+    The largest fill depends on the grains: 0.55 for spheres, 0.45 for the default habits, 0.35 for octahedra or plates
+    alone.
 
     Attributes:
         diameter, height: mm, of the can outside; it has neither lid nor bottom.
         wall_um: thickness of the can's wall.
         size_um: median diameter of spheres of the grains' volumes.
-        spread: standard deviation of the logarithm of the diameter, 2 at most; none is farther than 2.5 of them from
-            the median.
+        spread: standard deviation of the logarithm of the diameter, 2 at most; it is cut off at 2.5 of them.
         fill: share of the volume between collector and separator that grains take, pores and cracks included.
         habits: shares of the number of sphere, ellipsoid, octahedron, truncated_octahedron and plate.
-        irregularity: axes are longer or shorter by up to this share.
+        irregularity: largest relative change of a grain's axes.
         aspect: width over thickness of plates.
         hollow, cracked: shares of the grains that have a hole, of half their size, or a crack.
-        gap_um: between two grains at least.
+        gap_um: between two grains, at least.
         collector_um, separator_um: thickness of the foil below and of the film above; 0: none.
-        made_of: other materials for parts: {particle: NMC622, wall: steel}; they are looked at in a beam with energies.
-        attenuation: 1/mm of parts, in a beam without, or in place of all materials.
+        made_of: other materials for parts: {particle: NMC622, wall: steel}; for a beam with energies.
+        attenuation: 1/mm of parts, for a beam without energies, or in place of all materials.
         seed: of all random numbers.
     """
 
@@ -115,7 +114,7 @@ class Cathode:
         if sum(self.habits.values()) > MOST:
             raise ValueError(f"habits are shares, {MOST:g} at most in sum, got {dict(self.habits)}")
         if not (self.inner_radius > 0 and self.bed_height > 0):
-            raise ValueError(f"nothing is left inside {self.diameter} x {self.height} mm for the cathode")
+            raise ValueError(f"there is no room for the cathode inside {self.diameter} x {self.height} mm")
         check_roles(self)
 
     @property
@@ -125,7 +124,7 @@ class Cathode:
 
     @property
     def bed_height(self) -> float:
-        """mm, of the room for the grains."""
+        """mm, of the space for the grains."""
         return self.height - (self.collector_um + self.separator_um) * 1e-3
 
     @property
@@ -134,10 +133,10 @@ class Cathode:
         return {role: value * 2 / self.diameter for role, value in GREY.items()}
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The can, what is in it, and the grains.
+        """The can, its contents and the grains.
 
         Raises:
-            ValueError: a grain is larger than the cell, or they do not find room; see `arrange`.
+            ValueError: a grain is larger than the cell, or there is no room for all; see `arrange`.
         """
         rng = np.random.default_rng(self.seed)
         radius, bed = self.inner_radius, self.bed_height

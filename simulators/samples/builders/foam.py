@@ -1,6 +1,6 @@
-"""Foam: a cylinder or box of matter with many round holes that do not touch, from large to as small as still fit in.
+"""Foam: a cylinder or box of matter with many round holes that do not touch, from large to small ones.
 
-Each hole is put where the largest one fits, of all of many random points (the idea of Pelt, Hendriksen and Batenburg,
+Each hole is placed at that of many random points where the largest hole fits (idea of Pelt, Hendriksen and Batenburg,
 "Foam-like phantoms for comparing tomography algorithms", J. Synchrotron Rad. 29, 2022).
 """
 
@@ -24,7 +24,7 @@ Reals = NDArray[np.float64]
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"matter": "polypropylene", "hole": "air"})
 MOST_HOLES, MOST_CANDIDATES = 200_000, 10_000_000
-"""They take minutes, and 2 GB of memory."""
+"""Largest numbers: these take minutes, and 2 GB of memory."""
 POINTS_A_CELL = 8
 GREY = 2.0
 """Attenuation of the matter times half its width, in a beam without energies."""
@@ -37,12 +37,12 @@ class Foam:
     Attributes:
         diameter, height: mm, of a cylinder.
         edges: mm (x, y, z), of a box instead.
-        n_holes: at most; fewer where none of `smallest_um` fits any more.
+        n_holes: at most; fewer where no further hole of `smallest_um` fits.
         largest_um, smallest_um: diameters of holes.
-        gap_um: of matter, between holes and to the outside, at least.
-        candidates: random points among which the places are sought; more of them make a denser foam.
-        made_of: other materials for matter and hole, in a beam with energies.
-        attenuation: 1/mm of them, in a beam without, or in place of materials.
+        gap_um: least thickness of matter between holes and to the outside.
+        candidates: number of random points; more of them make a denser foam.
+        made_of: other materials for matter and hole, for a beam with energies.
+        attenuation: 1/mm of them, for a beam without energies, or in place of materials.
         seed: of all random numbers.
     """
 
@@ -119,17 +119,17 @@ class Foam:
 
 
 def holes(points: Reals, radii: Reals, smallest: float, gap: float, n: int) -> Reals:
-    """Balls (x, y, z, radius), float64 [ball, 4] in mm, from the largest to the smallest; n at most.
+    """Non-touching balls (x, y, z, radius), float64 [ball, 4] in mm, from the largest to the smallest; n at most.
 
     Args:
-        points: float64 [point, 3], where they may be.
-        radii: float64 [point], how large each may be for all that is not a ball.
-        gap: between two balls at least.
+        points: float64 [point, 3], candidates for centres.
+        radii: float64 [point], largest radius at each without other balls.
+        gap: between two balls, at least.
     """
     low = points.min(axis=0)
     span = np.maximum(points.max(axis=0) - low, 1e-12)
     edge = float((span.prod() * POINTS_A_CELL / len(points)) ** (1 / 3))
-    while np.maximum(1, span / edge).prod() > len(points):  # of what is thin or flat there were too many
+    while np.maximum(1, span / edge).prod() > len(points):  # thin or flat boxes would have too many cells
         edge *= 1.5
     cells = np.maximum(1, np.floor(span / edge)).astype(np.int64)
     size = span / cells * (1 + 1e-9)
@@ -152,17 +152,17 @@ def _holes(
     gap: float,
     n: int,
 ) -> Reals:
-    """Points stand cell after cell. A new ball is no smaller than any that may yet come, so that it concerns points
-    within two of its radii (and the gap) only."""
+    """Points are sorted by cell. A new ball is at least as large as all later ones, so that it affects only points
+    within two of its radii (and the gap)."""
     queue = [(-radii[i], i) for i in range(radii.size) if radii[i] >= smallest]
     heapq.heapify(queue)
     out = np.empty((n, 4))
     found = 0
     start, stop = np.empty(3, np.int64), np.empty(3, np.int64)
     while found < n and len(queue) > 0:
-        said, i = heapq.heappop(queue)
+        listed, i = heapq.heappop(queue)
         radius = radii[i]
-        if radius < -said:  # a ball came nearer since
+        if radius < -listed:  # a ball has been placed nearby since
             if radius >= smallest:
                 heapq.heappush(queue, (-radius, i))
             continue

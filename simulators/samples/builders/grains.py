@@ -1,6 +1,6 @@
 """Grains: crystals and secondary particles of a battery's cathode: sizes, habits, orientations, pores and cracks.
 
-The habits are those of layered oxides by the synthesis (Ariyoshi et al.): octahedra and such with cut corners, plates,
+The habits are those of layered oxides by the synthesis (Ariyoshi et al.): octahedra, truncated octahedra, plates,
 and the nearly spherical secondary particles of NMC.
 """
 
@@ -20,11 +20,11 @@ HABITS = ("sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate")
 TAIL = 2.5
 """Standard deviations beyond which no size is drawn."""
 HOLLOW, CRACK = 0.5, (0.95, 0.06)
-"""Size of the core of a hollow grain, of the grain's; radius and half width of a crack, of the sphere inside."""
+"""Size of a pore over the grain's; radius and half width of a crack over the inscribed sphere's radius."""
 MOST = 100_000
-"""Grains of a cell: so many take minutes to arrange."""
+"""Largest number of grains in a cell: this many take minutes to arrange."""
 ROUNDEST, FLATTEST = 0.6, 0.85
-"""The least and the most that truncated octahedra keep of their corners."""
+"""Least and largest cut of truncated octahedra; see TruncatedOctahedron."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,7 @@ def grain(rng: np.random.Generator, habit: str, diameter: float, irregularity: f
     """A grain at the origin, of the volume of a sphere of `diameter` (mm), in any orientation.
 
     Args:
-        irregularity: largest share by which each of its axes is longer or shorter than it should be, before the
-            volume is put right.
+        irregularity: largest relative change of each axis, before all are scaled to the volume.
         aspect: width over thickness of plates.
     """
     volume = math.pi / 6 * diameter**3
@@ -92,29 +91,29 @@ def grains(
         habits: shares of the grains' number, of any sum.
 
     Raises:
-        ValueError: that were more than MOST.
+        ValueError: they would be more than MOST.
     """
     names = list(habits)
     shares = np.array([habits[name] for name in names])
     largest = math.pi / 6 * (sizes.median * math.exp(TAIL * sizes.spread)) ** 3
-    made: list[Grain] = []
+    drawn: list[Grain] = []
     taken = 0.0
     while True:
         diameter = sizes.draw(rng)
         own = math.pi / 6 * diameter**3
         if taken + own / 2 > volume:
-            return made
-        if len(made) == MOST or volume > MOST * largest:
+            return drawn
+        if len(drawn) == MOST or volume > MOST * largest:
             raise ValueError(
                 f"{volume:.3g} mm3 of grains of {1e3 * sizes.median:g} um are more than {MOST} grains; make the cell "
                 "smaller, the grains larger or the fill lower"
             )
-        made.append(grain(rng, str(rng.choice(names, p=shares / shares.sum())), diameter, irregularity, aspect))
+        drawn.append(grain(rng, str(rng.choice(names, p=shares / shares.sum())), diameter, irregularity, aspect))
         taken += own
 
 
 def core(grain: Grain) -> Grain:
-    """What a hollow grain lacks: its own shape, in small."""
+    """The pore of a hollow grain: its own shape, scaled down."""
     match grain:
         case Ellipsoid():
             a, b, c = grain.semi_axes
@@ -126,7 +125,7 @@ def core(grain: Grain) -> Grain:
 
 
 def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
-    """A crack through a grain's middle: a flat ellipsoid, wholly in the sphere that the grain holds."""
+    """A crack through a grain's middle: a flat ellipsoid within the grain's inscribed sphere."""
     radius = inner_radius(grain)
     w, x, y, z = rng.normal(size=4).tolist()
     wide, thin = CRACK[0] * radius, CRACK[1] * radius
@@ -134,7 +133,7 @@ def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
 
 
 def inner_radius(grain: Grain) -> float:
-    """mm, of the largest sphere around a grain's centre that is all in it."""
+    """mm, of the largest sphere around a grain's centre that lies inside it."""
     match grain:
         case Ellipsoid():
             return min(grain.semi_axes)

@@ -1,8 +1,8 @@
-"""Resolution pattern: bars of given widths, a Siemens star and balls of falling size, in a carrier of another material.
+"""Resolution pattern: bars of given widths, a Siemens star and balls of decreasing size, in another material.
 
-From below: balls in a row along x; the star across the rotation axis; and groups of bars, upright ones (side by side
-along x) at y > 0 and lying ones (above each other) at y < 0. Bars and the gaps between them are equally wide: a pair of
-them is twice a width. Everything has its place by the sizes asked for; nothing is random.
+From below: balls in a row along x; the star across the rotation axis; and groups of bars, vertical ones (side by side
+along x) at y > 0 and horizontal ones (above each other) at y < 0. Bars and the gaps between them are equally wide: a
+line pair is twice a width. All places follow from the sizes; nothing is random.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star"
 """Attenuation times the carrier's radius, in a beam without energies."""
 MOST_BARS, MOST_SPOKES = 100, 1000
 MARGIN = 1.1
-"""The carrier's size over that of what it holds."""
+"""The carrier's size over that of its contents."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class Resolution:
     """A pattern around the rotation axis.
 
     Attributes:
-        widths_um: of the bars of each group; none: no bars.
+        widths_um: of the bars, one group each; empty: no bars.
         bars: in a group, which is a cube.
         star_um: diameter of the star; 0: none. At a radius r a pair of spoke and gap is 2 π r / spokes wide.
         spokes: of the star.
         star_height_um: its thickness.
-        balls_um: diameters; none: no balls.
-        made_of: other materials for carrier, bar, star and ball, in a beam with energies.
-        attenuation: 1/mm of them, in a beam without, or in place of materials.
+        balls_um: diameters; empty: no balls.
+        made_of: other materials for carrier, bar, star and ball, for a beam with energies.
+        attenuation: 1/mm of them, for a beam without energies, or in place of materials.
     """
 
     widths_um: tuple[float, ...] = (30.0, 20.0, 14.0, 10.0, 7.0, 5.0)
@@ -76,14 +76,14 @@ class Resolution:
         return {role: value / radius for role, value in GREY.items()}
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The carrier, and what it holds."""
+        """The carrier and its contents."""
         radius, height = self._size()
         z = -height / MARGIN / 2
-        made = [Piece(Cylinder(radius, height, 1.0), "carrier")]
+        pieces = [Piece(Cylinder(radius, height, 1.0), "carrier")]
         for solids, role, tall in self._layers():
-            made += [Piece(_raised(solid, z + tall / 2), role, "carrier") for solid in solids]
+            pieces += [Piece(_raised(solid, z + tall / 2), role, "carrier") for solid in solids]
             z += tall
-        return tuple(made)
+        return tuple(pieces)
 
     def _size(self) -> tuple[float, float]:
         """Radius and height of the carrier, mm."""
@@ -129,13 +129,13 @@ class Resolution:
 
 
 def _row(sizes: list[float], space: float) -> list[float]:
-    """Middles of things of these sizes side by side with a space between, about 0."""
+    """Middles of objects of these sizes side by side with a space between, centred at 0."""
     ends = [sum(sizes[: i + 1]) + i * space for i in range(len(sizes))]
     return [end - size / 2 - ends[-1] / 2 for end, size in zip(ends, sizes, strict=True)]
 
 
 def _reach(solid: Box | Ellipsoid | Polyhedron) -> float:
-    """mm from the axis to the farthest of a solid (of the ball around it, where it is one)."""
+    """mm from the axis to the farthest point of a solid (of an ellipsoid's bounding sphere)."""
     x, y, _ = solid.centre
     match solid:
         case Box():

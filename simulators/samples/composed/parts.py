@@ -1,7 +1,7 @@
-"""Parts: solids that are made of something, and the sample that they are in a beam.
+"""Parts: solids with materials, and the sample that they form in a beam.
 
-Where solids overlap they add up, so a part that displaces another material counts with the difference of the two. Grey
-parts have one attenuation at every energy.
+Overlapping solids add up, so that a part that displaces another material counts with the difference of the two. Grey
+parts have the same attenuation at every energy.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Part:
-    """A solid of something.
+    """A solid and its material.
 
     Attributes:
         solid: without a material its attenuation is in 1/mm; with one it is the share of the solid's volume that the
-            material takes, 1 where there is nothing else in it.
-        material: what it is made of; None: grey.
-        instead_of: what the material displaces; None: nothing.
-        name: of its label; None: the material's, or the solid's kind.
+            material fills, 1 for all of it.
+        material: None: grey.
+        instead_of: the material that it displaces; None: nothing.
+        name: of its label; None: the material's name, or the solid's kind.
     """
 
     solid: Solid
@@ -58,9 +58,9 @@ class Constituent:
     """One kind of matter in a sample.
 
     Attributes:
-        chords: thickness of it along a ray, mm (a depth already, where it is grey).
+        chords: its thickness along a ray, mm (the optical depth, where it is grey).
         material: None: grey.
-        instead_of: what it displaces.
+        instead_of: the material that it displaces.
     """
 
     chords: Sample
@@ -68,7 +68,7 @@ class Constituent:
     instead_of: Material | None = None
 
     def attenuation(self, energies: ArrayLike) -> Reals:
-        """1/mm at energies in keV, of their shape; less what is displaced."""
+        """1/mm at energies in keV, of their shape; less that of the displaced material."""
         if self.material is None:
             return np.ones(np.shape(energies))
         own = self.material.attenuation(energies)
@@ -77,13 +77,13 @@ class Constituent:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Constituents under a spectrum: each one's chords are paid for once, whatever the number of energies.
+    """Constituents under a spectrum: each one's chords are computed once for any number of energies.
 
-    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam: the slope with
-    which the effective depth begins. Thicker matter shows less than that: beam hardening.
+    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam: the initial
+    slope of the effective depth. Thicker matter appears to attenuate less: beam hardening.
 
     Attributes:
-        constituents: what there is.
+        constituents: of the sample.
         spectrum: energies and weights.
         whole: the sample with its attenuation in the thin limit.
     """
@@ -116,18 +116,18 @@ class Mixture:
         return self.whole.labels(grid)
 
     def under(self, spectrum: Spectrum) -> Mixture:
-        """The same matter in other light; its truth stays that of the light it was made for."""
+        """The same sample in another spectrum; its truth remains that of the original one."""
         return replace(self, spectrum=spectrum)
 
 
 def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation] | None = None) -> Sample:
-    """The parts as they are seen in the beam: of one energy a plain phantom, of more a mixture.
+    """The sample that the parts form in the beam: a phantom for one energy, a mixture for more.
 
     Args:
-        filters: the attenuation of a material by its name, for a tube; None: of those known by name.
+        filters: the attenuation of a material by its name, for a tube; None: known materials only.
 
     Raises:
-        ValueError: a material, but a beam that does not say its energies or says some that are not tabulated.
+        ValueError: a material in a beam that does not state its energies, or states some that are not tabulated.
     """
     names = [part.label for part in parts]
     kinds = dict.fromkeys((part.material, part.instead_of) for part in parts)

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simulators.frame.mapping import SceneError, build, located, named
 from simulators.light.beam import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.piece import Piece, PieceBuilder
 from simulators.samples.sample import Sample
-from simulators.samples.voxels.stored import ReadVolume
+
+if TYPE_CHECKING:
+    from simulators.samples.voxels.volume import ReadVolume
+
+    _Builder = Callable[[str, Mapping[str, Any], Beam, ReadVolume | None], Sample]
 
 
 def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = None) -> Sample:
@@ -45,7 +49,7 @@ def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume
 
 
 def _volume(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    from simulators.samples.voxels.scene import VolumeSettings, voxels_of
+    from simulators.samples.voxels.volume import VolumeSettings, voxels_of
 
     settings = build(VolumeSettings, where, mapping)
     if read is None:
@@ -102,7 +106,6 @@ def _of_materials(
     return sample_of(parts, beam, palette.filters)
 
 
-_Builder = Callable[[str, Mapping[str, Any], Beam, ReadVolume | None], Sample]
 _KINDS: Mapping[str, _Builder] = {
     "battery": _battery,
     "solids": _solids,

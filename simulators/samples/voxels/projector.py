@@ -1,9 +1,9 @@
-"""Voxel projector: line integrals through a volume, by Joseph's method: the hot loops.
+"""Voxel projector: kernels for line integrals through a volume by Joseph's method.
 
 The volume is the function that its voxels' centres interpolate linearly, falling to 0 one voxel beyond the outermost.
 A ray is sampled where it meets the planes of centres across its main axis, and interpolated in each plane (Joseph,
-"An improved algorithm for reprojecting rays through pixel images", IEEE Trans. Med. Imaging 1, 1982). A parallel beam
-through a sample that stands upright sees each row in one height: it takes a slice, and one interpolation a plane.
+"An improved algorithm for reprojecting rays through pixel images", IEEE Trans. Med. Imaging 1, 1982). In a parallel
+beam through an upright sample each row lies in one slice, with one interpolation a plane.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from simulators.frame.pose import Pose
 Reals = NDArray[np.float64]
 Voxels32 = NDArray[np.float32]
 
-_EDGE = 1e-7  # voxels: kept clear of the outer edge
+_EDGE = 1e-7  # voxels: distance kept from the outer edge
 
 
 def padded(values: NDArray[np.floating]) -> Voxels32:
-    """The volume with one voxel of nothing on all sides, float32, as `project` wants it."""
+    """The volume with one voxel of zeros on all sides, float32, for `project`."""
     return np.pad(np.asarray(values, dtype=np.float32), 1)
 
 
@@ -52,12 +52,12 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
         def rows(low: int, high: int) -> None:
             _any(volume, spacing, first, axes, origin, u0, v0, detector.pitch, detector.sod, low, high, out)
 
-    # Not numba's get_num_threads: it would start numba's own threads, which slows torch down.
+    # Not numba's get_num_threads, which starts numba's own threads and slows torch down.
     threads = min(int(config.NUMBA_NUM_THREADS), detector.shape[0])
     if threads == 1:
         rows(0, detector.shape[0])
         return out
-    # Rows near the middle cost more than those beside the sample: more jobs than threads.
+    # More jobs than threads, since rows near the middle cost more than those beside the sample.
     cuts = np.linspace(0, detector.shape[0], min(8 * threads, detector.shape[0]) + 1).astype(int).tolist()
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(rows, cuts[:-1], cuts[1:]))
@@ -144,7 +144,7 @@ def _any(
     high: int,
     out: Reals,
 ) -> None:
-    """Rows low ... high - 1, whatever the pose and wherever the source; coordinates in voxels of the padded volume."""
+    """Rows low ... high - 1 for any pose and source; coordinates in voxels of the padded volume."""
     size = np.array([volume.shape[2] - 2, volume.shape[1] - 2, volume.shape[0] - 2])
     point, along, step = np.empty(3), np.empty(3), np.empty(3)
     for j in range(low, high):
@@ -173,7 +173,7 @@ def _any(
                     continue
                 one, other = (_EDGE - at) / step[n], (size[n] + 1 - _EDGE - at) / step[n]
                 start, stop = max(start, min(one, other)), min(stop, max(one, other))
-            if not start <= stop:  # asked here, for far off they are beyond whole numbers
+            if not start <= stop:  # checked here: far off they exceed the range of integers
                 continue
             total = 0.0
             for k in range(math.ceil(start), math.floor(stop) + 1):
@@ -189,7 +189,7 @@ def _any(
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(plane: Voxels32, down: float, across: float) -> float:
-    # On the plane, even where the rounding of a ray from far says otherwise.
+    # On the plane, even where a distant ray's rounding differs.
     j, i = min(max(int(down), 0), plane.shape[0] - 2), min(max(int(across), 0), plane.shape[1] - 2)
     q, p = down - j, across - i
     upper = plane[j, i] + p * (plane[j, i + 1] - plane[j, i])

@@ -1,6 +1,6 @@
-"""Voxels: a sample that is a volume of attenuation, from a file or from a reconstruction, with labels.
+"""Voxels: a sample given by a volume of attenuation, from a file or a reconstruction, with labels.
 
-The sample is the function that the voxels' centres interpolate linearly; so is what is projected, and what is true.
+The sample is the linear interpolation between the voxels' centres, for projections and truth alike.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from simulators.samples.voxels.projector import padded, project
 
 MOST_LABELS = 255
 ON = 1e-9
-"""Voxels: a point so close to a centre is on it."""
+"""Voxels: a point closer than this to a centre counts as on it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """A volume around the rotation axis. Make one with `Voxels.of`.
+    """A volume around the rotation axis. Created by `Voxels.of`.
 
     Attributes:
-        padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of nothing on all sides.
+        padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of zeros on all sides.
         spacing: mm from voxel to voxel along (z, y, x).
-        thresholds: 1/mm, ascending: label k from the k-th on; None where `label_volume` says what is where.
+        thresholds: 1/mm, ascending: label k from the k-th on; None where there is a `label_volume`.
         label_volume: uint8 [z, y, x].
-        names: what labels 1, 2, ... stand for.
+        names: of the labels 1, 2, ...
         radius: mm from the rotation axis to the farthest matter.
     """
 
@@ -58,13 +58,14 @@ class Voxels:
         Args:
             attenuation: [z, y, x] in 1/mm; the rotation axis goes up through the middle.
             spacing: mm from voxel to voxel, one for all or along (z, y, x).
-            thresholds: 1/mm, ascending: a label begins at each. Without them and `labels`, matter is what attenuates.
+            thresholds: 1/mm, ascending: a label begins at each. Without them and `labels`, all that attenuates is
+                matter.
             labels: [z, y, x], 0 ... 255; 0 is air.
-            names: of the labels from 1 on; numbered where there are none.
+            names: of the labels from 1 on; empty: numbers.
 
         Raises:
-            ValueError: no volume, values that are not finite, lengths that are not positive, thresholds that do not
-                ascend, labels of another shape, or names that do not go with them.
+            ValueError: not a volume, values that are not finite, lengths that are not positive, thresholds that do not
+                ascend, labels of another shape, or too few names.
         """
         along = spacing if isinstance(spacing, tuple) else (spacing, spacing, spacing)
         if attenuation.ndim != 3 or 0 in attenuation.shape:
@@ -109,7 +110,7 @@ class Voxels:
 
         Raises:
             ValueError: a pose of another number of rows.
-            CannotExposeError: a cone's source that is not outside of the volume.
+            CannotExposeError: a cone's source inside the volume.
         """
         pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
         if pose.angle.size != detector.shape[0]:
@@ -132,8 +133,8 @@ class Voxels:
             )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
-        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume, where voxels are larger than its own
-        averaged over as many points a side as there are of its own across (`supersample` is for surfaces)."""
+        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume. For voxels larger than its own
+        it is averaged over as many points a side as it has voxels (`supersample` is for surfaces)."""
         points = [
             max(1, math.ceil(wanted / own - 1e-6)) for wanted, own in zip(grid.spacing, self.spacing, strict=True)
         ]
@@ -156,15 +157,15 @@ class Voxels:
         return out
 
     def _mean(self, grid: Grid, points: Sequence[int]) -> NDArray[np.float32]:
-        """Mean over `points` a side (z, y, x) in each voxel. Linear interpolation and the mean are products over the
-        axes: each is one sparse matrix, float32 [z, y, x]."""
+        """Mean over `points` a side (z, y, x) in each voxel, float32 [z, y, x]. It is separable: one sparse matrix for
+        each axis."""
         values = self.padded
         for axis, centres in enumerate(grid.coordinates()):
             weights = _weights(
                 centres, grid.spacing[axis], points[axis], self.first[axis], self.spacing[axis], values.shape[0]
             )
             rest = values.shape[1:]
-            # The axis in front is replaced and goes to the back: after three turns all are where they were.
+            # The first axis is replaced and moved to the end: after three steps all are in their places again.
             values = np.moveaxis((weights @ values.reshape(values.shape[0], -1)).reshape(-1, *rest), 0, 2)
         return np.ascontiguousarray(values)
 
@@ -173,20 +174,20 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
     """Matrix [target, padded voxel] that interpolates along one axis and takes the mean over each target voxel."""
     within = (np.arange(points) + 0.5) / points - 0.5
     place = (centres[:, None] + within * edge - first) / step + 1.0
-    # On a voxel's centre it is the voxel's value, to the bit: what rounding takes of its neighbour would be matter.
+    # On a voxel's centre exactly the voxel's value: a rounded share of its neighbour would count as matter.
     place = np.where(np.abs(place - np.rint(place)) < ON, np.rint(place), place)
     below = np.floor(place)
     rows = np.repeat(np.arange(centres.size), points)
     entries = []
     for column, weight in ((below, 1 - (place - below)), (below + 1, place - below)):
-        seen = ((column >= 0) & (column < n)).ravel()
-        entries.append((weight.ravel()[seen] / points, rows[seen], column.ravel()[seen].astype(np.int64)))
+        inside = ((column >= 0) & (column < n)).ravel()
+        entries.append((weight.ravel()[inside] / points, rows[inside], column.ravel()[inside].astype(np.int64)))
     data, row, column = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     return csr_array((data.astype(np.float32), (row, column)), shape=(centres.size, n))
 
 
 def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) -> float:
-    """mm to the farthest voxel that holds matter; the interpolation ends one voxel beyond it."""
+    """mm to the farthest voxel with matter; the interpolation ends one voxel beyond it."""
     y, x = np.nonzero((volume != 0).any(axis=0))
     if not x.size:
         return 0.0

@@ -93,7 +93,7 @@ def test_the_shift_of_the_edge_may_be_named() -> None:
         (5.0, 0.5, None, "an oxide with Mn, Co, Ni; this has none of them"),
         (5.0, 0.5, 20.5, r"edge_shift_ev must lie in -20 ... 20 eV, got 20.5"),
         (5.0, 0.5, -400.0, "edge_shift_ev must lie in"),
-        (5.0, None, 2.0, "edge_shift_ev moves nothing without a state_of_charge"),
+        (5.0, None, 2.0, "edge_shift_ev needs a state_of_charge"),
     ],
 )
 def test_impossible_materials_are_refused(

@@ -91,5 +91,5 @@ def test_a_tube_is_kramers_behind_its_filter() -> None:
 def test_light_that_is_not_there_is_refused() -> None:
     with pytest.raises(ValueError, match="give it energy_kev, spectrum or tube"):
         _light(Beam(1.0))
-    with pytest.raises(ValueError, match=r"nothing of the tube's 60 kV comes through its filters {'it': 1000000.0} mm"):
+    with pytest.raises(ValueError, match=r"no light of the tube's 60 kV passes its filters {'it': 1000000.0} mm"):
         light(Beam(1.0, tube=Tube(60.0, {"it": 1e6})), [_smooth], 1.0, lambda name: _smooth)

@@ -83,7 +83,7 @@ def test_a_face_that_cuts_nothing_off_is_left_out() -> None:
         (CUBE[:4], "its 4 vertices lie in a plane"),
         ([(0, 0, 0)] * 5, "its 5 vertices lie in a plane"),
         ([(0, 0, 0), (1, 1, 1), (2, 2, 2), (5, 5, 5)], "lie in a plane"),
-        ([*CUBE, (0.1, 0.2, 0.3)], r"not convex: vertex 8 at \(0.1, 0.2, 0.3\) mm is no corner"),
+        ([*CUBE, (0.1, 0.2, 0.3)], r"not convex: vertex 8 at \(0.1, 0.2, 0.3\) mm is not a corner"),
         ([*CUBE, (1, 1, 0)], "vertex 8 at .* leave it out"),
         ([(0, 0, 1), *CUBE], r"vertex 0 at \(0.0, 0.0, 1.0\)"),
     ],

@@ -1,10 +1,10 @@
-"""Voxel scene: what a scene says of a volume from a file, and the sample that comes of it.
+"""Volume: the keys of a scene for a volume from a file, and the sample that they give.
 
 phantom:
   kind: volume
   file: thorax.nii.gz              # .tif, .npy, .npz, .nii(.gz) or .h5, beside the scene file or by its full path
-  voxel_mm: 0.01                   # where the file does not say, or to make it smaller
-  window: [-1000, 1500]            # the file's values that become nothing and the most
+  voxel_mm: 0.01                   # where the file does not state it, or to scale the sample
+  window: [-1000, 1500]            # the file's values for no attenuation and the largest
   attenuation_max: 4.0             # 1/mm at the window's upper end; or largest_line_integral: 2.5
   thresholds: [-200, 300]          # the file's values at which labels begin
   names: [tissue, bone]
@@ -13,6 +13,7 @@ phantom:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,27 +21,44 @@ from numpy.typing import NDArray
 
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
-from simulators.samples.voxels.stored import ReadVolume, Stored
 from simulators.samples.voxels.voxels import Voxels
 
 MOST_COLUMNS = 100_000
-LOOKS = 8
-"""Views over half a turn among which the largest line integral is sought."""
+VIEWS = 8
+"""Views over half a turn in which the largest line integral is searched."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A volume as it is in a file.
+
+    Attributes:
+        values: [z, y, x] or in another order that the scene gives, real numbers in the file's own units.
+        spacing: mm from voxel to voxel along the same axes; None: the file does not state it.
+    """
+
+    values: NDArray[np.generic]
+    spacing: tuple[float, float, float] | None = None
+
+
+ReadVolume = Callable[[str, str | None], Stored]
+"""Reads the file that a scene names, and a dataset in it. The caller of `load_scene` provides it, since simulators open
+no files; its errors pass through."""
 
 
 @dataclass(frozen=True)
 class VolumeSettings:
-    """Values of the file become attenuation by a straight line: (value - low) times a factor, kept within the window.
+    """Values of the file become attenuation linearly: (value - low) times a factor, clipped to the window.
 
     Attributes:
-        file: read by whoever opens the scene.
+        file: path; see ReadVolume.
         dataset: path in an HDF5 file, name in an .npz; needed where there is more than one volume.
         axes: the file's order of axes.
-        voxel_mm: from voxel to voxel; None: the file says.
-        window: file's values (low, high) that become 0 and the most; None: from 0 on, as it is.
+        voxel_mm: from voxel to voxel; None: as in the file.
+        window: file's values (low, high) for 0 and the largest attenuation; None: low is 0, nothing is clipped.
         scale: the factor itself, 1/mm per unit of the file.
         attenuation_max: 1/mm of the window's upper end, or of the largest value.
-        largest_line_integral: dimensionless, over all rays of 8 views around, a voxel apart.
+        largest_line_integral: dimensionless, over all rays of 8 views, a voxel apart.
         thresholds: file's values, ascending, at which labels 1, 2, ... begin.
         labels: a file of labels 0 ... 255 instead, of the same shape; `labels_dataset` in it.
         names: of the labels.
@@ -71,20 +89,20 @@ class VolumeSettings:
             "attenuation_max": self.attenuation_max,
             "largest_line_integral": self.largest_line_integral,
         }
-        said = {name: value for name, value in factors.items() if value is not None}
-        if len(said) > 1:
-            raise ValueError(f"{' and '.join(said)} both say how values become attenuation; name one")
-        if self.window is not None and not said:
+        given = {name: value for name, value in factors.items() if value is not None}
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
+        if self.window is not None and not given:
             raise ValueError("a window needs attenuation_max, largest_line_integral or scale")
-        if any(not value > 0 for value in said.values()):
-            raise ValueError(f"{next(iter(said))} must be positive, got {next(iter(said.values()))}")
+        if any(not value > 0 for value in given.values()):
+            raise ValueError(f"{next(iter(given))} must be positive, got {next(iter(given.values()))}")
 
 
 def voxels_of(settings: VolumeSettings, read: ReadVolume) -> Voxels:
     """The sample of the settings.
 
     Raises:
-        ValueError: what is read is no volume, or does not go with the settings.
+        ValueError: the file does not hold a volume, or not one that fits the settings.
     """
     stored = read(settings.file, settings.dataset)
     values = _turned(stored.values, settings)
@@ -93,7 +111,7 @@ def voxels_of(settings: VolumeSettings, read: ReadVolume) -> Voxels:
         labels = _turned(read(settings.labels, settings.labels_dataset).values, settings)
     spacing = _spacing(stored, settings)
     low, high = settings.window or (0.0, math.inf)
-    # float32 throughout: a volume is the largest thing that a scene holds.
+    # float32 throughout: a volume is the largest array of a scene.
     attenuation = values.astype(np.float32)
     if settings.window is not None:
         np.clip(attenuation, low, high, out=attenuation)
@@ -112,16 +130,16 @@ def _turned(values: NDArray[np.generic], settings: VolumeSettings) -> NDArray[np
 
 def _spacing(stored: Stored, settings: VolumeSettings) -> tuple[float, float, float]:
     if settings.voxel_mm is None and stored.spacing is None:
-        raise ValueError("voxel_mm is missing, and the file does not say the size of its voxels")
+        raise ValueError("voxel_mm is missing, and the file does not state the size of its voxels")
     own = stored.spacing or (1.0, 1.0, 1.0)
     z, y, x = (own[settings.axes.index(axis)] for axis in "zyx")
-    # A size that is said is the voxel's width; where the file knows the shape of its voxels, they keep it.
+    # voxel_mm is the voxel's width; the file's ratio of width to height is kept.
     factor = 1.0 if settings.voxel_mm is None else settings.voxel_mm / x
     return z * factor, y * factor, x * factor
 
 
 def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], settings: VolumeSettings) -> float:
-    """What the values are multiplied by to become attenuation in 1/mm."""
+    """Factor from values to attenuation in 1/mm."""
     if settings.scale is not None:
         return settings.scale
     if settings.attenuation_max is not None:
@@ -135,15 +153,15 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
         across = math.ceil(math.hypot(spacing[1] * values.shape[1], spacing[2] * values.shape[2]) / pitch) + 2
         if across > MOST_COLUMNS:
             raise ValueError(
-                f"voxels of {spacing[2]:g} x {spacing[1]:g} mm are too unlike for largest_line_integral; give "
+                f"voxels of {spacing[2]:g} x {spacing[1]:g} mm are too anisotropic for largest_line_integral; give "
                 "attenuation_max"
             )
         detector = Detector.centred((planes, across), pitch)
-        # Each row sees a plane of voxels, however far apart these are; between two of them no sum is larger.
+        # Each row projects one plane of voxels, at any distance between planes; in between no sum is larger.
         shift = np.zeros((planes, 3))
         shift[:, 2] = detector.v() * (1 - spacing[0] / pitch)
-        looks = (Pose.turned(k * math.pi / LOOKS, planes).shifted_by(shift) for k in range(LOOKS))
-        most = max(float(whole.line_integrals(look, detector).max()) for look in looks)
+        poses = (Pose.turned(k * math.pi / VIEWS, planes).shifted_by(shift) for k in range(VIEWS))
+        most = max(float(whole.line_integrals(pose, detector).max()) for pose in poses)
         if not most > 0:
             raise ValueError(f"largest_line_integral needs matter; the largest sum is {most:g}")
         return settings.largest_line_integral / most

@@ -11,8 +11,7 @@ from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
 from simulators.light.beam import Beam
 from simulators.samples.composed.phantoms import build_sample
-from simulators.samples.voxels.scene import VolumeSettings, voxels_of
-from simulators.samples.voxels.stored import Stored
+from simulators.samples.voxels.volume import Stored, VolumeSettings, voxels_of
 from simulators.samples.voxels.voxels import Voxels
 from simulators.scenes.scene import load_scene
 
@@ -79,14 +78,14 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
         ({"voxel_mm": -1.0}, "voxel_mm must be positive"),
         ({"window": [3.0, 3.0], "scale": 1.0}, r"window must be \(low, high\)"),
         ({"window": [3.0, 4.0]}, "a window needs attenuation_max"),
-        ({"scale": 1.0, "attenuation_max": 2.0}, "scale and attenuation_max both"),
+        ({"scale": 1.0, "attenuation_max": 2.0}, "scale and attenuation_max exclude each other"),
         ({"largest_line_integral": 0.0}, "largest_line_integral must be positive"),
         ({"file": 7}, "file must be text"),
         ({"thresholds": [3.0, 2.0]}, "thresholds must ascend"),
         ({"voxel_mm": None}, "voxel_mm is missing"),
         ({"file": "flat"}, "three axes"),
         ({"file": "complex"}, "real values"),
-        ({"file": "thin", "voxel_mm": None, "largest_line_integral": 2.0}, "too unlike for largest_line_integral"),
+        ({"file": "thin", "voxel_mm": None, "largest_line_integral": 2.0}, "too anisotropic for largest_line_integral"),
         ({"file": "none", "largest_line_integral": 2.0}, "needs matter"),
         ({"file": "none", "attenuation_max": 2.0}, "needs a value above 0"),
     ],
