@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
 from beamline.config.devices import DeviceSection
-from beamline.config.monitor import Monitor
+from beamline.config.monitor import MonitorSection
 from beamline.config.section import Section
 from beamline.plan.plan import Mode, Place
 
@@ -149,7 +149,7 @@ class Config(Section):
     devices: DeviceSection
     optics: Optics
     storage: Storage = Storage()
-    monitor: Monitor = Monitor()
+    monitor: MonitorSection = MonitorSection()
     recon: Recon = Recon()
     simulation: Simulation | None = None
 

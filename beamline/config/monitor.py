@@ -16,14 +16,16 @@ from beamline.monitor.check import Check
 from beamline.monitor.checks import CHECKS
 
 
-class MonitorSection(Section):
+class MonitorBase(Section):
+    """The keys that do not depend on the checks."""
+
     on_alarm: Literal["log", "stop"] = "log"
     """An alarm of a check is logged, or it stops the scan."""
 
     @model_validator(mode="before")
     @classmethod
     def _without_thresholds(cls, data: Any) -> Any:
-        """Take out `thresholds`, which held the limits until 0.1; the empty one is in every older resolved file."""
+        """Take out `thresholds`, which held the limits in earlier versions; their resolved files have an empty one."""
         if not isinstance(data, dict) or "thresholds" not in data:
             return data
         if old := data["thresholds"]:
@@ -45,12 +47,12 @@ def _limits_of(check: Check) -> Any:
 
 
 if TYPE_CHECKING:
-    Monitor = MonitorSection
+    MonitorSection = MonitorBase
 else:
     _LIMITS = {check.name: _limits_of(check) for check in CHECKS if fields(check)}
-    Monitor = create_model("Monitor", __base__=MonitorSection, __doc__=MonitorSection.__doc__, **_LIMITS)
+    MonitorSection = create_model("MonitorSection", __base__=MonitorBase, __doc__="Section `monitor`.", **_LIMITS)
 
 
-def configured_checks(monitor: MonitorSection) -> tuple[Check, ...]:
+def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:
     """All checks, with the limits that the configuration gives them."""
     return tuple(replace(check, **dict(getattr(monitor, check.name, ()))) for check in CHECKS)

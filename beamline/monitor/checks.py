@@ -1,27 +1,32 @@
-"""Registry of the monitor's checks, and the bits by which a file says which of them flagged a frame.
+"""The registry of the monitor's checks, and the bits by which a file says which of them flagged a frame.
 
-To add a check: write its file beside the others and enter it in CHECKS. Configuration, bitmask, legend of the file and
-`beamline info` follow from the entry.
+Adding a check takes its file in this folder and its line in REGISTRY. Its keys in the configuration, its bits and the
+legend in a scan file, and its name in `beamline info` follow.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib import import_module
 
-from beamline.monitor.bands import Bands
-from beamline.monitor.beam import Beam
 from beamline.monitor.check import Check, Flag, Level
-from beamline.monitor.dark import Dark
-from beamline.monitor.mass import Mass
-from beamline.monitor.saturation import Saturation
-from beamline.monitor.stuck import Stuck
-from beamline.monitor.timing import Timing
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
 
 
-def _registry(*checks: Check) -> tuple[Check, ...]:
-    """The checks with their default limits, refused where two share a name or a bit, or a bit has no place."""
+REGISTRY = {  # module in this folder: class of the check
+    "beam": "Beam",
+    "saturation": "Saturation",
+    "stuck": "Stuck",
+    "bands": "Bands",
+    "timing": "Timing",
+    "mass": "Mass",
+    "dark": "Dark",
+}
+
+
+def _distinct(*checks: Check) -> tuple[Check, ...]:
+    """The checks; ValueError where two share a name or a bit, or a bit is outside the mask."""
     names, bits = {check.name for check in checks}, {check.bit for check in checks}
     if min(len(names), len(bits)) < len(checks) or not bits <= set(range(ALARM_SHIFT)):
         taken = ", ".join(f"{check.name} {check.bit}" for check in checks)
@@ -29,15 +34,10 @@ def _registry(*checks: Check) -> tuple[Check, ...]:
     return checks
 
 
-CHECKS: tuple[Check, ...] = _registry(
-    Beam(),
-    Saturation(),
-    Stuck(),
-    Bands(),
-    Timing(),
-    Mass(),
-    Dark(),
+CHECKS: tuple[Check, ...] = _distinct(
+    *(getattr(import_module(f"beamline.monitor.{module}"), name)() for module, name in REGISTRY.items())
 )
+"""All checks with their default limits, in the order in which they look at a frame."""
 
 _BITS = {check.name: check.bit for check in CHECKS}
 
