@@ -1,1 +1,1 @@
-"""How good a volume is: against a truth, against its data, and against the time it took."""
+"""Quality of a volume: against a truth, by half data sets (FSC), and against the time spent."""

@@ -1,4 +1,4 @@
-"""Fourier shell correlation: down to which detail do two volumes of a sample, from half the views each, agree?"""
+"""Fourier shell correlation: the resolution at which two volumes, from half of the views each, still agree."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from scipy import fft
 F64 = NDArray[np.float64]
 
 FIXED_THRESHOLD = 0.143
-"""Half sets that agree so well stand for a whole set that agrees to 0.5 with the truth (Rosenthal & Henderson 2003)."""
+"""Correlation of half sets at which the whole set correlates to 0.5 with the truth (Rosenthal & Henderson 2003)."""
 
-_TAPERED_FROM = 8  # an axis with fewer voxels has no room for a soft edge
+_TAPERED_FROM = 8  # voxels; a shorter axis is too short for a soft edge
 
 
 @dataclass(frozen=True, eq=False)
 class ShellCorrelation:
-    """How two volumes agree, by spatial frequency.
+    """Correlation of two volumes by spatial frequency.
 
     Attributes:
         frequency: [shell], 1/mm, the middle of each shell; the first is one period over the longest edge.
-        correlation: [shell], -1..1; NaN in a shell where a volume holds nothing.
-        independent: [shell], how many independent Fourier values a shell holds; of white noise the correlation
+        correlation: [shell], -1..1; NaN in a shell where a volume has no power.
+        independent: [shell], number of independent Fourier values in a shell; for white noise the correlation
             scatters about 0 with a standard deviation of 1/sqrt(independent), or up to 30 % less under a mask.
         nyquist: 1/mm, of the coarsest voxel edge; shells end there.
     """
@@ -53,7 +53,7 @@ class ShellCorrelation:
         """Full period, in mm, at which the correlation first falls below `threshold` [shell].
 
         Between two shells the crossing is interpolated. The Nyquist period where the correlation never falls below:
-        the voxels are then the limit, not the data. Infinite where already the first shell lies below.
+        then the voxels are the limit, not the data. Infinite if already the first shell lies below.
         """
         above = np.nan_to_num(self.correlation, nan=-1.0) - threshold
         below = np.flatnonzero(above < 0)
@@ -68,19 +68,19 @@ class ShellCorrelation:
 
 
 def soft_cylinder(shape: tuple[int, int, int], edge: float = 0.2) -> NDArray[np.float32]:
-    """A mask [z, y, x], 1 inside the cylinder that the field of view turns through, with a raised-cosine edge to 0.
+    """A mask [z, y, x]: 1 inside the cylinder that every view sees, with a raised-cosine edge to 0.
 
     Without a soft edge the outline of the field, which both volumes share, correlates at every frequency.
 
     Args:
-        shape: of the volume.
-        edge: width of the edge as a share of the half axis, along the radius and along z; 0 leaves a hard cylinder.
+        shape: shape of the volume.
+        edge: width of the edge as a fraction of the half axis, along the radius and along z; 0 leaves a hard cylinder.
 
     Raises:
         ValueError: for an edge outside 0..1.
     """
     if not 0 <= edge <= 1:
-        raise ValueError(f"the edge is a share of the half axis, 0 to 1, got {edge}")
+        raise ValueError(f"the edge is a fraction of the half axis, 0 to 1, got {edge}")
     nz, ny, nx = shape
     along = np.abs(_centred(nz)) if nz >= _TAPERED_FROM else np.zeros(nz)
     radius = np.hypot(_centred(ny)[:, None] * ny, _centred(nx)[None, :] * nx) / min(ny, nx)
@@ -109,14 +109,14 @@ def fourier_shell_correlation(
 
         FSC(k) = Re Σ F₁ F₂* / sqrt(Σ |F₁|² Σ |F₂|²), sums over the shell of radius k
 
-    Each volume's mean (within the mask) is taken off first, so that neither gain nor offset matters. What both
-    reconstructions share without its being in the sample (the same prior, the same mask, the same ring) counts as
-    agreement: the resolution is an upper bound of what the data hold.
+    Each volume's mean (within the mask) is subtracted first, so that neither gain nor offset matters. Errors common to
+    both reconstructions (the same prior, mask or ring artefact) count as agreement, so the resolution is an optimistic
+    bound.
 
     Args:
         first, second: [z, y, x], of one shape; edges may differ in length.
         spacing: voxel edge in mm, or the edges (z, y, x).
-        mask: weights [z, y, x], such as `soft_cylinder`; None takes all alike.
+        mask: weights [z, y, x], such as `soft_cylinder`; None: all 1.
 
     Raises:
         ValueError: for shapes that differ, fewer than 4 voxels along the longest axis, values that are not finite,
@@ -139,7 +139,7 @@ def fourier_shell_correlation(
     shells = max(1, int(np.floor(nyquist / width + 1e-9)))
     kz, ky = (np.fft.fftfreq(n, edge) for n, edge in zip(shape[:2], edges[:2], strict=True))
     kx = np.fft.rfftfreq(shape[2], edges[2])
-    twice = np.full(kx.size, 2.0)  # a real volume's transform is stored by half: the rest are the conjugates
+    twice = np.full(kx.size, 2.0)  # half of a real volume's transform is stored: the other half are its conjugates
     twice[0] = 1
     if shape[2] % 2 == 0:
         twice[-1] = 1
@@ -160,18 +160,18 @@ def fourier_shell_correlation(
             total += np.bincount(index, w * values, shells + 1)
     power = np.sqrt(power_a * power_b)
     correlation = np.divide(cross, power, out=np.full(shells + 1, np.nan), where=power > 0)
-    kept = count > 0
-    kept[0] = False  # the mean was taken off
+    used = count > 0
+    used[0] = False  # the mean was subtracted
     return ShellCorrelation(
-        frequency=np.float64(width) * np.arange(shells + 1, dtype=np.float64)[kept],
-        correlation=np.clip(correlation[kept], -1, 1),
-        independent=np.maximum(1.0, count[kept] * _independent_share(mask)),
+        frequency=np.float64(width) * np.arange(shells + 1, dtype=np.float64)[used],
+        correlation=np.clip(correlation[used], -1, 1),
+        independent=np.maximum(1.0, count[used] * _independent_share(mask)),
         nyquist=nyquist,
     )
 
 
 def _spectrum(volume: NDArray[np.floating], mask: NDArray[np.floating] | None) -> NDArray[np.complex64]:
-    """The transform [z, y, x // 2 + 1] of what is under the mask, without its mean, scaled to unit variance."""
+    """Fourier transform [z, y, x // 2 + 1] of the masked volume, without its mean, scaled to a maximum of 1."""
     data = np.asarray(volume, np.float64)
     if not np.isfinite(data).all():
         raise ValueError(f"{int((~np.isfinite(data)).sum())} of {data.size} voxels are not finite")
@@ -179,17 +179,17 @@ def _spectrum(volume: NDArray[np.floating], mask: NDArray[np.floating] | None) -
     if mask is not None:
         data = data * mask
     scale = float(np.abs(data).max())
-    # Of a constant, taking the mean off leaves rounding, which would correlate with anything.
+    # A constant without its mean is rounding noise, which has no meaningful correlation.
     if scale <= 1e-12 * max(float(np.abs(volume).max()), 1e-300):
         raise ValueError("a volume is constant under the mask; there is nothing to correlate")
     return np.asarray(fft.rfftn((data / scale).astype(np.float32), workers=-1), np.complex64)
 
 
 def _independent_share(mask: NDArray[np.floating] | None) -> float:
-    """Which share of the Fourier values of noise under a mask are independent: (Σ w²)² / (N Σ w⁴).
+    """Fraction of the Fourier values of masked noise that are independent: (Σ w²)² / (N Σ w⁴).
 
-    By Parseval the cross term of two noises over all frequencies scatters as sqrt(Σ w⁴) where its bound is Σ w². Within
-    one thin shell somewhat more are independent, so that thresholds come out a little too strict, never too lax.
+    By Parseval the cross term of two noises over all frequencies scatters as sqrt(Σ w⁴), against a bound of Σ w².
+    Within one thin shell slightly more are independent, so thresholds are a little too strict, never too lax.
     """
     if mask is None:
         return 1.0

@@ -1,4 +1,4 @@
-"""How good a volume is: against a truth (PSNR, SSIM, NRMSE), and without one (SNR, CNR of dense against empty)."""
+"""Quality of a volume: against a truth (PSNR, SSIM, NRMSE), and without one (SNR and CNR of dense and empty parts)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.cluster.vq import kmeans2
 
 _WINDOW, _SIGMA = 11, 1.5
-_SAMPLE = 100_000  # voxels that fix the two cluster centres
+_SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _SLAB = 32  # slices at a time
 
 Array = NDArray[np.floating]
@@ -16,7 +16,7 @@ Array = NDArray[np.floating]
 
 def _same_shape(truth: Array, volume: Array) -> None:
     if truth.shape != volume.shape or truth.size == 0:
-        raise ValueError(f"truth has shape {truth.shape}, the volume to judge {volume.shape}; they must be equal")
+        raise ValueError(f"truth has shape {truth.shape}, the volume {volume.shape}; they must be equal")
 
 
 def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
@@ -39,7 +39,7 @@ def nrmse(truth: Array, volume: Array) -> float:
     _same_shape(truth, volume)
     norm = float(np.linalg.norm(np.asarray(truth, np.float64).ravel()))
     if norm == 0:
-        raise ValueError("the truth is zero everywhere: an error relative to it has no meaning")
+        raise ValueError("the truth is zero everywhere: a relative error is not defined")
     return float(np.linalg.norm(np.subtract(volume, truth, dtype=np.float64).ravel())) / norm
 
 
@@ -59,7 +59,7 @@ def _ssim_sum(x: Array, y: Array, span: float, plane: tuple[int, int]) -> tuple[
         return image
 
     c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
-    # About their own means: E[x²] - E[x]² of values far from zero would leave nothing but rounding.
+    # Subtract the means first: E[x²] - E[x]² of values far from zero would be rounding noise.
     base_x, base_y = x.mean(), y.mean()
     x, y = x - base_x, y - base_y
     mean_x, mean_y = blur(x), blur(y)
@@ -119,7 +119,7 @@ def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> floa
 
 
 def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[slice, slice, slice]:
-    """The box inside the cylinder that the field of view turns through, less a margin: (z, y, x) slices.
+    """The largest box inside the cylinder that every view sees, less a margin: (z, y, x) slices.
 
     The side is 2 r cos 45° for a circle of radius r = half the smaller of ny and nx. The margin is a fraction of the
     side, and of the height, taken off at each end.
@@ -139,12 +139,13 @@ def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np
     """Dense and empty regions by k-means with k = 2 on the voxel values, within the inscribed cuboid.
 
     Args:
-        volume: [z, y, x], good enough to tell the two apart: the mask may then judge other volumes of the same sample.
+        volume: [z, y, x], with enough contrast to separate the two regions; the mask then serves for other volumes of
+            the same sample.
         seed: of the sample and of the k-means++ start.
         margin: see `inscribed_cuboid`.
 
     Returns:
-        int8 [z, y, x]: 1 dense, 0 empty, -1 outside the cuboid (not judged).
+        int8 [z, y, x]: 1 dense, 0 empty, -1 outside the cuboid (not used).
 
     Raises:
         ValueError: where all voxels have the same value or some are not finite.
@@ -156,7 +157,7 @@ def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np
     rng = np.random.default_rng(seed)
     sample = values if values.size <= _SAMPLE else rng.choice(values, _SAMPLE, replace=False)
     if np.ptp(sample) == 0:
-        raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to tell apart")
+        raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to separate")
     centres, _ = kmeans2(sample[:, None], 2, iter=30, minit="++", rng=rng)
     mask = np.full(volume.shape, -1, np.int8)
     mask[box] = volume[box] > centres.mean()
@@ -171,10 +172,10 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
 
     Args:
         volume: [z, y, x].
-        mask: 1 (True) dense, 0 (False) empty, -1 not judged; see `kmeans_mask`.
+        mask: 1 (True) dense, 0 (False) empty, -1 not used; see `kmeans_mask`.
 
     Raises:
-        ValueError: where shapes differ, a region is empty of voxels, or some of its voxels are not finite.
+        ValueError: where shapes differ, a region has no voxels, or some of its voxels are not finite.
     """
     if volume.shape != mask.shape:
         raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")

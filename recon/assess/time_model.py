@@ -1,4 +1,4 @@
-"""Quality for time: presets, the choice of settings for a budget, and what the next decibel would cost; pure values."""
+"""Quality against time: presets, settings for a time budget, and the time that the next decibel would take."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Quality = Literal["preview", "standard", "best"]
 
-_REACH = 10.0  # a curve is not followed further than to so many times the time it covers
-_POINTS = 24  # neighbours in a fit's record share their running mean, so that more are not more evidence
+_REACH = 10.0  # times the time covered: no extrapolation goes further
+_POINTS = 24  # groups of a record: neighbouring values share a running mean, so more groups are not more information
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Curve:
 
     Attributes:
         binning: detector pixels joined a side.
-        share: Gaussians at the start over those that the volume would get by itself.
-        pace: CPU time of a step over that of a step with binning 1 and share 1.
+        share: Gaussians at the start, relative to the default number for the volume.
+        pace: CPU time of a step, relative to a step with binning 1 and share 1.
         points: (steps, dB above the FBP of the unbinned views), steps rising.
     """
 
@@ -40,7 +40,7 @@ class Curve:
 
 
 # Means of two scans: a slab of a measured walnut (40 rows of 256 pixels, 60 views) and a simulated battery (48 rows of
-# 160 pixels, 90 views, 5000 photons a pixel). Joining pixels only pays where FBP of all of them takes too long.
+# 160 pixels, 90 views, 5000 photons a pixel). Binning helps only where FBP of all pixels takes too long.
 CURVES: tuple[Curve, ...] = (
     Curve(1, 0.25, 0.5, ((30, -6.34), (60, -3.79), (125, -1.39), (250, 0.89), (500, 2.64), (1000, 3.34))),
     Curve(1, 0.5, 0.71, ((30, -6.55), (60, -3.49), (125, -0.33), (250, 1.83), (500, 3.47), (1000, 3.93))),
@@ -52,12 +52,12 @@ CURVES: tuple[Curve, ...] = (
 
 @dataclass(frozen=True)
 class Preset:
-    """What a word for quality stands for.
+    """Settings of a fit for one of the quality levels.
 
     Attributes:
-        steps: of the fit.
-        share: Gaussians at the start over those that the volume would get by itself.
-        polish: sweeps on voxels after it.
+        steps: number of steps of the fit.
+        share: Gaussians at the start, relative to the default number for the volume.
+        polish: sweeps on voxels after the fit.
     """
 
     steps: int
@@ -74,13 +74,13 @@ PRESETS: dict[Quality, Preset] = {
 
 @dataclass(frozen=True)
 class Speeds:
-    """What this machine needs for this scan, in s; measured.
+    """Times measured on this machine for this scan, in s, without binning and with the default number of Gaussians.
 
     Attributes:
-        fbp: of the whole volume, unbinned.
-        start: of placing the Gaussians, FBP excluded, unbinned.
-        step: of the fit, unbinned, with as many Gaussians as the volume would get by itself.
-        fill: of the final volume, with the same.
+        fbp: FBP of the whole volume.
+        start: placing the Gaussians, without FBP.
+        step: one step of the fit.
+        fill: computing the final volume from the Gaussians.
     """
 
     fbp: float
@@ -91,13 +91,13 @@ class Speeds:
 
 @dataclass(frozen=True)
 class Choice:
-    """What to do with a budget.
+    """Settings chosen for a time budget.
 
     Attributes:
         binning: detector pixels joined a side, on top of the selection's.
-        share: Gaussians at the start over those that the unbinned volume would get by itself; 0 for FBP.
-        steps: how many will fit in; 0 for FBP.
-        gain: dB above the FBP of the unbinned views that the measured curve promises.
+        share: Gaussians at the start, relative to the default number for the unbinned volume; 0 for FBP.
+        steps: number of steps for which the time suffices; 0 for FBP.
+        gain: expected dB above the FBP of the unbinned views, from the measured curve.
     """
 
     binning: int
@@ -112,15 +112,15 @@ class Choice:
 
 
 def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
-    """The settings that promise most within `budget` seconds.
+    """The settings with the best expected quality within `budget` seconds.
 
-    Each measured curve says what a kind of fit reaches in the steps that fit in; FBP, where it alone fits in, promises
-    0 dB. Where not even a FBP of binned views fits in, the smallest one is taken and will be late.
+    Each measured curve gives the quality of a kind of fit after the steps for which the time suffices; FBP counts as
+    0 dB. If the time does not suffice even for FBP of binned views, the coarsest FBP is chosen and takes longer.
 
     Args:
-        budget: s, for all of it: FBP, placing, fitting and filling the volume.
-        speeds: of this machine and scan.
-        largest_binning: that the detector allows.
+        budget: s for everything: FBP, placing, fitting and filling the volume.
+        speeds: times of this machine and scan.
+        largest_binning: largest binning that the detector allows.
 
     Raises:
         ValueError: for a budget that is not positive.
@@ -129,8 +129,8 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
         raise ValueError(f"a budget is a positive time in s, got {budget}")
     candidates: list[Choice] = []
     for binning in (n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)):
-        # More than two pixels joined a side were not measured: each halving of the detail is taken to cost 3 dB, about
-        # what the first one does.
+        # Binning above 2 was not measured: each further factor of 2 is assumed to cost 3 dB, about as much as the
+        # first one.
         loss = 3.0 * math.log2(binning)
         fbp = speeds.fbp / binning**3
         if fbp <= budget:
@@ -147,18 +147,18 @@ def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
                 candidates.append(Choice(binning, share, int(steps), gain))
     if not candidates:
         return Choice(max(n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)), 0.0, 0, -math.inf)
-    # Of equal promises the finer volume, then the fewer Gaussians.
+    # With equal gains the finer volume, then fewer Gaussians.
     return max(candidates, key=lambda c: (c.gain, -c.binning, -c.share))
 
 
 @dataclass(frozen=True)
 class NextDecibel:
-    """How much longer a reconstruction would have to be to gain another dB.
+    """Additional time for which a reconstruction would have to run to gain another dB.
 
     Attributes:
-        seconds: more; infinite where no gain could be told, or where it lies beyond ten times the time so far.
-        low, high: what it may be as well.
-        of: what gains it.
+        seconds: additional time; infinite if no gain is measurable, or needs more than ten times the time so far.
+        low, high: range of uncertainty of `seconds`.
+        of: the quantity that would gain a dB.
     """
 
     seconds: float
@@ -175,8 +175,8 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
     """Extrapolate a fit's record of residual against time by one decibel.
 
     In the second half of the time -20 log10 of the residual is fitted by a line in log t, which is how fits slow down.
-    The line is followed no further than to ten times the time so far. A longer fit would also lower its rates later, so
-    this is what that fit would need roughly, not a promise.
+    It is extrapolated to at most ten times the time so far. A longer fit would also lower its learning rates later, so
+    the result is a rough estimate.
 
     Args:
         seconds: since the start of the reconstruction, rising.
@@ -197,7 +197,7 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
     slope = float(x @ y / (x @ x))  # dB for each factor of e in time
     scatter = y - y.mean() - slope * x
     error = math.sqrt(float(scatter @ scatter) / (x.size - 2) / float(x @ x))
-    # A record without scatter, of two dozen points: still no better known than that.
+    # The slope is known no better than this, also for a record of two dozen points without scatter.
     error = max(error, 1e-3 * abs(slope))
     if slope <= 2 * error:
         return none
@@ -207,16 +207,16 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
 
 
 def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
-    """What a fit of a dB more would take, from how fits of other lengths did (`CURVES`).
+    """Additional time for a fit to gain a dB, from the quality of fits of other lengths (`CURVES`).
 
-    A fit's own record cannot tell: much of what it gains towards its end comes from its falling rates, and a longer fit
-    collects that once, too. The curves are means over two scans; `low` and `high` are the best and the worst of those
-    for different numbers of Gaussians. Beyond its last point a curve goes on along its last slope, to four times its
-    steps and no further.
+    A fit's own record is no basis: much of its gain towards the end comes from the falling learning rates, a gain that
+    a longer fit has only once, too. The curves are means over two scans; `low` and `high` are the best and the worst of
+    the curves for different numbers of Gaussians. Beyond its last point a curve is extrapolated with its last slope, to
+    at most four times its steps.
 
     Args:
-        seconds: that the fit took.
-        steps: that it made, its rates falling along them.
+        seconds: time that the fit took.
+        steps: number of its steps, over which the learning rates fell.
     """
     found = sorted(_further(curve, steps) for curve in CURVES if curve.binning == 1)
     low, middle, high = (seconds * (factor - 1) for factor in (found[0], found[len(found) // 2], found[-1]))
@@ -224,7 +224,7 @@ def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
 
 
 def _further(curve: Curve, steps: int) -> float:
-    """How many times the steps give a dB more; inf where that is not within reach."""
+    """Factor on the steps that gains a dB; inf if it is above ten."""
     steps = max(steps, curve.points[0][0])
     (before, gain), (last, most) = curve.points[-2:]
     slope = max(0.0, (most - gain) / math.log(last / before))
@@ -241,7 +241,7 @@ def _time_of(end: float, slope: float) -> float:
 
 
 def record(seconds: ArrayLike, residuals: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(s, -20 log10 of the residual) of what is known of a fit's record."""
+    """(s, -20 log10 of the residual) for the valid entries of a fit's record."""
     t, r = np.asarray(seconds, np.float64), np.asarray(residuals, np.float64)
     known = np.isfinite(t) & (t > 0) & np.isfinite(r) & (r > 0)
     return t[known], -20 * np.log10(r[known])
@@ -254,10 +254,10 @@ def parse_budget(text: str) -> float:
         ValueError: for anything else, and for a time that is not positive and finite.
     """
     units = {"s": 1.0, "m": 60.0, "h": 3600.0}
-    said = text.strip()
-    unit = units.get(said[-1:].lower())
+    number = text.strip()
+    unit = units.get(number[-1:].lower())
     try:
-        seconds = float(said if unit is None else said[:-1]) * (unit or 1.0)
+        seconds = float(number if unit is None else number[:-1]) * (unit or 1.0)
     except ValueError:
         seconds = math.nan
     if not (math.isfinite(seconds) and seconds > 0):
@@ -266,7 +266,7 @@ def parse_budget(text: str) -> float:
 
 
 def parts_of(seconds: float) -> str:
-    """A time as people read it."""
+    """A time as text: s, min or h."""
     if seconds < 100:
         return f"{seconds:.3g} s"
     return f"{seconds / 60:.3g} min" if seconds < 6000 else f"{seconds / 3600:.3g} h"

@@ -1,4 +1,4 @@
-"""Joining pixels: views of a coarser detector from those of a finer one; `Geometry.binned` is the geometry of them."""
+"""bin_views: binning of projections by a factor; `Geometry.binned` gives their geometry."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 
 def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means of factor x factor line integrals, [view, row, col]; trailing pixels that fill no bin go.
+    """Means of factor x factor line integrals [view, row, col]; trailing pixels that do not fill a bin are dropped.
 
-    The mean of line integrals is a little less than the line integral of the mean transmission where they differ
-    within a bin; correction can bin counts instead (`--bin`).
+    Where line integrals differ within a bin, their mean is slightly larger than the line integral of the mean
+    transmission; the correction can bin counts instead (`--bin`).
 
     Raises:
         ValueError: for a factor below 1, or larger than the detector.
@@ -21,5 +21,5 @@ def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float
     if factor == 1:
         return projections
     rows, cols = rows // factor, cols // factor
-    kept = projections[:, : rows * factor, : cols * factor]
-    return kept.reshape(n, rows, factor, cols, factor).mean(axis=(2, 4), dtype=np.float32)
+    whole = projections[:, : rows * factor, : cols * factor]
+    return whole.reshape(n, rows, factor, cols, factor).mean(axis=(2, 4), dtype=np.float32)

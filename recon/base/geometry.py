@@ -1,4 +1,4 @@
-"""Geometry: where every view's rays run, as one immutable value.
+"""Geometry: the rays of every view, as one immutable value.
 
 Convention (fixed for the whole project): the object stands still and the view turns. For a view at angle θ
 
@@ -8,13 +8,13 @@ Convention (fixed for the whole project): the object stands still and the view t
 
 Parallel beam: column i has its centre at u = (i - axis_col) * pixel_pitch, so `axis_col` counts pixels from 0 at the
 centre of the first column; row j has its centre at v = (j - axis_row) * pixel_pitch, with axis_row = (rows - 1) / 2
-where nothing else is said.
+by default.
 
 Cone beam: the source lies at -sod * d, the detector sdd away from it; a point at depth w = sod + x·d falls on column
 axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_pitch, with pixel_pitch on the detector.
 
-A real set-up departs from that in three ways, each of them one number a view: `tilt` leans the rotation axis along
-the beam (laminography), `roll` turns the detector about the beam, `shifts` move the picture on the detector.
+A real set-up departs from that in three ways, each given for every view: `tilt` leans the rotation axis along the beam
+(laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from numpy.typing import ArrayLike, NDArray
 
 F64 = NDArray[np.float64]
 
-_OFF_MIDDLE = 0.05  # of the detector's width: an axis farther from the middle leaves a tenth of the field to one side
-_SHORT_OF_SOURCE = 0.7  # of sod: the corners of a box that reaches so far still lie before the source
+_OFF_MIDDLE = 0.05  # of the detector's width: with the axis farther off, a tenth of the field is on one side
+_SHORT_OF_SOURCE = 0.7  # of sod: the corners of a box of this half width do not reach the source
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Geometry of a set of views; made by `Geometry.parallel` or `Geometry.cone`.
+    """Geometry of a set of views; construct it with `Geometry.parallel` or `Geometry.cone`.
 
     Attributes:
         angles: float64 [view], radians, any order, any range.
@@ -124,10 +124,10 @@ class Geometry:
 
     @property
     def period(self) -> float:
-        """Radians after which a view brings nothing new: π where its rays are those of the view half a turn before.
+        """Angle, in radians, after which views repeat the same rays: π for a centred parallel beam, else 2π.
 
-        2π for a cone, for an axis that leans along the beam, and for one so far off the detector's middle that views
-        half a turn apart complete each other (by more than a tenth of the field).
+        2π holds for a cone, for an axis that leans along the beam, and for an axis so far off the detector's middle
+        that views half a turn apart see different parts (more than a tenth of the field).
         """
         cols = self.detector_shape[1]
         off = abs(float((self.axis_col + self.shifts[:, 0]).mean()) - (cols - 1) / 2)
@@ -135,7 +135,7 @@ class Geometry:
 
     @property
     def middle_height(self) -> float:
-        """z in mm that falls on the middle of the detector's rows."""
+        """z in mm of the middle of the detector's rows."""
         return ((self.detector_shape[0] - 1) / 2 - self.axis_row) * self.sample_pitch
 
     @property
@@ -145,9 +145,9 @@ class Geometry:
 
     @property
     def reach(self) -> float:
-        """mm from the rotation axis to the farthest edge of the columns that any view has, measured at the axis.
+        """mm from the rotation axis to the farthest column edge of any view, measured at the axis.
 
-        Rolled views count as straight ones. A cone so wide that this comes near its source reaches 0.7 sod.
+        Rolled views count as straight ones. For a wide cone the value is limited to 0.7 sod.
         """
         cols, axis = self.detector_shape[1], self.axis_col + self.shifts[:, 0]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
@@ -170,7 +170,7 @@ class Geometry:
         return np.stack((cr * u + sr * v, cr * v - sr * u, d))
 
     def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) at which the middle of the object's frame falls in one view."""
+        """Pixel (col, row) of the origin of the object's frame in one view."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def select(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Geometry:
@@ -189,17 +189,17 @@ class Geometry:
         )  # fmt: skip
 
     def at(self, angles: ArrayLike) -> Geometry:
-        """The same set-up at other angles (radians), with the shift, roll and tilt that all views have.
+        """The same set-up at other angles (radians), with the shift, roll and tilt common to all views.
 
         Raises:
-            ValueError: for bad angles, or where these differ between views: which would the new ones have?
+            ValueError: for bad angles, or if shift, roll or tilt differ between views: new views have no known ones.
         """
         for name, own in (("shifts", self.shifts), ("roll", self.roll), ("tilt", self.tilt)):
             widest = float(np.ptp(own, axis=0).max())
             if widest > 0:
                 raise ValueError(
                     f"{name} differ from view to view (by up to {widest:.3g}), so that those of views at other angles "
-                    "are not known: give a geometry whose views have the same, or make one of all views"
+                    "are not known: give a geometry whose views share one value, or one that holds the other views"
                 )
         n = np.size(angles)
         return _checked(
@@ -214,8 +214,8 @@ class Geometry:
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 
-        For a parallel beam v is measured from the middle of the kept rows, so that a slab is a scan of its own; a cone
-        keeps its central ray where it is.
+        For a parallel beam v is then measured from the middle of these rows, so that a slab is a scan of its own; the
+        central ray of a cone stays where it is.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:
@@ -225,22 +225,22 @@ class Geometry:
         return replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
 
     def binned(self, factor: int) -> Geometry:
-        """The geometry after joining factor x factor pixels; trailing rows and columns that do not fill a bin go.
+        """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
 
-        As with `rows`, a parallel beam's v is measured from the middle of what is left.
+        As with `rows`, v of a parallel beam is then measured from the middle of the rows left.
         """
         if operator.index(factor) < 1:
             raise ValueError(f"bin factor must be >= 1, got {factor}")
         rows, cols = (n // factor for n in self.detector_shape)
         if rows < 1 or cols < 1:
             raise ValueError(f"bin factor {factor} is larger than the detector {self.detector_shape}")
-        kept = self.rows(0, rows * factor)
+        whole = self.rows(0, rows * factor)
         return replace(
-            kept,
+            whole,
             detector_shape=(rows, cols),
             pixel_pitch=self.pixel_pitch * factor,
-            axis_col=(kept.axis_col - (factor - 1) / 2) / factor,
-            axis_row=(kept.axis_row - (factor - 1) / 2) / factor,
+            axis_col=(whole.axis_col - (factor - 1) / 2) / factor,
+            axis_row=(whole.axis_row - (factor - 1) / 2) / factor,
             shifts=_frozen(self.shifts / factor),
         )
 
@@ -288,6 +288,6 @@ def _checked(
 
 
 def _frozen(values: F64) -> F64:
-    own = np.array(values, np.float64)
-    own.setflags(write=False)
-    return own
+    copy = np.array(values, np.float64)
+    copy.setflags(write=False)
+    return copy

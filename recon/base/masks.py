@@ -1,4 +1,4 @@
-"""Pixels that tell nothing: filled from their neighbours so that none spreads, and given no weight in a fit."""
+"""Masked pixels: filled from their neighbours, so that bad values do not spread, and given weight 0 in a fit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[
 
 
 def plan_fill(mask: Mask) -> Fill:
-    """Rings of masked pixels from the outside in; each takes the mean of the neighbours known before it.
+    """Order in which to fill masked pixels: rings from the outside in, each the mean of neighbours filled before.
 
     Raises:
         ValueError: where all pixels [row, col] are masked.
@@ -38,7 +38,7 @@ def plan_fill(mask: Mask) -> Fill:
 
 
 def fill(image: Image, plan: Fill) -> None:
-    """Fill the pixels that `plan` was made for, in place."""
+    """Fill the masked pixels of `plan` (see `plan_fill`), in place."""
     for r, c, nr, nc, valid in plan:
         image[r, c] = np.where(valid, image[nr, nc], 0).sum(axis=1) / valid.sum(axis=1)
 
@@ -46,18 +46,18 @@ def fill(image: Image, plan: Fill) -> None:
 def masked(
     projections: NDArray[np.float32], weight: NDArray[np.float32] | None = None, largest: float = math.inf
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Projections without a value that is not finite, and the weights that go with them.
+    """Projections with all values finite, and their weights.
 
-    Pixels that are not finite, or have no weight, take the mean of their neighbours in the same view, so that direct
-    methods and starting volumes have something to work with; a fit sees by their weight of 0 that nothing was measured.
+    Pixels that are not finite, or have weight 0, take the mean of their neighbours in the same view, which direct
+    methods and first volumes use; their weight is 0, so that a fit ignores them.
 
     Args:
         projections: [view, row, col]; not changed.
-        weight: of each ray, 0 or more, [view, row, col]; None: one for all.
+        weight: weight of each ray, 0 or more, [view, row, col]; None: 1 for all.
         largest: values beyond ± this count as not finite.
 
     Returns:
-        Projections (the given ones where there is nothing to fill) and weights; None where every ray weighs one.
+        Projections (the array given, if nothing is filled) and weights (None if all are 1).
 
     Raises:
         ValueError: for weights that are negative, not finite or of another shape, or a view without a single value.
@@ -71,17 +71,17 @@ def masked(
     bad = ~((projections >= -most) & (projections <= most))
     if weight is not None:
         bad |= weight == 0
-    marred = np.flatnonzero(bad.any(axis=(1, 2)))
-    if marred.size == 0:
+    affected = np.flatnonzero(bad.any(axis=(1, 2)))
+    if affected.size == 0:
         return projections, weight
-    blind = np.flatnonzero(bad.all(axis=(1, 2)))
-    if blind.size:
+    empty = np.flatnonzero(bad.all(axis=(1, 2)))
+    if empty.size:
         within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
-            f"{blind.size} of {len(bad)} views have no value that is {within} and weighs something "
-            f"({blind[:8].tolist()} ...); leave these views out"
+            f"{empty.size} of {len(bad)} views have no value that is {within} and has a weight "
+            f"({empty[:8].tolist()} ...); leave these views out"
         )
     filled = np.array(projections, np.float32)
-    for view in marred:
+    for view in affected:
         fill(filled[view], plan_fill(bad[view]))
     return filled, np.where(bad, 0, 1 if weight is None else weight).astype(np.float32)

@@ -1,4 +1,4 @@
-"""How a ray meets Gaussians: where a Gaussian ends, and what it adds to a ray."""
+"""Truncation and RayModel: where a Gaussian is cut off, and its line integral along a ray."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from recon.base.geometry import Geometry
 
 @dataclass(frozen=True)
 class Truncation:
-    """Where a Gaussian ends.
+    """Where a Gaussian is cut off: at the smaller of two distances from its centre.
 
     Attributes:
-        sigmas: at the latest after so many standard deviations (3.5 leaves 0.2 % of a projected one outside).
-        faint: and where it has fallen below this fraction of the density unit (times the field for a projection).
+        sigmas: number of standard deviations (3.5 leaves 0.2 % of a projected Gaussian outside).
+        faint: fraction of the density unit (times the field of view for a projection) below which it is cut off.
     """
 
     sigmas: float = 3.5
@@ -29,15 +29,15 @@ class Truncation:
 
 @dataclass(frozen=True)
 class RayModel:
-    """What a Gaussian gives a ray.
+    """How the line integral of a Gaussian along a ray is computed.
 
     Attributes:
         exact_above: in a cone, Gaussians whose affine footprint is off by more than this (an estimate of the relative
-            L2 error, see `footprints_cpu`) are integrated exactly along each ray; inf: none, 0: all. A parallel
-            beam's footprints are exact.
-        rectified: False gives the footprints of 3DGS without their correction (Zha et al. 2024, section 4.2), as
-            X-Gaussian has them: the density times one length for all, half the width of the field, however much of a
-            ray lies in the Gaussian. Kept to show the bias.
+            L2 error, see recon.kernels.cpu.footprints) are integrated exactly along each ray; inf: none, 0: all. The
+            footprints of a parallel beam are exact.
+        rectified: False gives the uncorrected footprints of 3DGS, as in X-Gaussian (see Zha et al. 2024, section 4.2):
+            density times one length for all, half the width of the field, whatever length of the ray lies in the
+            Gaussian. It serves to show the bias.
     """
 
     exact_above: float = math.inf
@@ -47,8 +47,8 @@ class RayModel:
         if not self.exact_above >= 0:
             raise ValueError(f"exact_above must be a relative error >= 0 (inf: never), got {self.exact_above}")
         if not self.rectified and self.exact_above < math.inf:
-            raise ValueError("an exact integral is rectified: leave exact_above at inf where rectified is False")
+            raise ValueError("exact integrals are always rectified: leave exact_above at inf with rectified = False")
 
     def length(self, geometry: Geometry) -> float:
-        """mm that stand in for a ray's length in a Gaussian; 0 where the true one is taken."""
+        """mm used for the length of every ray in a Gaussian; 0 to use the true length."""
         return 0.0 if self.rectified else geometry.detector_shape[1] * geometry.sample_pitch / 2

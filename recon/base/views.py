@@ -1,4 +1,4 @@
-"""Which views to use, in a word: all, fixed:90, sector:30-150:60, random:45:7, first:20."""
+"""parse_views: a selection of views from its short form: all, fixed:90, sector:30-150:60, random:45:7, first:20."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _COUNT = re.compile(r"\d+")
 
 
 def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = np.pi) -> NDArray[np.int64]:
-    """Indices of the views that a selection names, ascending, none twice.
+    """Indices of the selected views, ascending, without repetition.
 
     - `all`: every view.
-    - `fixed:N`: N views spread evenly in angle. Views one `period` apart see the same rays, so they count as one place
-      as long as there are N places.
+    - `fixed:N`: N views spread evenly in angle. Views one `period` apart see the same rays and count as one angle, as
+      long as N angles are left.
     - `sector:A-B[:N]`: views with A <= angle <= B degrees (modulo 360); of these, N spread evenly.
     - `random:N[:seed]`: N views drawn without replacement.
     - `first:N`: the N views taken first.
@@ -28,7 +28,7 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
     Args:
         spec: the selection.
         angles: [view], radians, in the order taken.
-        seed: for `random:N` without a seed of its own.
+        seed: for `random:N` without a seed in the text.
         period: radians after which views see the same rays, see `Geometry.period`; by default those of a parallel beam
             with the axis in the middle.
 
@@ -41,17 +41,17 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
         raise ValueError(
             f"views {np.flatnonzero(~np.isfinite(theta))[:8].tolist()} have no angle; leave them out first"
         )
-    everything = np.arange(theta.size)
+    views = np.arange(theta.size)
     name, _, rest = spec.strip().partition(":")
     if name == "all" and not rest:
-        return everything
+        return views
     if name in ("fixed", "first") and _COUNT.fullmatch(rest):
         n = _enough(int(rest), theta.size, spec)
-        return everything[:n] if name == "first" else _even(everything, theta, n, period)
+        return views[:n] if name == "first" else _even(views, theta, n, period)
     if name == "random" and (match := _RANDOM.fullmatch(rest)):
         n = _enough(int(match[1]), theta.size, spec)
         rng = np.random.default_rng(seed if match[2] is None else int(match[2]))
-        return np.sort(rng.choice(everything, n, replace=False))
+        return np.sort(rng.choice(views, n, replace=False))
     if name == "sector" and (match := _SECTOR.fullmatch(rest)):
         return _sector(theta, float(match[1]), float(match[2]), match[3], spec, period)
     raise ValueError(f"unknown selection of views {spec!r}; use one of: {FORMS}")
@@ -59,7 +59,7 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
 
 def _enough(n: int, available: int, spec: str) -> int:
     if not 1 <= n <= available:
-        raise ValueError(f"{spec!r} asks for {n} views; between 1 and {available} can be had")
+        raise ValueError(f"{spec!r} asks for {n} views; give a number from 1 to {available}")
     return n
 
 
@@ -68,7 +68,7 @@ def _sector(
 ) -> NDArray[np.int64]:
     if not high > low:
         raise ValueError(f"{spec!r}: the sector must end after it begins, {high:g} is not above {low:g} degrees")
-    slack = 1e-6  # degrees, so that an end that is a view's own angle takes that view
+    slack = 1e-6  # degrees, so that a view at an end of the sector is inside
     from_low = np.mod(np.rad2deg(theta) - low + slack, 360)
     inside = np.flatnonzero(from_low <= high - low + 2 * slack)
     if not inside.size:
@@ -83,12 +83,14 @@ def _sector(
 
 
 def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: float) -> NDArray[np.int64]:
-    """n of the views, spread evenly over their places within a period, or over themselves if places are too few."""
+    """n of the views, spread evenly over the distinct angles within a period, or over all if these are too few."""
     once = np.sort(np.mod(theta[views], period))
     gaps = np.diff(once, append=once[0] + period)
     step = float(np.median(gaps[gaps > 1e-9]))
     place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first view
     order = np.argsort(place, kind="stable")
     starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
-    distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # of views at one place the earliest
+    distinct = (
+        np.minimum.reduceat(order, starts) if starts.size >= n else order
+    )  # the earliest of the views at one angle
     return np.sort(views[distinct[np.arange(n) * distinct.size // n]])

@@ -1,4 +1,4 @@
-"""Grid and Volume: a box of voxels in the sample's frame, and the attenuation in it."""
+"""Grid and Volume: a box of voxels in the object's frame, and the attenuation in it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 
-_COARSEST = 4.0  # pixels: voxels of a fit's box, however coarse the volume that is wanted
+_COARSEST = 4.0  # pixels: largest voxel of a fit's box, also where the volume wanted is coarser
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Grid:
 
     Attributes:
         shape: (nz, ny, nx) in voxels; z runs along the rotation axis.
-        voxel_size: edge in mm along x and y, and along z where no other is given.
+        voxel_size: edge in mm along x and y, and along z without a slice_pitch.
         centre: (z, y, x) of the box's centre in mm; the rotation axis is x = y = 0.
         slice_pitch: edge in mm along z; None: voxels are cubes.
     """
@@ -46,9 +46,9 @@ class Grid:
     def matching(cls, geometry: Geometry) -> Grid:
         """One voxel a detector pixel: (rows, cols, cols) voxels around the rotation axis, at the height that views see.
 
-        Views that are shifted apart widen it to what at least half as many of them see as see any part: an alignment's
-        small shifts change nothing, views that jump up and down give all heights. However far off the detector's middle
-        the axis falls, it is no wider for that: all that such views see is in `of_field`.
+        With shifted views it covers every position that is seen by at least half as many views as the position seen
+        most often: small alignment shifts change nothing, views that step up and down give all heights. An axis off the
+        detector's middle does not widen the box; `of_field` covers all that such views see.
         """
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
         height = geometry.middle_height + middle * geometry.sample_pitch
@@ -56,25 +56,25 @@ class Grid:
 
     @classmethod
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
-        """A box around the rotation axis that holds all that any view sees, wherever the axis falls in it.
+        """A box around the rotation axis that holds all that any view sees, wherever the axis is on the detector.
 
-        It spans what shifted views see, and is as wide as needed for an axis off the detector; rolled and tilted views
-        count as straight ones. A cone's field is measured at the rotation axis, as its makers do: what lies nearer the
-        source is seen larger, and by few views only. The box of a wide cone ends before its source.
+        It spans what shifted views see, also for an axis outside the detector; rolled and tilted views count as
+        straight ones. The field of a cone is measured at the rotation axis, the usual convention: matter nearer the
+        source is magnified more, and only few views see it. The box of a wide cone ends before its source.
         """
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
-        nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error is no voxel
+        nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error adds no voxel
         if geometry.is_cone and nx * voxel_size >= math.sqrt(2) * geometry.sod:
             nx = max(1, math.floor(across))  # the corners of the last voxel would reach the source
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
     @classmethod
     def for_fit(cls, geometry: Geometry, wanted: Grid) -> Grid:
-        """The box that a fit covers whatever volume is wanted of it: the field, in voxels like those wanted.
+        """The box that a fit covers: the whole field, in voxels of the size wanted.
 
-        They are no finer than a pixel, which the views do not resolve, and no coarser than four, from which no fit
-        could start.
+        The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
+        from which a fit can start.
         """
         pixel = geometry.sample_pitch
         return cls.of_field(geometry, min(max(wanted.voxel_size, pixel), _COARSEST * pixel))
@@ -100,14 +100,16 @@ class Grid:
 
 
 def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
-    """How many pixels the shifted views reach across along columns (0) or rows (1), and where their middle is, from
-    that of a view without a shift; without what fewer than half as many views see as see the best seen part."""
+    """Extent in pixels of shifted views along columns (0) or rows (1), and its middle from that of an unshifted view.
+
+    Positions seen by fewer than half as many views as the position seen most often are left out.
+    """
     size = geometry.detector_shape[1 - axis]
     first = -geometry.shifts[:, axis]
     edges = np.unique(np.concatenate((first, first + size)))
     within = (edges[:-1] + edges[1:]) / 2
-    seen = (first[:, None] <= within) & (within < first[:, None] + size)
-    enough = np.flatnonzero(2 * seen.sum(axis=0) >= seen.sum(axis=0).max())
+    covered = (first[:, None] <= within) & (within < first[:, None] + size)
+    enough = np.flatnonzero(2 * covered.sum(axis=0) >= covered.sum(axis=0).max())
     low, high = float(edges[enough[0]]), float(edges[enough[-1] + 1])
     return max(1, round(high - low)), (low + high - size) / 2
 

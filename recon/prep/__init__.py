@@ -1,1 +1,1 @@
-"""Before a reconstruction: counts to line integrals, and the rotation axis."""
+"""Preparation of projections: counts to line integrals, and the rotation axis."""

@@ -1,7 +1,7 @@
-"""The rotation axis from the data: each estimate comes with its curve and says whether it can be trusted.
+"""find_axis: the rotation axis from the data, with the curve of each estimate and whether it is reliable.
 
-Three methods that fail in different ways: a pair of views half a turn apart needs only these; the double wedge uses all
-views of about half a turn; the centre of mass needs any sector, but the whole sample in the field and air at zero.
+Three methods with different weaknesses: the pair needs two views half a turn apart; the double wedge needs views over
+about half a turn; the centre of mass takes any sector, but needs the whole sample in the field and air at zero.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from scipy import fft
 
 Floats = NDArray[np.float64]
 
-_MOST_VIEWS, _MOST_ROWS, _MOST_COLS = 256, 16, 1024  # enough for 0.1 px; more costs time only
+_MOST_VIEWS, _MOST_ROWS, _MOST_COLS = 256, 16, 1024  # enough for 0.1 px
 _STEP = 0.25  # px between candidates
-_WIDEST_GAP = np.deg2rad(20)  # in a half turn; beyond it the seam no longer fixes the axis
-_AGREE = 1.0  # px by which independent estimates may differ and still be believed
+_WIDEST_GAP = np.deg2rad(20)  # in a half turn; with a wider gap the double wedge does not determine the axis
+_AGREE = 1.0  # px by which independent estimates may differ and still count as equal
 
 
 class AxisError(ValueError):
@@ -28,13 +28,13 @@ class AxisError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class AxisEstimate:
-    """Where the rotation axis is, and how that was found.
+    """Estimate of the rotation axis.
 
     Attributes:
         value: axis_col in pixels, 0 at the centre of the first column.
-        candidates: float64 [n], the columns tried.
+        candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 is none.
-        confident: False where the curve is shallow, or parts of the data contradict each other.
+        confident: False if the minimum of the curve is shallow, or parts of the data disagree.
         method: "pair", "double wedge" or "centre of mass".
     """
 
@@ -51,8 +51,8 @@ def axis_from_pair(
     """Axis from two views half a turn apart: p180 is p0 mirrored about the axis.
 
     The normalised correlation of p0 with the mirrored p180 is taken at every half column (a mirror about a half column
-    maps pixels on pixels, so nothing is interpolated), then a parabola through the peak. Samples that reach out of the
-    field do no harm: only columns that both views see are compared.
+    maps pixels on pixels, so nothing is interpolated), then a parabola through the peak. Samples wider than the field
+    are allowed: only columns that both views see are compared.
 
     Args:
         p0, p180: float32 [row, col], line integrals.
@@ -82,7 +82,7 @@ def axis_from_pair(
 def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows.
 
-    1 where these columns hold next to nothing of what the views hold: air alone always matches.
+    Set to 1 where these columns hold almost none of the views' variance: air alone always matches.
     """
     rows, cols = a.shape
     a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
@@ -98,23 +98,23 @@ def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     count, sum_a, sum_b = last - first, sums(a), sums(b)
     covariance = (product - sum_a * sum_b / count).sum(axis=0)
     variance = (sums(a * a) - sum_a**2 / count).sum(axis=0) * (sums(b * b) - sum_b**2 / count).sum(axis=0)
-    told = variance > 1e-6 * (a * a).sum() * (b * b).sum()
-    return np.where(told, 1 - covariance / np.sqrt(np.where(told, variance, 1)), 1)
+    usable = variance > 1e-6 * (a * a).sum() * (b * b).sum()
+    return np.where(usable, 1 - covariance / np.sqrt(np.where(usable, variance, 1)), 1)
 
 
 def axis_from_sinogram(
     sinogram: NDArray[np.floating], angles: Floats, search: tuple[float, float] | None = None
 ) -> AxisEstimate:
-    """Axis from all views, without needing a pair: uneven, sparse and noisy scans, sectors and full turns.
+    """Axis from all views, without a pair: for uneven, sparse and noisy scans, sectors and full turns.
 
     About half a turn or more: the double wedge. The Fourier transform of a sinogram along the columns holds, at
     frequency ω, only the angular harmonics |n| <= ω r of a sample of radius r (Edholm, Lewitt & Lindholm 1986; used for
     the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis the view at θ + π is the mirrored view at
-    θ, so the real part has even harmonics only and the imaginary part odd ones. The curve is what a least-squares fit
-    of these to the views leaves over. It takes the angles as they are and is a sum of cosines of the axis: nothing is
-    interpolated.
+    θ, so the real part has even harmonics only and the imaginary part odd ones. The curve is the residual of a
+    least-squares fit of these harmonics to the views. It takes angles in any spacing and is a sum of cosines of the
+    axis, so nothing is interpolated.
 
-    Less than half a turn, or a wedge that is not sure: the centre of mass of the views, fitted by
+    Less than half a turn, or a wedge that is not confident: the centre of mass of the views, fitted by
     axis + a cos θ + b sin θ (the first of the Helgason-Ludwig conditions).
 
     Args:
@@ -162,22 +162,22 @@ def _axis_from_mass(data: Floats, theta: Floats, search: tuple[float, float] | N
     solution = covariance @ (basis.T @ centre)
     residual = centre - basis @ solution
     value, left_over = float(solution[0]), float(residual @ residual)
-    # Fixing the axis elsewhere raises the sum of squares by this much a px²; the curve counts in quarters of the field.
+    # Another axis raises the sum of squares by this much a px²; the curve is in units of a quarter of the field.
     rise = 1 / covariance[0, 0]
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
     curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
     low, high = (candidates[0], candidates[-1]) if search is None else search
     if not low < value < high:
         raise _axis_error(value, search, candidates, "outside it")
-    # Neighbouring residuals that are alike are not independent; air that is not at zero pulls without any scatter.
-    alike = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
-    error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + alike) / (1 - alike))
+    # Correlated neighbouring residuals are not independent; air that is not at zero biases the axis without scatter.
+    correlation = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
+    error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
     edge = max(2, cols // 40)
     left, right = float(profile[:, :edge].mean()), float(profile[:, -edge:].mean())
-    pull = abs(left - right) / 2 * cols**2 / 6 + abs(left + right) / 2 * cols * abs(value - (cols - 1) / 2)
+    bias = abs(left - right) / 2 * cols**2 / 6 + abs(left + right) / 2 * cols * abs(value - (cols - 1) / 2)
     whole = max(abs(left), abs(right)) < 0.05 * profile.max() and mass.std() < 0.03 * mass.mean()
-    sure = whole and 2 * error + pull / mass.mean() < _AGREE
-    return AxisEstimate(value, *_within(search, candidates, curve), bool(sure), "centre of mass")
+    confident = whole and 2 * error + bias / mass.mean() < _AGREE
+    return AxisEstimate(value, *_within(search, candidates, curve), bool(confident), "centre of mass")
 
 
 def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | None) -> AxisEstimate:
@@ -194,7 +194,7 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    # Low frequencies feel bad air and truncation, which asks for higher ones; high ones feel noise: they must agree.
+    # Low frequencies suffer from bad air and truncation, high ones from noise: both must give the same axis.
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
     power = 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
     curve = curve_for(power)
@@ -207,27 +207,27 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
 def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     """Frequencies ω [k] and coefficients [3, k] of the residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
     views, rows, cols = data.shape
-    # Air that is not at zero would be a box fixed to the detector, symmetric about its middle: take it off.
+    # Subtract air that is not at zero: it is a box fixed to the detector, symmetric about its middle.
     edge = max(2, cols // 40)
     left, right = (np.median(part, axis=2)[..., None] for part in (data[:, :, :edge], data[:, :, -edge:]))
     data = data - (left + (right - left) * np.linspace(0, 1, cols))
     n = fft.next_fast_len(2 * cols, real=True)
     radius = cols / 2
-    highest = min(np.pi / 2, 0.7 * views / radius)  # keeps more views than harmonics
+    highest = min(np.pi / 2, 0.7 * views / radius)  # so that there are more views than harmonics
     k = np.arange(1, max(3, int(highest * n / (2 * np.pi))) + 1)
     omega = 2 * np.pi * k / n
     harmonics = np.ceil(omega * radius + 2)
     spectrum = fft.rfft(data, n, axis=2)[:, :, k].reshape(views, -1)
     re, im = spectrum.real.copy(), spectrum.imag.copy()
 
-    def left_over(first: int) -> list[Floats]:
-        """What the harmonics first, first + 2 ... up to each frequency's limit leave of re·re, im·im and re·im."""
+    def residual_power(first: int) -> list[Floats]:
+        """re·re, im·im and re·im after the fit of harmonics first, first + 2 ... up to each frequency's limit."""
         order = np.repeat(np.arange(first, harmonics[-1] + 1, 2), 2)
         columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
         if first == 0:  # sin 0
             columns, order = np.delete(columns, 1, 1), np.delete(order, 1)
-        # Nested: the first m columns of q span the first m harmonics. By torch: NumPy's threads spin, which takes
-        # seconds where other processes want the cores.
+        # Nested: the first m columns of q span the first m harmonics. With torch: NumPy's threads
+        # spin, which takes seconds where other processes use the cores.
         q, r = (part.numpy() for part in torch.linalg.qr(torch.from_numpy(columns)))
         independent = np.abs(np.diag(r)) > 0.05 * np.sqrt(views)
         q, order = torch.from_numpy(q[:, independent]), order[: len(independent)][independent]
@@ -239,7 +239,7 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
         ]
 
     # About an axis a the transform is (re + i im) e^{iωa}: even harmonics in its real part, odd in its imaginary part.
-    even, odd = left_over(0), left_over(1)
+    even, odd = residual_power(0), residual_power(1)
     cosine2, sine2, mixed = even[0] + odd[1], even[1] + odd[0], odd[2] - even[2]
     return omega, np.stack([(cosine2 + sine2) / 2, (cosine2 - sine2) / 2, mixed])
 
@@ -247,7 +247,7 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 def find_axis(
     projections: NDArray[np.floating], angles: Floats, search: tuple[float, float] | None = None
 ) -> AxisEstimate:
-    """The rotation axis of a scan, from all views and, where two lie half a turn apart, checked against these.
+    """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
     Args:
         projections: float32 [view, row, col], line integrals.
@@ -255,7 +255,7 @@ def find_axis(
         search: (lowest, highest) column; None: the whole detector.
 
     Returns:
-        The estimate from all views, or the pair's where that alone is sure; not confident where they contradict.
+        The estimate from all views, or that of the pair if only that is confident; not confident if they disagree.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
@@ -263,23 +263,23 @@ def find_axis(
     theta = np.asarray(angles, np.float64)
     if projections.ndim != 3:
         raise ValueError(f"projections must be [view, row, col], got shape {projections.shape}")
-    everything = axis_from_sinogram(projections, theta, search)
+    from_all = axis_from_sinogram(projections, theta, search)
     pair = _closest_pair(theta, tolerance=2 / projections.shape[2])
     if pair is None:
-        return everything
+        return from_all
     try:
-        two = axis_from_pair(projections[pair[0]], projections[pair[1]], search)
-    except AxisError:  # nothing to tell in these two views: all the others have told
-        return everything
-    if not two.confident:
-        return everything
-    if abs(everything.value - two.value) > _AGREE:
-        return replace(everything, confident=False)
-    return everything if everything.confident else two
+        from_pair = axis_from_pair(projections[pair[0]], projections[pair[1]], search)
+    except AxisError:  # these two views do not show the axis; all views together do
+        return from_all
+    if not from_pair.confident:
+        return from_all
+    if abs(from_all.value - from_pair.value) > _AGREE:
+        return replace(from_all, confident=False)
+    return from_all if from_all.confident else from_pair
 
 
 def _closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
-    """The two views nearest to half a turn apart; none within the tolerance (radians): None."""
+    """The two views nearest to half a turn apart; None if none are within the tolerance (radians)."""
     order = np.argsort(np.mod(theta, 2 * np.pi))
     turned = np.mod(theta[order], 2 * np.pi)
     extended = np.concatenate([turned, turned + 2 * np.pi])
@@ -293,7 +293,7 @@ def _closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
 
 
 def _few_rows(data: NDArray[np.floating]) -> Floats:
-    """At most 16 rows, each the mean of up to 4: a sum of slices is a slice too, with less noise."""
+    """At most 16 rows, each the mean of up to 4, which has less noise: the sum of slices is again a slice."""
     rows = data.shape[1]
     if rows <= _MOST_ROWS:
         return np.asarray(data, np.float64)
@@ -303,7 +303,7 @@ def _few_rows(data: NDArray[np.floating]) -> Floats:
 
 
 def _lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
-    """Position of the minimum, by a parabola through its three points, and its index."""
+    """Position of the minimum, by a parabola through three points, and its index."""
     i = int(curve.argmin())
     if not 0 < i < curve.size - 1:
         return float(candidates[i]), i
@@ -331,8 +331,8 @@ def _axis_error(value: float, search: tuple[float, float] | None, candidates: Fl
 def _optimum(candidates: Floats, curve: Floats, search: tuple[float, float] | None) -> tuple[float, float]:
     """The minimum inside the search range and its depth, 0 (as bad as the typical candidate) to 1 (perfect agreement).
 
-    A minimum at the edge of the range, or clearly worse than one outside, is refused: a range that leaves the axis out
-    has some minimum too.
+    A minimum at the edge of the range, or clearly worse than one outside, raises AxisError: a range without the axis
+    also has a minimum.
     """
     part, values = _within(search, candidates, curve)
     if part.size < 3:

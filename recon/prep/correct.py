@@ -1,4 +1,4 @@
-"""Counts to line integrals: dark and flat, dead pixels, beam drift, zingers, then -log with a stated floor."""
+"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and zingers; then -log with a floor."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scipy import ndimage
 from recon.base.masks import NEIGHBOURS, Image, Mask, fill, plan_fill
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
-_UNLIT = 0.01  # of the light that well-lit pixels get
+_UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
 
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """What the beam looks like without a sample.
+    """Darks and flats: the images without beam, and with beam but without a sample.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks.
@@ -30,14 +30,14 @@ class References:
 
 @dataclass(frozen=True)
 class CorrectionSettings:
-    """How counts become line integrals.
+    """Settings of the correction from counts to line integrals.
 
     Attributes:
-        floor: lowest transmission; below it, zero and negative included, the line integral is -log(floor).
-        hot_threshold: a pixel is masked whose dark, or whose response to the beam, differs from its neighbours by more
-            than so many robust standard deviations; inf keeps all.
-        zinger_threshold: a pixel is replaced that is brighter than its neighbours, and than itself in the neighbouring
-            views, by more than so many robust standard deviations; inf keeps all.
+        floor: lowest transmission; below it, also for zero and negative values, the line integral is -log(floor).
+        hot_threshold: robust standard deviations by which a pixel's dark, or its response to the beam, must differ from
+            its neighbours to be masked; inf masks none.
+        zinger_threshold: robust standard deviations by which a pixel must be brighter than its neighbours, and than
+            itself in the neighbouring views, to be replaced; inf replaces none.
         air: columns (left, right) that see no sample in any view and are scaled to a transmission of 1, or "auto" to
             find them, or "none".
     """
@@ -59,15 +59,15 @@ class CorrectionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Projections:
-    """Line integrals and what was done to get them.
+    """Line integrals, and what the correction changed.
 
     Attributes:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
-        floored: fraction of the live pixels that stand at -log(floor).
-        air: float32 [view], transmission of the air columns that each view was divided by; 1 where none was measured.
+        floored: fraction of the live pixels that were set to -log(floor).
+        air: float32 [view], transmission of the air columns, by which each view was divided; 1 without air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
-        air_columns: (left, right) columns that `air` was measured in; (0, 0) where none was.
+        air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
         replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
     """
 
@@ -81,7 +81,7 @@ class Projections:
 
 
 def dead_pixels(references: References, hot_threshold: float = CorrectionSettings.hot_threshold) -> Mask:
-    """Pixels [row, col] that cannot be trusted: not finite, blind or unlit (flat near dark), or unlike all around them.
+    """Mask [row, col] of unusable pixels: not finite, blind or unlit (flat near dark), or unlike their neighbours.
 
     Raises:
         ValueError: where more than half of the detector is dead: no beam, or darks and flats exchanged.
@@ -95,7 +95,7 @@ def dead_pixels(references: References, hot_threshold: float = CorrectionSetting
             f"{dead.mean():.0%} of the pixels have flat <= dark (median flat {np.median(references.flats[0][1]):.4g}, "
             f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
         )
-    # Behind a slit, flat and view are both noise, and their ratio is anything.
+    # Behind a slit, flat and view are both noise, and their ratio has no meaning.
     dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], 90) for net in nets)])
     response = np.median([np.median(net[~dead]) for net in nets])
 
@@ -105,7 +105,7 @@ def dead_pixels(references: References, hot_threshold: float = CorrectionSetting
         sigma = max(_MAD * float(np.median(difference)), least)
         return difference > hot_threshold * sigma
 
-    # A dark that is off by less than 1 % of the beam, or a response by less than 10 %, the division puts right.
+    # Smaller deviations (dark below 1 % of the beam, response below 10 %) are corrected by the division.
     hot = outliers(dark, 1e-3 * float(response))
     for net in nets:
         filled = np.where(dead, response, net)
@@ -114,7 +114,7 @@ def dead_pixels(references: References, hot_threshold: float = CorrectionSetting
 
 
 def _flat_at(position: float, groups: list[tuple[float, Image]]) -> Image:
-    """Net flat at a frame's position: linear between groups, the nearest group outside."""
+    """Net flat at a frame's position: interpolated between groups, the nearest group outside."""
     at = [p for p, _ in groups]
     upper = int(np.searchsorted(at, position))
     if upper == 0 or upper == len(groups):
@@ -124,12 +124,12 @@ def _flat_at(position: float, groups: list[tuple[float, Image]]) -> Image:
 
 
 def air_columns(transmission: NDArray[np.float32], tolerance: float = 0.03) -> tuple[int, int]:
-    """How many columns at the left and the right edge hold air in all views: (0, 0) where none do.
+    """Number of columns at the left and right edge that show air in all views; (0, 0) if none do.
 
-    Air is nowhere darker than the outermost columns by more than the tolerance (or the noise where that is larger), in
+    Air columns are nowhere darker than the outermost ones by more than the tolerance (or the noise, if larger), in
     every view and over the whole height. A sample that fills the view is thinnest at the edge, so a trend towards
-    darker is sample; a slow one towards brighter is the beam. Fewer columns than 4 % are not believed, and neither is a
-    side that is darker than the other by more than 10 %.
+    darker is sample; a slow trend towards brighter is the beam. A side of fewer than 4 % of the columns, or darker than
+    the other side by more than 10 %, counts as 0.
 
     Args:
         transmission: float32 [view, row, col].
@@ -143,11 +143,11 @@ def air_columns(transmission: NDArray[np.float32], tolerance: float = 0.03) -> t
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
         noise = _MAD * float(np.median(np.abs(np.diff(relative, axis=2)))) / np.sqrt(2) if widest > 1 else 0.0
-        # One view in twenty may disagree: the median over the columns bears that, and noise has tails.
+        # One view in twenty may deviate: the median over the columns tolerates that, and noise has tails.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)
         n = int(np.argmin(np.append(steady, False)))
-        n -= n // 4  # keep away from the sample's edge, where phase fringes are
+        n -= n // 4  # keep a distance from the sample's edge and its phase fringes
         trend = np.median(relative[:, :, n // 2 : n]) - np.median(relative[:, :, : n // 2]) if n > 1 else -np.inf
         counts.append(n if n >= least and trend > -tolerance / 2 else 0)
         levels.append(float(np.median(level)))
@@ -156,7 +156,7 @@ def air_columns(transmission: NDArray[np.float32], tolerance: float = 0.03) -> t
 
 
 def _air(transmission: NDArray[np.float32], left: int, right: int) -> NDArray[np.float32]:
-    """Median transmission of the air columns in each view, both sides weighing the same."""
+    """Median transmission of the air columns in each view, with equal weight for both sides."""
     cols = transmission.shape[2]
     sides = [side for side in (transmission[:, :, :left], transmission[:, :, cols - right :]) if side.shape[2]]
     if not sides:
@@ -165,7 +165,7 @@ def _air(transmission: NDArray[np.float32], left: int, right: int) -> NDArray[np
 
 
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """Of the neighbours of each (r, c): the median, and the third brightest (at the image edge the brightest)."""
+    """Median and third brightest of the eight neighbours of each (r, c); at the image edge the brightest."""
     rows, cols = image.shape
     nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
     inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
@@ -178,8 +178,8 @@ def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Ima
 def _zingers(view: Image, others: list[Image], threshold: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Image]:
     """Pixels (r, c) hit by a stray photon, and the median around each.
 
-    In √transmission, where photon noise is the same everywhere. A bright feature of the sample is in the neighbouring
-    views too, or is larger than the two or three pixels of a zinger: a zinger stands out of both.
+    Compared in √transmission, where photon noise is uniform. A bright feature of the sample is also in the neighbouring
+    views, or is larger than the two or three pixels of a zinger; a zinger is brighter than both.
     """
     root = np.sqrt(np.maximum(view, 0))
     step = max(1, int(np.sqrt(view.size / 4096)))
@@ -203,19 +203,19 @@ def correct(
 ) -> Projections:
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views.
 
-    Nothing that is not finite comes out, and none of it spreads: dead pixels and single bad values take the mean of
-    their good neighbours and are reported. Memory beyond the result is a few frames.
+    All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
+    Memory beyond the result: a few frames.
 
     Args:
-        counts: [view, row, col], any real type, in the order they were taken.
-        positions: [view], frame of the scan, on the scale of the flats' positions.
+        counts: [view, row, col], any real type, in the order of acquisition.
+        positions: [view], number of the frame in the scan, as in the flats' positions.
         references: darks and flats of the same detector area.
         settings: None: the defaults.
         view_ids: int64 [view]; None: 0, 1, 2 ...
         masked: bool [row, col], pixels to fill, from an earlier part of the same scan; None: `dead_pixels(references)`.
 
     Raises:
-        ValueError: for shapes that do not fit, no flats, no beam in the flats, or unusable views, by number.
+        ValueError: for shapes that disagree, no flats, no beam in the flats, or unusable views, whose numbers it gives.
     """
     settings = CorrectionSettings() if settings is None else settings
     _check(counts, positions, references, settings)
@@ -253,7 +253,7 @@ def correct(
 def _transmission(
     counts: NDArray[np.generic], positions: NDArray[np.float64], references: References, dead: Mask
 ) -> tuple[NDArray[np.float32], int]:
-    """(counts - dark) / (flat - dark), every bad pixel filled, and how many were bad in one view only."""
+    """(counts - dark) / (flat - dark) with bad pixels filled, and the number of pixels bad in one view only."""
     dark = np.asarray(references.dark, np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
         groups = [
@@ -292,12 +292,12 @@ def _check(
             f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
         )
     if not references.flats:
-        raise ValueError("there is no flat: without one, counts cannot become line integrals")
+        raise ValueError("there is no flat: without one, counts cannot be converted to line integrals")
     for name, image in [("dark", references.dark), *((f"flat at {p:g}", flat) for p, flat in references.flats)]:
         if image.shape != shape:
             raise ValueError(f"{name} has shape {image.shape}, the views {shape}")
     at = sorted(p for p, _ in references.flats)
     if len(set(at)) < len(at) or not np.isfinite(at).all():
-        raise ValueError(f"the flats need positions of their own, got {at}; average the ones taken together")
+        raise ValueError(f"each group of flats needs a position of its own, got {at}; average the flats taken together")
     if isinstance(settings.air, tuple) and not (min(settings.air) >= 0 and 0 < sum(settings.air) <= cols):
         raise ValueError(f"air columns (left, right) {settings.air} do not fit {cols} columns")

@@ -1,7 +1,7 @@
-"""Where a fit computes: the operations of a step as one protocol, done by the CPU's kernels or by a GPU's.
+"""Backend: the operations of a fit's step as one Protocol, with an implementation for the CPU and one for a GPU.
 
-Arrays are numpy's on the CPU and torch tensors on a GPU; a fit passes them from one operation to the next and looks
-into none of them. Losses come as something `float` takes: on a GPU that waits for the device, so do it seldom.
+Arrays are numpy arrays on the CPU and torch tensors on a GPU; a fit passes them from one operation to the next without
+reading them. Losses are values that `float` converts: on a GPU that waits for the device, so convert them rarely.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ Array = TypeVar("Array")
 
 
 class View(Protocol[Array]):
-    """One rendered view: its image [row, col], and the way back."""
+    """One rendered view: its image [row, col] and its backward pass."""
 
     image: Array
 
     def backward(self, gradient: Array) -> Array:
-        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
+        """Back-propagate an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
 
 
 class Box(Protocol[Array]):
-    """One box of voxels: its density [z, y, x], and the way back."""
+    """One box of voxels: its density [z, y, x] and its backward pass."""
 
     density: Array
 
     def backward(self, gradient: Array, *, means_too: bool = True) -> None:
-        """Add what follows from a gradient [z, y, x]; `means_too=False` leaves positions alone."""
+        """Back-propagate a gradient [z, y, x]; `means_too=False` leaves positions out."""
 
 
 class Pass(Protocol[Array]):
-    """Physical parameters of a model, and the gradients that views and boxes of voxels have added so far."""
+    """One pass over a model: physical parameters, and the gradients added by its views and boxes of voxels."""
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> View[Array]:
         """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ.
 
-        A view must have gone back before the next one is rendered: they share memory.
+        A view must have run `backward` before the next one is rendered: they share memory.
         """
 
     def box(self, grid: Grid, faint: float, cut: float) -> Box[Array]:
@@ -59,10 +59,10 @@ class Pass(Protocol[Array]):
 
 
 class ProjectionLoss(Protocol[Array]):
-    """mean w (D(x, y) + λ (1 - SSIM(x, y))), see `losses_cpu.ProjectionLoss`."""
+    """mean w (D(x, y) + λ (1 - SSIM(x, y))), see `recon.kernels.cpu.losses`."""
 
     def target_maps(self, target: Array, weights: Array | None = None) -> Array:
-        """What is computed once for a target [row, col]."""
+        """The maps that are computed once for each target [row, col]."""
 
     def __call__(
         self, image: Array, target: Array, target_maps: Array, weights: Array | None = None
@@ -71,13 +71,13 @@ class ProjectionLoss(Protocol[Array]):
 
 
 class Backend(Protocol[Array]):
-    """The operations of a step on one device."""
+    """The operations of a fit's step on one device."""
 
     def array(self, values: F32) -> Array:
         """A copy on the device."""
 
     def numpy(self, array: Array) -> F32:
-        """A copy for the host."""
+        """A copy as a numpy array."""
 
     def begin(self, means: Array, log_scales: Array, quaternions: Array, raw: Array, unit: float) -> Pass[Array]:
         """A pass over raw parameters; densities are unit * softplus(raw)."""
@@ -122,9 +122,9 @@ def backend_for(device: str) -> Backend[Any]:
     if not re.fullmatch(r"cuda(:\d+)?", device):
         raise ValueError(
             f"device {device!r} was asked for, and a fit computes on 'cpu' or on 'cuda', the current CUDA device: name "
-            "one of these; which CUDA device is the current one, CUDA_VISIBLE_DEVICES says when Python starts"
+            "one of these; CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
         )
-    from recon.kernels.gpu.engine import Gpu  # triton is loaded only where a GPU is asked for
+    from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
 
     return Gpu(device)
 
@@ -145,7 +145,7 @@ class Cpu:
         return CpuPass(self, means, log_scales, quaternions, raw, unit)
 
     def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:
-        """Scratch buffers for a view of n Gaussians; the last ones are used again where they fit."""
+        """Scratch buffers for a view of n Gaussians; the last ones are reused if they fit."""
         if self._scratch is None or self._scratch[0] != (n, detector_shape):
             self._scratch = ((n, detector_shape), Scratch.of(n, detector_shape))
         return self._scratch[1]
@@ -180,7 +180,7 @@ class Cpu:
 
 
 class CpuPass:
-    """A pass by the numba kernels."""
+    """A pass with the numba kernels."""
 
     def __init__(
         self, backend: Cpu, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float
@@ -201,7 +201,7 @@ class CpuPass:
 
 
 class CpuView:
-    """A view by the numba kernels."""
+    """A view with the numba kernels."""
 
     def __init__(self, rendered: RenderedView, into: Gradients) -> None:
         self._rendered, self._into, self.image = rendered, into, rendered.image
@@ -213,7 +213,7 @@ class CpuView:
 
 
 class CpuBox:
-    """A box of voxels by the numba kernels."""
+    """A box of voxels with the numba kernels."""
 
     def __init__(self, run: CpuPass, grid: Grid, faint: float, cut: float) -> None:
         self._into, self._layout = run.into, grid_layout(run.active, grid, faint, cut)
@@ -227,7 +227,7 @@ class CpuBox:
 
 
 class CpuLoss:
-    """The fused loss by the numba kernels."""
+    """The fused loss with the numba kernels."""
 
     def __init__(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm) -> None:
         self._loss = losses_cpu.ProjectionLoss(shape, ssim_weight, term=term)

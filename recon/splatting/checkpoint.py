@@ -1,4 +1,4 @@
-"""A fit's state as plain arrays and back, to the bit: what a checkpoint holds. Nothing here is pickled."""
+"""Checkpoint of a fit: its complete state as plain arrays, restored to the bit. Nothing is pickled."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from recon.splatting.settings import NAMES
 
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")
-_WORDS = 4  # of 64 bits: state and increment of PCG64
+_WORDS = 4  # 64-bit words: state and increment of PCG64
 
 
 def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str, NDArray[Any]]:
-    """Everything that a step reads, as arrays by name.
+    """The complete state of a fit, as arrays by name.
 
     Raises:
-        ValueError: for a random generator other than numpy's default, whose state has another form.
+        ValueError: for a random generator other than numpy's default, PCG64.
     """
     device = backend or Cpu()
     arrays: dict[str, NDArray[Any]] = {"statistic": device.numpy(state.statistic)}
@@ -41,7 +41,7 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
 
 
 def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None = None) -> FitState:
-    """The inverse of `arrays_of`: the next step does what it would have done.
+    """The inverse of `arrays_of`: the fit continues as if it had not been interrupted.
 
     Raises:
         ValueError: where arrays are missing, disagree in length, or hold values that are not finite.
@@ -51,7 +51,7 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     wanted = [f"{group}.{name}" for group in groups for name in NAMES]
     missing = [k for k in (*wanted, "statistic", "counts", "scalars", "drawn", "generator") if k not in arrays]
     if missing:
-        raise ValueError(f"this is no checkpoint of a fit: {missing} are missing")
+        raise ValueError(f"this is not a checkpoint of a fit: {missing} are missing")
     n = len(arrays["parameters.raw"])
     widths = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw": (n,)}
     shapes: dict[str, tuple[int, ...]] = {key: widths[key.split(".")[1]] for key in wanted}

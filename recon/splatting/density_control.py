@@ -1,4 +1,4 @@
-"""Density control: clone, split and prune Gaussians where the data ask for it; a policy and pure operations."""
+"""Density control: clones, splits and prunes Gaussians by the gradients of the loss; a policy and pure functions."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from numpy.typing import NDArray
 
 from recon.kernels.cpu.activation import F32
 
-# A split moves the halves this many standard deviations apart from the middle along the longest axis.
+# Standard deviations, along the longest axis, by which each half of a split moves from the centre.
 _APART = 0.75
 
-# Gaussians go whose centre is this many standard deviations (of their longest axis) outside the box: of a nearer one
-# the views need the tail that reaches in, and cutting it takes matter from the border (0.05 to 0.16 dB, measured).
+# Standard deviations (of the longest axis) outside the box beyond which a Gaussian is removed. The tail of a nearer one
+# is part of the views: without it, matter at the border is lost (0.05 to 0.16 dB, measured).
 _LOST = 3.0
 
 
 @dataclass(frozen=True)
 class DensityPolicy:
-    """When and what. The rounds, their end and the threshold are those of Zha et al. 2024; the rest is for short fits.
+    """When density control runs, and its thresholds.
 
-    Theirs for 30 000 steps: from step 500, split above 0.1 of the field, prune below 1e-5, no
-    more than 500 000.
+    `every`, `stop` and `threshold` are those of Zha et al. 2024, the rest is for short fits. Theirs for 30 000 steps:
+    from step 500, split above 0.1 of the field, prune below 1e-5, at most 500 000 Gaussians.
 
     Attributes:
         start, stop: first and last step as fractions of all steps.
         every: steps between two rounds.
         threshold: mean gradient of the loss with respect to a centre, per half detector width, above which a Gaussian
-            grows.
-        large: a growing Gaussian longer than this fraction of the field splits, a smaller one is cloned.
-        prune_below: densities (in density units) that go.
-        growth: at most this many times the initial count.
+            is split or cloned.
+        large: fraction of the field above whose length it is split; a smaller one is cloned.
+        prune_below: density (in density units) below which a Gaussian is removed.
+        growth: largest number of Gaussians, relative to the number at the start.
     """
 
     start: float = 0.05
@@ -45,12 +45,12 @@ class DensityPolicy:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What a round of density control does to the arrays of a model.
+    """Result of a round of density control: changes to the arrays of a model.
 
     Attributes:
-        keep: int64, positions of the Gaussians that stay.
-        parents: int64, positions (in the old arrays) of those that get a copy appended.
-        means, log_scales, raw: their new values, for the kept ones first and then for the copies.
+        keep: int64, indices of the Gaussians that stay.
+        parents: int64, indices (in the old arrays) of those whose second half is appended.
+        means, log_scales, raw: new values, first for those that stay, then for the appended ones.
     """
 
     keep: NDArray[np.int64]
@@ -72,28 +72,28 @@ def control(
     box: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Change:
-    """Decide one round. Mass ρ √|Σ| is conserved by every clone and split, so the projections barely move.
+    """Compute one round. Every clone and split conserves the mass ρ √|Σ|, so the projections hardly change.
 
-    Pruning comes first, and a model at its limit grows into the room that it leaves. There the two together relocate
-    Gaussians: from where they are faint or lost to where the data ask for more, most wanted first, at a constant
-    number. Only the mass of those pruned is lost, which is next to none.
+    Pruning comes first: a model at its limit may add as many Gaussians as were pruned. Together the two then relocate
+    Gaussians, at a constant number, from where they are faint or outside the box to where the statistic is largest.
+    Only the mass of the pruned ones is lost, which is negligible.
 
     Args:
         means [n, 3] mm, log_scales [n, 3], rotations [n, 9], raw [n]: the model; ρ = softplus(raw) in density units.
-        statistic: [n], the mean gradient that `policy.threshold` is held against.
-        field: mm, the width of the field of view.
-        limit: no more Gaussians than this.
-        box: [2, 3] mm, lower and upper corner (x, y, z); Gaussians whose centre is more than three standard deviations
-            of their longest axis outside go.
-        rng: picks sides of clones.
+        statistic: [n], the mean gradient that is compared with `policy.threshold`.
+        field: width of the field of view, mm.
+        limit: largest number of Gaussians.
+        box: [2, 3] mm, lower and upper corner (x, y, z); a Gaussian whose centre is more than three standard deviations
+            of its longest axis outside is removed.
+        rng: draws the direction in which a clone or half moves.
     """
     density = np.logaddexp(0, raw)
     reach = _LOST * np.exp(log_scales.max(axis=1, keepdims=True))
     alive = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
     wanted = np.flatnonzero(alive & (statistic > policy.threshold))
-    room = max(0, limit - int(alive.sum()))
-    if wanted.size > room:
-        wanted = wanted[np.argsort(-statistic[wanted], kind="stable")[:room]]
+    free = max(0, limit - int(alive.sum()))
+    if wanted.size > free:
+        wanted = wanted[np.argsort(-statistic[wanted], kind="stable")[:free]]
         wanted.sort()
 
     new_means, new_scales, new_raw = means.copy(), log_scales.copy(), raw.copy()
@@ -101,8 +101,8 @@ def control(
     longest = np.exp(log_scales[wanted, axis])
     direction = rotations.reshape(-1, 3, 3)[wanted, :, axis]
     split = longest > policy.large * field
-    # Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) keep mass, mean and covariance.
-    # Cloning: two of half the density, set a little apart, since two equal ones would get equal gradients for ever.
+    # Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
+    # Cloning: two of half the density, a small distance apart, since two equal ones would always get equal gradients.
     apart = np.where(split, _APART, 0.25) * longest * np.where(rng.random(wanted.size) < 0.5, 1, -1)
     shrink = np.where(split, np.sqrt(1 - _APART**2), 1.0)
     child_density = density[wanted] / (2 * shrink)

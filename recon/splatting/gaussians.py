@@ -1,4 +1,4 @@
-"""Gaussians: a density field as a sum of anisotropic Gaussians, held as raw parameters that may be any real number."""
+"""Gaussians: a density field as a sum of anisotropic Gaussians, with unconstrained raw parameters."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Gaussians:
         log_scales: [n, 3], logarithms of standard deviations in mm along the Gaussian's own axes.
         quaternions: [n, 4] (w, x, y, z), of any non-zero length.
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
-        density_unit: 1/mm; the size of a typical density, which makes the raw values (and the learning rates that act
-            on them) independent of the units of the data.
+        density_unit: a typical density, 1/mm; it makes raw values and their learning rates independent of the units of
+            the data.
     """
 
     means: Tensor
@@ -104,7 +104,7 @@ class Gaussians:
         )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """The parameters as plain arrays on the host, for a checkpoint; `from_arrays` reads them back."""
+        """The parameters as numpy arrays by name, for a checkpoint; `from_arrays` is the inverse."""
         return {
             "means": self.means.detach().cpu().numpy(),
             "log_scales": self.log_scales.detach().cpu().numpy(),
@@ -125,7 +125,7 @@ class Gaussians:
 
 
 def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:
-    """x with log(1 + eˣ) = value, for value > 0: value + log(1 - e^-value), which keeps its digits at both ends."""
+    """x with log(1 + eˣ) = value, for value > 0: value + log(1 - e^-value), accurate for small and large values."""
     value = np.asarray(value, np.float64)
     return value + np.log(-np.expm1(-value))
 

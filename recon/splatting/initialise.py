@@ -1,4 +1,4 @@
-"""A volume to Gaussians: where there is matter, and most where it changes (Zha et al. 2024, refined)."""
+"""First Gaussians of a fit: drawn from a first volume, most where it changes (after Zha et al. 2024)."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from recon.voxels.view_weights import angular_weights, covers_the_circle
 
 Start = Literal["fbp", "tv"]
 
-# Voxels below this fraction of the density unit hold no matter worth a Gaussian (Zha et al. 2024: τ = 0.05).
+# No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
 
-# Standard deviation of a new Gaussian in distances to its neighbours. Zha et al. take 1; narrower ones start sharper
+# Standard deviation of a new Gaussian over the distance to its neighbours. Zha et al. take 1; narrower ones are sharper
 # and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3; 0.55 loses on the walnut).
 _SPREAD = 0.8
 
-# A pixel is wild beyond so many times the brightest one of other views: no sample shows so much more from one side than
-# from most. A tenth of the views, and one in any case, may hold such pixels.
+# A pixel counts as wild above this many times the largest pixel of other views, a ratio that no sample reaches. Up to a
+# tenth of the views, and at least one, may contain such pixels.
 _WILD, _WILD_VIEWS = 10.0, 0.1
 
-_SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum more of them only begin to follow the noise
+_SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
 
 
 def density_unit(volume: Volume) -> float:
@@ -46,7 +46,7 @@ def density_unit(volume: Volume) -> float:
 
 
 def default_count(grid: Grid) -> int:
-    """How many Gaussians a grid is worth: one for 60 voxels of the cylinder in it, 2000 to 200 000."""
+    """Default number of Gaussians for a grid: one for 60 voxels of its inscribed cylinder, from 2000 to 200 000."""
     nz, ny, nx = grid.shape
     return int(np.clip(np.pi / 4 * nz * ny * nx / 60, 2000, 200_000))
 
@@ -64,13 +64,13 @@ def place(
     """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
 
     Args:
-        grid: a box that holds all that the views see (`Grid.of_field`): matter outside could not be explained.
-        count: how many; None derives it from the grid.
-        start: which volume, see `first_volume`.
-        rays: what a Gaussian gives a ray in the fit to come.
+        grid: a box that holds all that the views see (`Grid.of_field`): a fit cannot represent matter outside.
+        count: number of Gaussians; None: `default_count`.
+        start: kind of first volume, see `first_volume`.
+        rays: ray model of the fit.
 
     Raises:
-        ValueError: for a count below 1, and where the data hold no matter or are no line integrals.
+        ValueError: for a count below 1, and for data without matter or that are not line integrals.
     """
     wanted = default_count(grid) if count is None else operator.index(count)
     if wanted < 1:
@@ -81,29 +81,29 @@ def place(
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Projections [view, row, col] without values ten times as large as other views' largest: filled from neighbours.
+    """Projections [view, row, col] with values above ten times the largest of other views filled from neighbours.
 
-    One such pixel is a streak through a first volume, and may have all of a least-squares factor. A tenth of the views,
-    and one in any case, may hold such pixels. A view of nothing else is clipped.
+    One such pixel makes a streak in a first volume, and may dominate a least-squares factor. Up to a tenth of the
+    views, and at least one, may contain such pixels. A view with no other pixels is clipped.
     """
     peaks = np.maximum(projections.max(axis=(1, 2)), -projections.min(axis=(1, 2)))
     sound = max(1, peaks.size - max(1, round(_WILD_VIEWS * peaks.size)))
     largest = _WILD * float(np.partition(peaks, sound - 1)[sound - 1])
     if not (0 < largest < peaks.max()):
         return projections
-    tame = np.array(projections, np.float32)
+    cleaned = np.array(projections, np.float32)
     for view in np.flatnonzero(peaks > largest):
-        if (np.abs(tame[view]) > largest).all():
-            np.clip(tame[view], -largest, largest, out=tame[view])
-    return masked(tame, None, largest)[0]
+        if (np.abs(cleaned[view]) > largest).all():
+            np.clip(cleaned[view], -largest, largest, out=cleaned[view])
+    return masked(cleaned, None, largest)[0]
 
 
 def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp") -> Volume:
-    """A quick volume to draw Gaussians from, 1/mm, in which wild pixels have no part (see `without_wild_pixels`).
+    """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
 
-    "fbp": FBP or FDK; a cone's short scan, for which there is no FDK here, gets a few sweeps of OS-SIRT with TV
-    instead. "tv": these sweeps, always: slower, and without streaks where views are few. Rolled and tilted views count
-    as straight ones here: the fit knows better.
+    "fbp": FBP or FDK; a short scan of a cone, which FDK does not cover, gets a few sweeps of OS-SIRT with TV instead.
+    "tv": these sweeps in every case: slower, and free of streaks with few views. Rolled and tilted views count as
+    straight ones here; the fit then uses the full geometry.
     """
     straight, projections = geometry.straightened(), without_wild_pixels(projections)
     if start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles)):
@@ -111,7 +111,7 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
         return solve(sweeps, Projector(straight, grid), projections)
     if geometry.is_cone:
         return Volume(fdk(projections, straight, grid, "hann"), grid)
-    # Views over a part of the half circle give an FBP that is weaker by that part; the unit must not be.
+    # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
     return Volume(fbp(projections, straight, grid, "hann") * whole, grid)
 
@@ -121,16 +121,16 @@ def sample_gaussians(
 ) -> Gaussians:
     """At most n isotropic Gaussians drawn from a volume.
 
-    The volume is smoothed first (streaks of few views would attract Gaussians: Yuluo et al. 2025, GR-Gaussian, gain
-    0.4 dB so with 25 views), then voxels above 5 % of the density unit are drawn without replacement, with a
+    The volume is smoothed first (streaks of few views would attract Gaussians; Yuluo et al. 2025, GR-Gaussian, gain
+    0.4 dB with 25 views), then voxels above 5 % of the density unit are drawn without replacement, with a
     probability that is half density and half gradient. A Gaussian's size is the distance to its neighbours, its density
     the voxel's.
 
     Args:
         volume: an FBP or iterative reconstruction.
-        n: how many; fewer come where fewer voxels hold matter.
-        field_radius: mm around the rotation axis that the detector saw; nothing is placed outside.
-        smooth: voxels of Gaussian smoothing.
+        n: number of Gaussians; fewer if fewer voxels hold matter.
+        field_radius: mm around the rotation axis that the detector sees; no Gaussian is placed outside.
+        smooth: standard deviation of the smoothing, in voxels.
 
     Raises:
         ValueError: where the volume holds no matter inside the field.
@@ -146,7 +146,7 @@ def sample_gaussians(
             f"the initial volume holds no matter: {candidates.size} voxels above {MATTER:.0%} of {unit:.3g} 1/mm; "
             "are the projections line integrals (-log of the transmission), and is the axis right?"
         )
-    data /= unit  # squares of gradients must stay in float32's range
+    data /= unit  # so that squares of gradients stay in float32's range
     slope = gaussian_gradient_magnitude(data, 1.0).ravel()[candidates]
     value = data.ravel()[candidates]
     weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
@@ -162,7 +162,7 @@ def sample_gaussians(
 
 
 def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean square distance [n] of each point to its three nearest neighbours; of one alone infinite."""
+    """Root mean square distance [n] of each point to its three nearest neighbours; infinite for a single point."""
     near = min(4, means.shape[0])
     if near < 2:
         return np.full(near, np.inf)
@@ -179,7 +179,7 @@ def scale_to_data(
 ) -> Gaussians:
     """The same Gaussians with all densities times k, k = <Aρ, P> / <Aρ, Aρ> over a few views.
 
-    Projection is linear in density, so this is the exact least-squares factor; it replaces the published constant 0.15
+    Projection is linear in density, so this is the exact least-squares factor. It replaces the published constant 0.15
     and makes the start independent of units and of the number of Gaussians.
     """
     chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))

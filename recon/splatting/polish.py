@@ -19,7 +19,7 @@ from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
 
-# In density units. Half of what is best for a volume that starts from nothing: most noise is gone already.
+# In density units. Half of the best weight for a start from zero, since the fit has removed most of the noise.
 _TV_WEIGHT = 0.002
 
 
@@ -36,28 +36,28 @@ def polish(
     should_stop: Callable[[], bool] | None = None,
     seed: int = 0,
 ) -> Volume:
-    """The volume after `sweeps` over all views, from where a fit has left it.
+    """The volume after `sweeps` over all views, starting from the volume of a fit.
 
-    The views that the sweeps see are those that the voxels x of the model would give, plus what the model leaves
-    unexplained: p - G + A x, with G the views of the Gaussians. So the coarseness of the voxels is no error to be
-    corrected, and what lies outside the box stays explained by the Gaussians.
+    The sweeps fit the views p - G + A x: measured views p, less the views G of the Gaussians, plus the projection A x
+    of the voxels x at the start. So the sweeps do not try to correct the coarseness of the voxels, and matter outside
+    the box stays represented by the Gaussians.
 
-    Sharp edges cost Gaussians much and voxels nothing. Three sweeps gain 0.3 to 2 dB where there are many (see
-    docs/exploration.md), more of them begin to follow the noise. Memory: 8 volumes and 4 x the projections.
+    Sharp edges need many Gaussians, and no additional voxels. With many edges three sweeps gain 0.3 to 2 dB (see
+    docs/exploration.md); more sweeps fit the noise. Memory: 8 volumes and 4 times the projections.
 
     Args:
-        volume: of the Gaussians, 1/mm.
-        gaussians: a fit of the views.
-        projections: [view, row, col]; what is not finite weighs nothing.
-        geometry: of the views; straight ones.
+        volume: voxels of the Gaussians, 1/mm.
+        gaussians: result of a fit to the views.
+        projections: [view, row, col]; values that are not finite get weight 0.
+        geometry: geometry of the views, without roll and tilt.
         sweeps: 1 or more.
-        weights: of each ray [view, row, col], 0 or more.
-        rays, truncation: of the fit.
-        should_stop: asked after each sweep.
-        seed: of the order of the subsets.
+        weights: weight of each ray [view, row, col], 0 or more.
+        rays, truncation: as in the fit.
+        should_stop: called after each sweep; True ends the iteration.
+        seed: seed of the order of the subsets.
 
     Raises:
-        ValueError: for leaning views, shapes that disagree, or no sweeps.
+        ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
     """
     projector = Projector(geometry, volume.grid)
     data, known = masked(projections, weights)

@@ -1,4 +1,4 @@
-"""What float32 kernels cost in accuracy: one small fit made twice, by the kernels and by the readable float64 twin."""
+"""Accuracy of the float32 kernels: one small fit, with the kernels and with the float64 reference implementation."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
 from recon.splatting.splat import project, voxelize
 
-_VIEWS, _ROWS, _COLS, _GAUSSIANS = 12, 8, 32, 150  # the twin evaluates every Gaussian at every pixel
+_VIEWS, _ROWS, _COLS, _GAUSSIANS = 12, 8, 32, 150  # few, since the reference evaluates every Gaussian at every pixel
 _RATES = (1e-3, 1e-2, 3e-3, 3e-2)  # of means (per half field), log scales, quaternions, raw densities
 
 
 def small_crop(projections: NDArray[np.float32], geometry: Geometry) -> tuple[NDArray[np.float32], Geometry]:
-    """At most 12 views, the middle rows and joined pixels of a scan: at most 8 x 32 pixels are left."""
+    """A small part of a scan: at most 12 views, its middle rows, binned to at most 8 x 32 pixels."""
     factor = max(1, -(-geometry.detector_shape[1] // _COLS))
     factor = min(factor, geometry.detector_shape[0])
     rows = min(_ROWS, geometry.detector_shape[0] // factor) * factor
@@ -42,12 +42,12 @@ def compare(
     """Fit a `small_crop` of a scan twice, with the same loss, views and optimiser (Adam), in float32 and in float64.
 
     Returns:
-        residual_float32, residual_float64: |rendered - measured| / |measured| at the end, both rendered by the twin.
+        residual_float32, residual_float64: |rendered - measured| / |measured| at the end, both rendered in float64.
         difference: root mean square of the volumes' difference over that of the float64 volume.
         seconds_float32, seconds_float64: of the steps.
 
     Raises:
-        ValueError: the scan holds no matter.
+        ValueError: the scan shows no matter.
     """
     data, views = small_crop(projections, geometry)
     grid = Grid.matching(views)
@@ -55,7 +55,7 @@ def compare(
     out: dict[str, float] = {}
     volumes = []
     for name, dtype in (("float32", torch.float32), ("float64", torch.float64)):
-        # Two steps first: what is compiled or loaded on first use is no part of the comparison.
+        # Two steps first, so that compilation and loading are not timed.
         _fit(start, data, views, dtype, 2)
         begin = now()
         fitted = _fit(start, data, views, dtype, steps)

@@ -1,7 +1,7 @@
-"""project and voxelize: Gaussians to line integrals and to voxels, differentiable, by the kernel that fits the data.
+"""project and voxelize: Gaussians to line integrals and to voxels, differentiable.
 
-Float32 tensors go to the threaded CPU kernels, on a CUDA device to the GPU's; float64 tensors (or
-`kernel="reference"`) to the readable twin, which runs on the CPU.
+The kernel follows from the tensors: float32 on the CPU uses the threaded CPU kernels, float32 on a CUDA device the GPU
+kernels, and float64 (or `kernel="reference"`) the reference implementation, which runs on the CPU.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Active:
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients on the physical parameters, added to by each projection or box of voxels."""
+    """Gradients on the physical parameters; each projection or box of voxels adds to them."""
 
     means: F32
     log_scales: F32
@@ -70,7 +70,7 @@ class Gradients:
 
 
 def camera(geometry: Geometry, view: int) -> Camera:
-    """One view as the kernels take it."""
+    """One view of a geometry as the kernels' Camera."""
     axes = geometry.axes(view).astype(np.float32)
     col, row = geometry.origin(view)
     if geometry.is_cone:
@@ -80,7 +80,7 @@ def camera(geometry: Geometry, view: int) -> Camera:
 
 
 def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
-    """Footprints of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
+    """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
     table = footprint_table(active.densities.shape[0])
     parameters = (active.means, active.scales, active.rotations, active.densities)
     footprints(*parameters, camera(geometry, view), faint, sigmas, table)
@@ -110,14 +110,16 @@ class Scratch:
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """One view's image [row, col] with all that its backward pass needs.
+    """One rendered view with everything that its backward pass needs.
 
     Attributes:
         image: line integrals [row, col].
         active: the Gaussians; neither they nor `scratch` may change before `backward`.
-        camera, length: the view, and what stands in for a ray's length in a Gaussian.
+        camera: the view.
+        length: see `RayModel.length`.
         scratch: holds the table of footprints.
-        exact, rays: positions of the Gaussians that are integrated ray by ray, and their rays (None: there are none).
+        exact: indices of the Gaussians that are integrated ray by ray.
+        rays: their rays; None if there are none.
     """
 
     image: F32
@@ -157,9 +159,10 @@ def render_view(
     image: F32 | None = None,
     scratch: Scratch | None = None,
 ) -> RenderedView:
-    """Line integrals of one view into `image` [row, col] (overwritten; None makes one); `faint` in its units.
+    """Render the line integrals of one view into `image` [row, col]; `faint` in the same unit.
 
-    `scratch` is overwritten too: a view that shares it must have run `backward` before the next one is rendered.
+    `image` and `scratch` are overwritten (None: new ones). A view that shares `scratch` must have run `backward` before
+    the next one is rendered.
     """
     chosen, shape, a = model or RayModel(), geometry.detector_shape, active
     picture = np.empty(shape, np.float32) if image is None else image
@@ -189,7 +192,7 @@ class _Project(torch.autograd.Function):
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         shared, views = Scratch.of(len(active.densities), geometry.detector_shape), []
-        for view, image in enumerate(images):  # each keeps its own table until it goes back
+        for view, image in enumerate(images):  # each needs its own table until its backward pass
             scratch = replace(shared, table=footprint_table(len(active.densities)))
             views.append(render_view(active, geometry, view, faint, cut, model, image=image, scratch=scratch))
         ctx.state = (_array(quaternions), _array(raw), unit, views)
@@ -229,7 +232,7 @@ def _array(tensor: Tensor) -> F32:
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
-    """Where Gaussians fall on a grid; `faint` is a density."""
+    """Layout of Gaussians on a grid, for filling it and its backward pass; `faint` is a density."""
     z, y, x = (float(axis[0]) for axis in grid.coordinates())
     parameters = (active.means, active.scales, active.rotations, active.densities)
     return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas)
@@ -246,12 +249,12 @@ def project(
 ) -> Tensor:
     """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
 
-    A cone's are those of the affine footprint, or of the true ray where `model` says so. Differentiable in all four
-    parameter tensors. The reference kernel truncates nothing.
+    For a cone they are those of the affine footprint, or of the true ray if `model` asks for it. Differentiable in all
+    four parameter tensors. The reference implementation does not truncate.
 
     Raises:
-        ValueError: the kernel does not take tensors of this type or on this device.
-        ImportError: CUDA tensors, and triton is not installed.
+        ValueError: the kernel does not support tensors of this type or on this device.
+        ImportError: the tensors are on a CUDA device and triton is not installed.
     """
     rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
@@ -268,7 +271,7 @@ def project(
         return torch.stack(images)
     cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
     if which == "gpu":
-        from recon.kernels.gpu import autograd  # triton is loaded only where a GPU is asked for
+        from recon.kernels.gpu import autograd  # loads triton, so only if a GPU is used
 
         return autograd.project(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
     return _Project.apply(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
@@ -292,7 +295,7 @@ def voxelize(
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
-    """The line integral below which nothing is drawn."""
+    """Line integral below which a footprint is cut off."""
     return truncation.faint * gaussians.density_unit * geometry.sample_pitch * geometry.detector_shape[1]
 
 

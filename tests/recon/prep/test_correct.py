@@ -267,7 +267,7 @@ def test_bad_input_is_refused_with_its_values() -> None:
         correct(counts, at[1:], references)
     with pytest.raises(ValueError, match=r"shape \(16, 48\)"):
         correct(counts[0], at, references)
-    with pytest.raises(ValueError, match=r"positions of their own, got \[3"):
+    with pytest.raises(ValueError, match=r"position of its own, got \[3"):
         correct(counts, at, References(dark, ((3.0, flat), (3.0, flat))))
     with pytest.raises(ValueError, match=r"\(40, 9\) do not fit 48"):
         correct(counts, at, references, CorrectionSettings(air=(40, 9)))
