@@ -16,7 +16,7 @@ from beamline.projections.prepare import prepare
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import Context, Made, facts_of
 from beamline.reconstruct.result import Target, axis_of, deliver
-from beamline.report.record import history_of
+from beamline.report.record import history_from
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 from beamline.scan.run_folder import RECON, RECON_LOG
@@ -75,7 +75,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         volume=Volume(record.volume.data, grid),
         method=config.recon.method,
         seconds=record.metrics["seconds"],
-        history=history_of(record.history),
+        history=history_from(record.history),
         settings=record.parameters,
         psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in keeper.snapshots],
     )

@@ -1,1 +1,1 @@
-"""Doctor: what this computer has (camera link, ports, disk, memory) against what a scan needs."""
+"""Doctor: checks of this computer (camera link, ports, disk, memory) against the needs of a scan."""

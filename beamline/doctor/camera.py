@@ -1,4 +1,4 @@
-"""Doctor on the camera: is it on the bus, on a fast link, and is the vendor's library there? No session by default."""
+"""Doctor on the camera: USB link and vendor's library. The camera is opened only on request."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LINK_ADVICE = {
 }
 _VERDICTS = {
     usb.Verdict.READY: Verdict.OK,
-    usb.Verdict.SLOW: Verdict.FAILED,  # the plan reckons with the fast link: frames would be lost
+    usb.Verdict.SLOW: Verdict.FAILED,  # the plan assumes the fast link: frames would be lost
     usb.Verdict.ABSENT: Verdict.FAILED,
     usb.Verdict.AMBIGUOUS: Verdict.WARNING,
     usb.Verdict.UNKNOWN: Verdict.CANNOT_CHECK,
@@ -36,11 +36,11 @@ _VERDICTS = {
 
 
 def link(camera: DcamOrca | None, backend: Any = None) -> Check:
-    """The camera on USB, as far as descriptors tell.
+    """The camera on USB, from its descriptors.
 
     Args:
-        camera: as configured; None where nothing is: a camera that is absent is then no failure.
-        backend: of pyusb; None takes the installed libusb.
+        camera: as configured; None: not configured, and a missing camera is no failure.
+        backend: of pyusb; None: the installed libusb.
     """
     if camera is not None and camera.link == "coaxpress":
         return Check(
@@ -62,10 +62,10 @@ def link(camera: DcamOrca | None, backend: Any = None) -> Check:
 
 
 def library(camera: DcamOrca | None, session: bool = False) -> Check:
-    """The DCAM-API library: loaded, and of version 4; with `session`, also what it says of the cameras it finds.
+    """The DCAM-API library and its version; with `session`, also the cameras that it finds.
 
     Args:
-        session: start one, which takes seconds and fails where another program has the camera.
+        session: open the camera, which takes seconds and fails while another program uses it.
     """
     path = Path(camera.library) if camera is not None and camera.library else None
     expected = "the DCAM-API runtime of the camera's vendor, version 4"
@@ -76,7 +76,7 @@ def library(camera: DcamOrca | None, session: bool = False) -> Check:
     file = _loaded_file(path)
     version = version_of(file)
     values: dict[str, Any] = {"library": None if file is None else str(file), "version": version}
-    found = f"{file or path or 'the installed library'}, version {version or 'not told by its name'}."
+    found = f"{file or path or 'the installed library'}, version {version or 'not known'}."
     if not session:
         return Check(LIBRARY, Verdict.OK, found, expected, values=values)
     index = 0 if camera is None else camera.index
@@ -86,21 +86,21 @@ def library(camera: DcamOrca | None, session: bool = False) -> Check:
         failure = of_error(LIBRARY, error, f"{expected}, and a camera")
         return replace(failure, found=f"{found} {failure.found}", values=values)
     values["cameras"] = cameras
-    told = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
+    listed = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
     if index >= len(cameras):
         return Check(
             LIBRARY,
             Verdict.FAILED,
-            f"{found} {len(cameras)} cameras: {told}.",
+            f"{found} {len(cameras)} cameras: {listed}.",
             f"a camera of index {index}",
-            "Set devices.camera.index to one that is there",
+            "Set devices.camera.index to one of these cameras",
             values,
         )
-    return Check(LIBRARY, Verdict.OK, f"{found} {told}.", expected, values=values)
+    return Check(LIBRARY, Verdict.OK, f"{found} {listed}.", expected, values=values)
 
 
 def version_of(file: Path | None) -> str:
-    """The version that a library's file carries: behind .so on Linux, in the name; "" where it carries none."""
+    """The version in the name of a library's file (after .so on Linux) or in its resource; "" if there is none."""
     if file is None:
         return ""
     if sys.platform == "win32":
@@ -110,7 +110,7 @@ def version_of(file: Path | None) -> str:
 
 
 def _cameras(dcam: Dcam) -> list[dict[str, str]]:
-    """What each camera says of itself, by a session of our own that is ended again."""
+    """The description that each camera reports; the session of the library is ended afterwards."""
     try:
         return [
             {
@@ -120,7 +120,7 @@ def _cameras(dcam: Dcam) -> list[dict[str, str]]:
             for index in range(dcam.api_init())
         ]
     finally:
-        with suppress(DeviceError):  # also a session that did not start must be ended; what failed is told already
+        with suppress(DeviceError):  # also a session that did not start must be ended; its error is reported already
             dcam.api_uninit()
 
 
@@ -133,7 +133,7 @@ def _no_libusb() -> str:
 
 
 def _loaded_file(path: Path | None) -> Path | None:
-    """Where the library that this process has loaded lies; None where the system does not tell."""
+    """The file of the library that this process has loaded; None if the system does not report it."""
     if path is not None:
         return path.resolve()
     if sys.platform == "win32":

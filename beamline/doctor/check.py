@@ -1,4 +1,4 @@
-"""Check: what the doctor looked at, the verdict, what was found against what was expected, and what to do."""
+"""Check: the result of one check of the doctor: verdict, what was found, what was expected, what to do."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from drivers.errors import DeviceError
 
 class Verdict(StrEnum):
     OK = "ok"
-    WARNING = "warning"  # it works, with less room than one wants
+    WARNING = "warning"  # it works, with a small margin
     FAILED = "failed"  # a scan would fail, or lose frames
     NOT_APPLICABLE = "not applicable"
-    CANNOT_CHECK = "cannot check"  # this machine does not tell
+    CANNOT_CHECK = "cannot check"  # this machine does not report it
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Check:
     """One result.
 
     Attributes:
-        found, expected, advice: sentences or parts of them, for a human; empty where there is nothing to say.
-        values: the numbers behind them, for a program; bytes, bytes/s, s.
+        found, expected, advice: sentences or parts of them, for people; may be empty.
+        values: the same as numbers, for programs; bytes, bytes/s, s.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Check:
 
 
 def of_error(name: str, error: DeviceError, expected: str, verdict: Verdict = Verdict.FAILED) -> Check:
-    """What a device's refusal or silence comes to."""
+    """The check that failed with an error of a device."""
     reply = f" It answered {error.reply!r}." if error.reply else ""
     found = f"{error.problem[:1].upper()}{error.problem[1:]}.{reply}"
     return Check(name, verdict, found, error.expected or expected, error.advice)

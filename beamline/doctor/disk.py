@@ -1,4 +1,4 @@
-"""Doctor on the disk: how fast it really takes bytes, and how much room it has, against what a scan needs."""
+"""Doctor on the disk: measured write speed and free space against the needs of a scan."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from beamline.scan.preflight import free_bytes
 from drivers.clock import Clock
 
 SECONDS, MOST = 3.0, 4 << 30
-"""How long (s on the clock) and how much (bytes) is written at most."""
+"""Longest time (s on the clock) and most bytes of a measurement."""
 PIECE = 16 << 20
-"""Bytes that go out together and are then waited for."""
+"""Bytes that are written and synchronised together."""
 LEAST = 4 * PIECE
-"""Bytes below which no rate is told."""
+"""Fewer bytes give no reliable rate."""
 COMFORT = 1.25
-"""A disk that is faster than the need by this has no trouble; below it, others' work may slow it too much."""
+"""A disk faster than the need by this factor is good; a slower one may be disturbed by other programs."""
 SPEED, ROOM = "disk speed", "disk space"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Bytes that were written, and the s that they took until the disk had them."""
+    """Bytes written, and the s until they were on the disk."""
 
     n_bytes: int
     seconds: float
@@ -42,20 +42,20 @@ class Measured:
 
 
 class Opens(Protocol):
-    """Opens a new file in a folder that is gone once it is closed, however the process ends."""
+    """Opens a new file in a folder; the file is removed when it is closed or the process ends."""
 
     def __call__(self, folder: Path) -> IO[bytes]: ...
 
 
 def temporary(folder: Path) -> IO[bytes]:
-    """A new file without a name, or with one that the system removes: nothing can be overwritten or left behind."""
+    """A new file without a name, or one that the system removes: nothing is overwritten or left behind."""
     return tempfile.TemporaryFile(dir=folder, prefix="beamline-doctor-", buffering=0)
 
 
 def measure(
     folder: Path, clock: Clock, opens: Opens = temporary, most: int = MOST, seconds: float = SECONDS
 ) -> Measured:
-    """Write bytes that do not compress into a file of its own in `folder`, each piece down to the disk.
+    """Write incompressible bytes to a temporary file in `folder`, synchronised after each piece.
 
     Raises:
         OSError: the folder cannot be written to, or the disk is full.
@@ -74,27 +74,27 @@ def measure(
 
 
 def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = temporary) -> Check:
-    """The rate of the disk that holds `folder`, or will hold it, against what frames bring."""
-    expected = "" if needs is None else f"{size(needs.rate)}/s while frames come fastest"
+    """Write speed of the disk that holds `folder`, or will hold it, against the rate of the frames."""
+    expected = "" if needs is None else f"{size(needs.rate)}/s at the highest frame rate"
     there = existing(folder)
-    # The file leaves again, but a disk must not even be filled for a moment.
+    # The file is temporary, but must not fill the disk even for a moment.
     most = min(MOST, shutil.disk_usage(there).free // 4)
     if most < LEAST:
-        return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} has too little room to measure in.", expected)
+        return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} has too little free space for a measurement.", expected)
     try:
         measured = measure(there, clock, opens, most)
     except OSError as error:
         if error.errno == errno.EINVAL:  # a file system without fsync
-            return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} does not say when bytes are on the disk.", expected)
+            return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.", expected)
         return Check(
             SPEED,
             Verdict.FAILED,
             f"{there} cannot be written to ({error.strerror or error}).",
-            expected or "a folder that takes files",
-            "Choose another storage.folder, or have its permissions or its disk put right",
+            expected or "a folder in which files can be created",
+            "Choose another storage.folder, or correct its permissions or its disk",
         )
     rate = measured.rate
-    found = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, down to the disk)."
+    found = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, synchronised)."
     values = {"bytes_per_s": rate, "written": measured.n_bytes, "seconds": measured.seconds}
     if needs is None:
         return Check(SPEED, Verdict.OK, found, values=values)
@@ -104,7 +104,7 @@ def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = tempor
         return Check(SPEED, Verdict.OK, found, expected, values=values)
     if backlog <= needs.waiting_bytes / 2:
         found += f" At most {size(backlog)} will wait in memory, which has room for {size(needs.waiting_bytes)}."
-        advice = "Let nothing else write to this disk during the scan, or choose a faster one"
+        advice = "Let no other program write to this disk during the scan, or choose a faster disk"
         return Check(SPEED, Verdict.WARNING, found, expected, advice, values)
     found += f" {size(backlog)} would have to wait in memory, which has room for {size(needs.waiting_bytes)}."
     advice = "Choose a storage.folder on a faster disk, or a longer period, a smaller roi or binning"
@@ -112,7 +112,7 @@ def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = tempor
 
 
 def room(folder: Path, needs: Needs | None) -> Check:
-    """Free space against the file's size."""
+    """Free space against the size of the file."""
     free = free_bytes(folder)
     found, values = f"{size(free)} free for {folder.absolute()}.", {"free_bytes": free}
     if needs is None:
@@ -120,14 +120,14 @@ def room(folder: Path, needs: Needs | None) -> Check:
     values["needed_bytes"] = needs.file_bytes
     expected = f"{size(needs.file_bytes)} for the scan and a tenth more; as much again for its reconstruction"
     if free < needs.file_bytes:
-        advice = "Free some, choose another storage.folder, or reduce views, roi or binning"
+        advice = "Free some space, choose another storage.folder, or reduce views, roi or binning"
         return Check(ROOM, Verdict.FAILED, found, expected, advice, values)
     if free < 2 * needs.file_bytes:
-        return Check(ROOM, Verdict.WARNING, found, expected, "Free some before the next scan", values)
+        return Check(ROOM, Verdict.WARNING, found, expected, "Free some space before the next scan", values)
     return Check(ROOM, Verdict.OK, found, expected, values=values)
 
 
 def existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that is there: a scan makes its own, the doctor makes none."""
+    """The folder, or its nearest parent that exists: a scan creates the folder, the doctor does not."""
     folder = folder.absolute()
     return next((place for place in (folder, *folder.parents) if place.is_dir()), folder)

@@ -1,4 +1,4 @@
-"""Examine: every check of the instrument's computer that a configuration calls for, one after the other."""
+"""Runs all checks of the instrument's computer that a configuration needs, one after the other."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from beamline.config.devices import BeamMonitorConfig, DcamOrca, ElectrometerCon
 from beamline.config.load import Config
 from beamline.config.models import Storage
 from beamline.core.free_memory import free_memory
+from beamline.core.text import size
 from beamline.doctor import camera, disk
 from beamline.doctor.check import Check, Verdict, of_error
-from beamline.doctor.memory import memory
 from beamline.doctor.needs import Needs, needs, ring_bytes
 from beamline.doctor.ports import port, ports
 from beamline.instrument.beam_monitors import make_beam_monitor
@@ -22,17 +22,19 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.serial.ports import SerialPort, serial_ports
 
+_MEMORY = "memory"
+
 
 def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Check]:
-    """Look at the camera's link and library, at ports, disk and memory. Nothing moves and nothing is overwritten.
+    """Check the camera's link and library, ports, disk and memory. Nothing moves and nothing is overwritten.
 
     Args:
-        config: what the scan will be; None: the instrument without a plan.
-        session: also ask the camera itself, which no other program may then have.
-        usb: a pyusb backend; None takes the installed libusb.
+        config: of the planned scan; None: no scan is planned.
+        session: also open the camera, which no other program may use meanwhile.
+        usb: a pyusb backend; None: the installed libusb.
 
     Raises:
-        ConfigError: a plan, scene or device setting that cannot be. Broken limits are for `check` to say.
+        ConfigError: an impossible plan, scene or device setting. Violated limits are reported by `beamline check`.
     """
     need = None if config is None else _needs(config, dry_run(config))
     cam = None if config is None else config.devices.camera
@@ -61,7 +63,7 @@ def _needs(config: Config, worked: DryRun) -> Needs:
 
 
 def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Clock) -> Iterator[Check]:
-    """The beam monitor, where there is one: its port, and one reading, which disturbs nothing."""
+    """The beam monitor, if one is configured: its port, and one reading."""
     name = "beam monitor"
     if isinstance(config, NoBeamMonitor):
         return
@@ -78,3 +80,25 @@ def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Cloc
         return
     values = {"value": reading.value, "unit": reading.unit}
     yield Check(name, Verdict.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+
+
+def memory(free: int | None, needs: Needs | None) -> Check:
+    """Free memory against a scan's need.
+
+    Args:
+        free: bytes; None if the system does not report them.
+    """
+    expected, values = "", {"free_bytes": free}
+    if needs is not None:
+        parts = [f"{size(needs.waiting_bytes)} for frames that wait for the disk"]
+        if needs.ring_bytes:
+            parts.append(f"{size(needs.ring_bytes)} for the camera's ring")
+        expected = " and ".join(parts) + ", besides the live reconstruction"
+        values |= {"needed_bytes": needs.memory, "ring_bytes": needs.ring_bytes}
+    if free is None:
+        return Check(_MEMORY, Verdict.CANNOT_CHECK, "This system does not report its free memory.", expected)
+    found = f"{size(free)} free."
+    if needs is None or free >= 2 * needs.memory:
+        return Check(_MEMORY, Verdict.OK, found, expected, values=values)
+    advice = "Close other programs, or choose a smaller roi or binning"
+    return Check(_MEMORY, Verdict.WARNING if free >= needs.memory else Verdict.FAILED, found, expected, advice, values)

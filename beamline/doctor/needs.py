@@ -1,4 +1,4 @@
-"""Needs: what a planned scan asks of disk and memory, worked out from its timeline."""
+"""Needs: disk and memory that a planned scan needs, computed from its timeline."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from beamline.scan.recorder import WAITING_BYTES, WAITING_FRAMES
 
 @dataclass(frozen=True)
 class Needs:
-    """A scan's needs.
+    """The disk and memory that a scan needs.
 
     Attributes:
-        stretches: bytes to write and s in which they come, block after block.
+        stretches: (bytes to write, duration in s) of each block.
         waiting_bytes: memory for frames that wait for the disk.
         ring_bytes: memory of the camera's ring; 0 for a simulated one.
-        file_bytes: the file, with the room that a scan demands beside it.
+        file_bytes: size of the file and the margin that a scan needs beside it.
     """
 
     stretches: tuple[tuple[int, float], ...]
@@ -29,7 +29,7 @@ class Needs:
 
     @property
     def rate(self) -> float:
-        """Bytes/s while frames come fastest."""
+        """Bytes/s at the highest frame rate."""
         return max(size / seconds for size, seconds in self.stretches)
 
     @property
@@ -37,7 +37,7 @@ class Needs:
         return self.waiting_bytes + self.ring_bytes
 
     def backlog(self, rate: float) -> float:
-        """Most bytes that ever wait for a disk of `rate` bytes/s."""
+        """The largest number of bytes that wait for a disk of `rate` bytes/s."""
         most = waiting = 0.0
         for size, seconds in self.stretches:
             waiting = max(waiting + size - rate * seconds, 0.0)
@@ -46,10 +46,10 @@ class Needs:
 
 
 def needs(worked: DryRun, ring_bytes: int) -> Needs:
-    """Of a scan that was worked out.
+    """The needs of a planned scan.
 
     Args:
-        ring_bytes: what the camera's ring takes.
+        ring_bytes: memory of the camera's ring buffer.
     """
     timeline = worked.timeline
     per_row = timeline.total_bytes // timeline.n_frames
@@ -62,14 +62,14 @@ def needs(worked: DryRun, ring_bytes: int) -> Needs:
 
 
 def waiting_frames(frame_bytes: int) -> int:
-    """How many frames may wait to be written."""
+    """The largest number of frames that may wait to be written."""
     low, high = WAITING_FRAMES
     return min(max(WAITING_BYTES // frame_bytes, low), high)
 
 
 def ring_bytes(timeline: Timeline, most: int) -> int:
-    """Of the camera's ring for the longest block: a slot more than frames and never less than 16 (as the driver does
-    it), as far as `most` bytes go."""
+    """Memory of the camera's ring buffer for the longest block, at most `most` bytes: one slot more than frames and at
+    least 16, like the driver."""
     frames = max(block.n for block in timeline.blocks)
     slots = max(2, min(max(frames + 1, 16), most // timeline.frame_bytes))
     return slots * timeline.frame_bytes

@@ -1,4 +1,4 @@
-"""Doctor on the ports: is the port that a device is configured on there, and may it be opened? No byte is sent."""
+"""Doctor on the ports: does the configured port of a device exist, and may it be opened? No byte is sent."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ CONNECT_TIMEOUT = 2.0
 
 
 def ports(found: Sequence[SerialPort]) -> Check:
-    """The serial ports that there are, without a word on which is whose."""
+    """All serial ports of this computer."""
     listed = "; ".join(map(str, found)) or "none"
     return Check(
         "serial ports",
         Verdict.OK if found else Verdict.WARNING,
         f"{listed}.",
         "the adapter of a stage on a serial line (a stage on the network shows none)",
-        "" if found else "Plug the adapter in; on Linux `dmesg` says whether the system took it",
+        "" if found else "Plug the adapter in; on Linux `dmesg` shows whether the system recognised it",
         {"ports": [vars(port) for port in found]},
     )
 
@@ -35,7 +35,7 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Check:
     Args:
         name: of the check.
         url: as configured.
-        found: the ports that there are.
+        found: the serial ports of this computer.
     """
     if url.lower().startswith("sim://"):
         return Check(name, Verdict.NOT_APPLICABLE, f"{url} is simulated.")
@@ -52,7 +52,7 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Check:
             Verdict.FAILED,
             f"There is no port {url}; there are {listed}.",
             f"the port {url} of the configuration",
-            "Plug the adapter in, switch the controller on, and set the port to one of those that there are; a name "
+            "Plug the adapter in, switch the controller on, and set the port to one of those found; a name "
             "under /dev/serial/by-id stays the same when adapters are plugged in another order",
             values,
         )
@@ -75,24 +75,26 @@ def _same(device: str, url: str) -> bool:
 
 
 def _network(name: str, url: str) -> Check:
-    """A connection that is made and closed again; the controller hears nothing."""
-    expected = f"a controller that takes connections at {url}"
+    """A TCP connection, opened and closed without sending anything."""
+    expected = f"a controller that accepts connections at {url}"
     try:
         parts = urlsplit(url)
         host, number = parts.hostname or "", parts.port
     except ValueError:
         host, number = "", None
     if not host or not number:
-        return Check(name, Verdict.FAILED, f"{url} is no address.", "socket://host:port", "Correct the configuration")
+        return Check(
+            name, Verdict.FAILED, f"{url} is not an address.", "socket://host:port", "Correct the configuration"
+        )
     try:
         socket.create_connection((host, number), CONNECT_TIMEOUT).close()
     except OSError as error:
         return Check(
             name,
             Verdict.FAILED,
-            f"{host}:{number} takes no connection ({error}).",
+            f"{host}:{number} accepts no connection ({error}).",
             expected,
             "Check the controller's power, its address and port on its panel, the network, and that no other program "
-            "holds its connection: many controllers take one at a time",
+            "is connected: many controllers accept only one connection",
         )
-    return Check(name, Verdict.OK, f"{host}:{number} takes connections.", expected)
+    return Check(name, Verdict.OK, f"{host}:{number} accepts connections.", expected)

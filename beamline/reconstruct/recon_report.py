@@ -15,7 +15,7 @@ from beamline.projections.selection import Selection
 from beamline.report import figures
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
-from beamline.report.record import history_arrays, judged_by
+from beamline.report.record import history_arrays, residual_curve
 from beamline.storage.readers.open import ScanSource
 from beamline.storage.writers.recon_file import Value
 from drivers.frame import FrameKind
@@ -78,7 +78,7 @@ class Made:
         None for a direct method, while views still came, for a resumed fit, whose whole time is not known, and for one
         with other rates than the fits that were measured, such as one that followed a scan.
         """
-        judged = judged_by(history_arrays(self.history))
+        judged = residual_curve(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:
             return None
         if (pace := self.settings.get("pace")) is not None:  # of a fit
@@ -90,7 +90,7 @@ class Made:
     @property
     def next_decibel_said(self) -> str:
         """The same in words; empty where there is nothing to say."""
-        found, judged = self.next_decibel, judged_by(history_arrays(self.history))
+        found, judged = self.next_decibel, residual_curve(history_arrays(self.history))
         if found is None or judged is None:
             return ""
         by_others = found.of == "volume"
@@ -250,7 +250,7 @@ def _told_by_history(made: Made) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit to the views it had"]
-    if (judged := judged_by(history_arrays(made.history))) is not None:
+    if (judged := residual_curve(history_arrays(made.history))) is not None:
         parts.append(f"the residual of {judged.views} as dB below the data")
     parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
     parts += [f"how many {' and '.join(growing)} there were"] if growing else []

@@ -1,1 +1,1 @@
-"""Reports: self-contained HTML pages, pictures, and the record of a fit."""
+"""Reports: self-contained HTML pages, pictures, figures of merit, and the history of a fit."""

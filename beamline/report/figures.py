@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from beamline.report.record import judged_by
+from beamline.report.record import residual_curve
 from recon.assess.time_model import NextDecibel, parts_of, record
 from recon.base.geometry import Geometry
 from recon.base.volume import Volume
@@ -22,11 +22,11 @@ from recon.base.volume import Volume
 Window = tuple[float, float]
 _DPI = 110
 _WIDTH = 8.6  # inches; the report's column
-_THIN = 0.06  # an image lower than this share of its width is stretched to be seen at all
+_THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
 
 def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> Window:
-    """The range of grey values that shows all `arrays` alike: percentiles of what they hold together."""
+    """One range of grey values for all `arrays`: percentiles of their values together."""
     finite = np.concatenate([a[np.isfinite(a)].ravel() for a in arrays])
     if finite.size == 0:
         return 0.0, 1.0
@@ -35,7 +35,7 @@ def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: 
 
 
 def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
-    """One corrected view [row, col], with the axis where the reconstruction put it."""
+    """One corrected view [row, col] with the rotation axis of the reconstruction."""
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
@@ -83,7 +83,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
 def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window | None = None) -> bytes:
     """Three orthogonal slices through each volume, side by side in one grey window.
 
-    They meet in the centre of mass of the bright voxels of the last volume.
+    They intersect at the centre of mass of the bright voxels of the last volume.
 
     Args:
         volumes: by name, all on the same grid.
@@ -132,7 +132,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
 
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
-    """The mismatch of the views with each candidate for the rotation axis (columns), and the one chosen."""
+    """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
     figure, axes = _figure((_WIDTH, 2.8))
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
@@ -148,12 +148,12 @@ def quality_against_time(
     psnr: Sequence[tuple[float, float]] = (),
     further: NextDecibel | None = None,
 ) -> bytes:
-    """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, and what grew.
+    """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, number of views and Gaussians.
 
     Args:
         history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
         psnr: (seconds, dB) of each snapshot; none without a truth.
-        further: what another dB would cost; marked where it is known.
+        further: time that another dB would take; None if it is not known.
     """
     seconds = history["seconds"]
     growing = [
@@ -161,8 +161,8 @@ def quality_against_time(
         for name, label in (("n_views", "views"), ("n_gaussians", "Gaussians"))
         if name in history and np.ptp(history[name]) > 0
     ]
-    judge = judged_by(history)
-    panels = 1 + (judge is not None) + bool(psnr) + bool(growing)
+    curve = residual_curve(history)
+    panels = 1 + (curve is not None) + bool(psnr) + bool(growing)
     down, across = (1, panels) if panels < 4 else (2, 2)
     figure = Figure(figsize=(_WIDTH, 3.1 * down), dpi=_DPI, layout="constrained")
     left, *others = np.ravel(figure.subplots(down, across))
@@ -172,7 +172,7 @@ def quality_against_time(
         ("held_out", "residual, held out", "tab:red"),
     ):
         if name == "loss" and np.array_equal(history[name], history.get("residual", [])):
-            continue  # what iterations lower is the residual itself
+            continue  # the loss of iterations is the residual itself
         if name in history and np.any(np.isfinite(history[name])):
             left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in left.get_lines()])
@@ -185,8 +185,8 @@ def quality_against_time(
         left.set_ylim(bottom=0)
     left.set(xlabel="time (s)", title="Misfit")
     left.legend(fontsize=8)
-    if judge is not None:
-        _decibels(others.pop(0), *record(judge.seconds, judge.residuals), judge.views, further)
+    if curve is not None:
+        _decibels(others.pop(0), *record(curve.seconds, curve.residuals), curve.views, further)
     if psnr:
         axes = others.pop(0)
         axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
@@ -207,7 +207,7 @@ def quality_against_time(
 def _decibels(
     axes: Axes, seconds: NDArray[np.float64], quality: NDArray[np.float64], views: str, further: NextDecibel | None
 ) -> None:
-    """The residual as dB below the data, and where the next one is expected."""
+    """The residual as dB below the data, and the time at which the next dB is expected."""
     axes.plot(seconds, quality, color="tab:green", lw=1.2, marker=".", ms=3)
     axes.set(xlabel="time (s)", ylabel="dB below the data", title=f"Residual, {views}")
     if further is None or seconds.size == 0:
@@ -215,10 +215,10 @@ def _decibels(
     if not further.measurable:
         axes.text(0.97, 0.05, "next dB: none measurable", ha="right", fontsize=8, transform=axes.transAxes)
         return
-    said = f"next dB of the {further.of}: about {parts_of(further.seconds)} more"
-    axes.text(0.97, 0.05, said, ha="right", fontsize=8, transform=axes.transAxes)
+    note = f"next dB of the {further.of}: about {parts_of(further.seconds)} more"
+    axes.text(0.97, 0.05, note, ha="right", fontsize=8, transform=axes.transAxes)
     if further.of == "volume":
-        return  # of which this curve is not
+        return  # this curve is the residual, not the quality of the volume
     end, top = float(seconds[-1]), float(quality[-1])
     axes.plot([end, end + further.seconds], [top, top + 1], color="tab:green", lw=1, ls=":")
     high = further.high if math.isfinite(further.high) else 3 * further.seconds
@@ -227,7 +227,7 @@ def _decibels(
 
 
 def _bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
-    """[z, y, x] of the centre of mass of what is brighter than half of the grey window; the middle where nothing is."""
+    """[z, y, x] of the centre of mass of the voxels brighter than half the grey window; the middle if none are."""
     low, high = grey_window([data[::2, ::2, ::2]])
     bright = np.clip(data - (low + high) / 2, 0, high - low)
     total = float(bright.sum(dtype=np.float64))

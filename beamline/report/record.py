@@ -1,4 +1,4 @@
-"""A fit's own record as arrays: kept in its file, shown in its figure, and read for the price of another decibel."""
+"""The history of a fit as arrays, for its file and its figures, and the residual curve that measures its quality."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WORDS = {"held_out": "views held out", "residual": "views used"}
 def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
     """The history of a fit as equally long arrays, by name; empty where there is none.
 
-    What was never measured (all NaN) is left out.
+    A quantity that was never measured (all NaN) is left out.
     """
     if not history:
         return {}
@@ -26,8 +26,8 @@ def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]
     return {name: values for name, values in arrays.items() if not np.isnan(values).all()}
 
 
-def history_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
-    """The history of a fit from `history_arrays`; what was not recorded is NaN."""
+def history_from(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
+    """The history of a fit from `history_arrays`; quantities that were not recorded are NaN."""
     if not arrays:
         return ()
     n = len(arrays["seconds"])
@@ -39,12 +39,12 @@ def history_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """The residual that tells how good a fit is, each time that it was looked at.
+class ResidualCurve:
+    """The residual that measures the quality of a fit, against time.
 
     Attributes:
-        views: which views it is of, in words.
-        seconds, residuals: [look].
+        views: the views of the residual: "views held out" or "views used".
+        seconds, residuals: [measurement].
     """
 
     views: str
@@ -52,13 +52,13 @@ class Judged:
     residuals: NDArray[np.float64]
 
 
-def judged_by(arrays: Mapping[str, NDArray[np.floating]]) -> Judged | None:
-    """The residual of views held out where there are any, else of those used; None where neither was recorded."""
+def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve | None:
+    """The residual of the views held out, if there are any, else of the views used; None if neither was recorded."""
     name = next((name for name in _WORDS if name in arrays and np.isfinite(arrays[name]).any()), None)
     if name is None:
         return None
     seconds, residuals = np.asarray(arrays["seconds"], np.float64), np.asarray(arrays[name], np.float64)
-    looks = np.isfinite(residuals)
-    if name == "held_out":  # looked at now and then, and said again in between
-        looks &= np.concatenate(([True], np.diff(residuals) != 0))
-    return Judged(_WORDS[name], seconds[looks], residuals[looks])
+    measured = np.isfinite(residuals)
+    if name == "held_out":  # measured now and then; the history repeats the last value in between
+        measured &= np.concatenate(([True], np.diff(residuals) != 0))
+    return ResidualCurve(_WORDS[name], seconds[measured], residuals[measured])

@@ -25,7 +25,7 @@ from scipy import ndimage
 import recon
 from beamline.core.memory import forget_peak, peak_memory
 from beamline.projections.held_out import with_held_out
-from beamline.report.record import history_arrays, judged_by
+from beamline.report.record import history_arrays, residual_curve
 from beamline.tradeoff.data import Data, geometry_in
 from beamline.tradeoff.trials import Trial
 from recon.assess import metrics
@@ -89,7 +89,7 @@ def run(
         "metrics": {name: float(value) for name, value in found.items()},
         "gaussians": None if result.gaussians is None else result.gaussians.n,
         "curve": curve_of(result),
-        "curve_of": "" if (judged := judged_by(history_arrays(result.history))) is None else judged.views,
+        "curve_of": "" if (judged := residual_curve(history_arrays(result.history))) is None else judged.views,
     }
 
 
@@ -146,7 +146,7 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
 
 def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
     """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
-    judged = judged_by(history_arrays(result.history))
+    judged = residual_curve(history_arrays(result.history))
     if judged is None:
         return []
     seconds, quality = record(judged.seconds, judged.residuals)

@@ -67,7 +67,7 @@ def test_a_network_port_is_connected_to_and_hears_nothing() -> None:
             assert connection.recv(100) == b""
     check = port("stage port", url, ())
     assert check.verdict is Verdict.FAILED
-    assert "takes no connection" in check.found and "one at a time" in check.advice
+    assert "accepts no connection" in check.found and "only one connection" in check.advice
 
 
 @pytest.mark.parametrize("url", ["socket://host", "socket://host:none", "socket://:7777"])

@@ -10,7 +10,7 @@ import pytest
 
 from beamline.reconstruct.recon_report import Made
 from beamline.report.figures import quality_against_time
-from beamline.report.record import history_arrays, history_of, judged_by
+from beamline.report.record import history_arrays, history_from, residual_curve
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
 from recon.base.volume import Grid, Volume
@@ -37,22 +37,22 @@ def test_there_and_back() -> None:
     history = _record(3.0)
     arrays = history_arrays(history)
     assert {len(values) for values in arrays.values()} == {len(history)}
-    assert [p.step for p in history_of(arrays)] == [p.step for p in history]
-    np.testing.assert_array_equal(history_arrays(history_of(arrays))["residual"], arrays["residual"])
-    assert history_arrays(()) == {} and history_of({}) == ()
+    assert [p.step for p in history_from(arrays)] == [p.step for p in history]
+    np.testing.assert_array_equal(history_arrays(history_from(arrays))["residual"], arrays["residual"])
+    assert history_arrays(()) == {} and history_from({}) == ()
 
 
 def test_what_was_not_recorded_is_not_a_number() -> None:
     arrays = history_arrays(_record(3.0))
     del arrays["loss"]
-    assert all(math.isnan(p.loss) for p in history_of(arrays))
+    assert all(math.isnan(p.loss) for p in history_from(arrays))
 
 
 def test_views_held_out_judge_before_views_used() -> None:
     seconds = np.arange(3.0)
 
     def words(**arrays: np.ndarray) -> str | None:
-        judged = judged_by({"seconds": seconds, **arrays})
+        judged = residual_curve({"seconds": seconds, **arrays})
         return None if judged is None else judged.views
 
     assert words(residual=seconds, held_out=seconds) == "views held out"
@@ -63,7 +63,7 @@ def test_views_held_out_judge_before_views_used() -> None:
 def test_each_look_at_views_held_out_counts_once() -> None:
     """Between two looks the record says the last one again, which is no evidence."""
     looks = np.array([np.nan, np.nan, 0.5, 0.5, 0.5, 0.4, 0.4, 0.3])
-    judged = judged_by({"seconds": np.arange(8.0), "residual": looks, "held_out": looks})
+    judged = residual_curve({"seconds": np.arange(8.0), "residual": looks, "held_out": looks})
     assert judged is not None
     np.testing.assert_array_equal(judged.seconds, [2, 5, 7])
     np.testing.assert_array_equal(judged.residuals, [0.5, 0.4, 0.3])
