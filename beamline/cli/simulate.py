@@ -33,7 +33,7 @@ from beamline.simulate.scene_file import (
     shipped_scenes,
 )
 from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
-from beamline.simulate.write import Simulated, refuse, write_scan
+from beamline.simulate.write import Simulated, check_output, write_scan
 from drivers.clock import Clock, SystemClock
 
 _OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."
@@ -93,7 +93,7 @@ def simulate(
         opened = open_scene(scene, overrides)
         scan = scan_of(opened, seed, views, clock.now())
         if out:
-            refuse(scan, out)
+            check_output(scan, out)
         tell = _Teller(fan_out(*sinks), clock, plain=not as_json)
         if explains:
             _explain(scan, tell)

@@ -1,4 +1,4 @@
-"""`beamline xafs`: at which energy a material stands out most, from a scene or from measured energies."""
+"""`beamline xafs`: the energy of the highest contrast of a material, from a scene or from measured energies."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from beamline.core.events import Event, fan_out
 from beamline.core.stop import StopRequest
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import LEAST, find_edge
-from beamline.xafs.measured import Asked, open_series
-from beamline.xafs.results import Found, left_out, lines, refuse_existing_results, table_beside, write
-from beamline.xafs.series import Series, Taken, take
+from beamline.xafs.measured import FileOptions, open_series
+from beamline.xafs.results import XafsResult, left_out, lines, refuse_existing_results, table_beside, write
+from beamline.xafs.series import Series, SeriesResult, run_series
 from drivers.clock import SystemClock
 
 Box = tuple[int, int, int, int]
@@ -61,8 +61,8 @@ def box(ctx: click.Context, param: click.Parameter, value: str | None) -> Box | 
 )
 @click.option("--seed", type=SEED, help="Of all random numbers of a scene; 0 unless given.")
 @click.option("--region", callback=box, metavar=_BOX, help="The material in a file's frames; all of them unless given.")
-@click.option("--around", callback=box, metavar=_BOX, help="What it is compared with; nothing unless given.")
-@click.option("--unit", type=click.Choice(["keV", "eV"]), help="Of a file's energies; as the file says, else keV.")
+@click.option("--around", callback=box, metavar=_BOX, help="Its surroundings, for the contrast; none unless given.")
+@click.option("--unit", type=click.Choice(["keV", "eV"]), help="Of a file's energies; as in the file, else keV.")
 @click.option(
     "--quantity",
     type=click.Choice(["counts", "line-integrals"]),
@@ -91,19 +91,19 @@ def xafs(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Find the energy at which a material, as thick as it is, stands out most of what is around it, and its absorption
-    edge.
+    """Find the energy at which a material of given thickness has the highest contrast to its surroundings, and its
+    absorption edge.
 
     SCENE is a YAML file or the name of a scene that comes with the package: its radiographs are simulated at all
     energies from --from to --to. FILE is a text table of energy and absorption, or an HDF5 file with `energy` and
     either `mu` or `frames` and `flats`.
 
-    Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6 where no edge is
-    seen: picture and table are written all the same.
+    Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6: no edge was found;
+    picture and table are written, too.
     """
     target = output or Path(f"{Path(source).stem}_xafs.png")
     if target.suffix.lower() != ".png":
-        raise click.BadParameter(f"{str(target)!r} is no picture; name a .png file", param_hint="--output")
+        raise click.BadParameter(f"{str(target)!r} is not a picture; give a .png file", param_hint="--output")
     is_scene = Path(source).suffix.lower() in _SCENES
     _refuse_foreign(click.get_current_context(), _OF_FILES if is_scene else _OF_SCENES)
     clock, stop = SystemClock(), StopRequest()
@@ -112,50 +112,57 @@ def xafs(
         opened.enter_context(stop_signals(stop))
         series: Series | Curve
         if is_scene:
-            from beamline.simulate.energy_scan import open_energy_scan  # and xraylib, of which measured files need none
+            from beamline.simulate.energy_scan import (
+                open_energy_scan,  # lazily: it imports xraylib, which measured files do not need
+            )
 
             series = open_energy_scan(
                 source, _grid(low, high, step or 0.001), material, math.radians(angle or 0.0), seed or 0
             ).series()
         else:
-            asked = Asked(low or 0.0, high or math.inf, region, around, unit, quantity)
-            series = opened.enter_context(open_series(Path(source), asked))
+            options = FileOptions(low or 0.0, high or math.inf, region, around, unit, quantity)
+            series = opened.enter_context(open_series(Path(source), options))
             n = series.energies.size if isinstance(series, Curve) else series.n
             if n < LEAST:
                 within = " between --from and --to" if low or high else ""
                 raise DataError(f"{source}: {n} energies{within} are too few for an edge, which takes {LEAST}.")
         with Terminal(sys.stderr) as terminal:
             sink = fan_out(*(sinks or [terminal]))
-            taken = Taken(series) if isinstance(series, Curve) else take(series, sink, clock, lambda: stop.stopping)
-        found = _found(Path(source).name if isinstance(series, Curve) else series.what, taken)
-        write(found, target)
+            if isinstance(series, Curve):
+                run, title = SeriesResult(series), Path(source).name
+            else:
+                run, title = run_series(series, sink, clock, lambda: stop.stopping), series.title
+        result = _result(title, run)
+        write(result, target)
         for done in sinks:
-            said = found.data() | {"picture": target, "table": table_beside(target), "stopped": taken.cut}
-            done(Event("done", clock.now(), said))
+            data = result.data() | {"picture": target, "table": table_beside(target), "stopped": run.stopped}
+            done(Event("done", clock.now(), data))
     if not as_json:
-        click.echo("\n".join([*lines(found), f"written     {target}, {table_beside(target)}"]))
-    if taken.cut:
-        n = taken.curve.energies.size + taken.curve.left_out.size
-        raise ScanStopped(f"Stopped after {n} energies; picture and table hold them.")
-    if not found.edge.seen:
-        raise QualityError(f"No absorption edge is seen: {found.edge.why}. Picture and table were written.")
+        click.echo("\n".join([*lines(result), f"written     {target}, {table_beside(target)}"]))
+    if run.stopped:
+        n = run.curve.energies.size + run.curve.left_out.size
+        raise ScanStopped(f"Stopped after {n} energies; picture and table contain them.")
+    if not result.edge.found:
+        raise QualityError(f"No absorption edge was found: {result.edge.reason}. Picture and table were written.")
 
 
-def _found(what: str, taken: Taken) -> Found:
-    """What a curve shows. Raises ScanStopped or DataError, with nothing written: it has too few energies."""
-    n, lost = taken.curve.energies.size, taken.curve.left_out
+def _result(title: str, run: SeriesResult) -> XafsResult:
+    """The edge of a curve. Raises ScanStopped or DataError, with nothing written, where it has too few energies."""
+    n, lost = run.curve.energies.size, run.curve.left_out
     if n < LEAST:
-        why = f" Left out: {left_out(taken.curve)}." if lost.size else ""
-        if taken.cut:
+        why = f" Left out: {left_out(run.curve)}." if lost.size else ""
+        if run.stopped:
             raise ScanStopped(f"Stopped after {n + lost.size} energies, too few for an edge; nothing was written.{why}")
-        raise DataError(f"{what}: {n} energies are too few for an edge, which takes {LEAST}; nothing was written.{why}")
-    return Found(what, taken.curve, find_edge(taken.curve.energies, taken.curve.absorption))
+        raise DataError(
+            f"{title}: {n} energies are too few for an edge, which takes {LEAST}; nothing was written.{why}"
+        )
+    return XafsResult(title, run.curve, find_edge(run.curve.energies, run.curve.absorption))
 
 
 def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.float64]:
-    """Energies from low to high, keV. Raises UsageError: they are not said, too few, or too many."""
+    """Energies from low to high, keV. Raises UsageError: a limit is missing, or energies are too few or many."""
     if low is None or high is None:
-        raise click.UsageError("A scene is scanned over energies that you say: --from 8.30 --to 8.42, in keV.")
+        raise click.UsageError("A scene needs a range of energies: --from 8.30 --to 8.42, in keV.")
     n = math.floor((high - low) / step * (1 + 1e-9) + 1e-9) + 1
     if not LEAST <= n <= MOST:
         raise click.UsageError(
@@ -165,7 +172,7 @@ def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.floa
 
 
 def _refuse_foreign(ctx: click.Context, foreign: Sequence[str]) -> None:
-    """Raises UsageError where an option is given that says nothing of such a source."""
+    """Raises UsageError where an option is given that does not apply to the source."""
     given = [name for name in foreign if ctx.params.get(name) is not None]
     if given:
         kind = "measured files, not for scenes" if foreign is _OF_FILES else "scenes, not for measured files"

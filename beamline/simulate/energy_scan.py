@@ -1,4 +1,4 @@
-"""Energy scan: radiographs of a scene at one energy after another, and where in them a material is to be seen."""
+"""Energy scan: radiographs of a scene at several energies, and the regions with and without a material."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ Reals = NDArray[np.float64]
 
 FLATS = 4
 """Frames without the sample before each energy's radiograph, as at a beamline: the beam changes with the energy."""
-THICK = 0.5  # of the most: pixels with so much of the material show it
-NEAR = 24  # pixels around the material that are its surrounding
+THICK = 0.5  # of the largest thickness: pixels with at least this much are inside the material
+NEAR = 24  # pixels around the material that count as its surroundings
 
 
 @dataclass(frozen=True, eq=False)
 class EnergyScan:
-    """A scene to be seen at many energies. Make one with `open_energy_scan`.
+    """A scene that is exposed at several energies. Created by `open_energy_scan`.
 
     Attributes:
         name: of the scene.
         beam: its light, of any energy.
         energies: keV, [n].
-        angle: radians at which the stage stands.
-        material: what is looked at.
-        regions: where it is.
+        angle: of the stage, radians.
+        material: whose contrast is measured.
+        regions: of the material and its surroundings.
     """
 
     name: str
@@ -56,13 +56,13 @@ class EnergyScan:
     regions: Regions
 
     def series(self) -> Series:
-        """Its radiographs, made as they are asked for."""
-        what = f"{self.material} in {self.name}, simulated"
-        return Series(what, self.energies.size, self.frames(self.energies), self.regions)
+        """Its radiographs, computed lazily."""
+        title = f"{self.material} in {self.name}, simulated"
+        return Series(title, self.energies.size, self.frames(self.energies), self.regions)
 
     def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene: a dark level once, then
-        flats and a radiograph each, one after the other as the scene's period has it. A pixel without light is +inf."""
+        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene: first a dark level, then
+        flats and a radiograph for each energy, in the scene's period. A pixel without light is +inf."""
         n_darks = max(self.scan.scene.scan.darks, 1)
         dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(n_darks)], axis=0)
         number = n_darks
@@ -74,7 +74,7 @@ class EnergyScan:
             yield energy, line_integrals(signal, flat)
 
     def _at(self, energy: float) -> EnergyScan:
-        """The same scan in light of that energy."""
+        """The same scan at that energy."""
         beam = replace(self.beam, energy_kev=energy)
         matter = [m.attenuation for c in self.sample.constituents for m in (c.material, c.instead_of) if m is not None]
         spectrum = light(beam, matter, 2 * self.sample.radius, _no_filters)
@@ -83,7 +83,7 @@ class EnergyScan:
         return replace(self, scan=replace(self.scan, scene=scene), sample=sample)
 
     def _counts(self, number: int, beam: bool = True, sample: bool = True) -> Reals:
-        """A frame, counts [row, col], NaN where they are the most that the sensor tells; the stage stands."""
+        """A frame of the standing stage, counts [row, col], NaN where they are the largest of the sensor."""
         time = number * self.scan.scene.scan.period_s
         shot = replace(
             self.scan.frame(len(self.scan) - self.scan.views).shot,
@@ -104,21 +104,21 @@ class EnergyScan:
 def open_energy_scan(
     name: str, energies: Reals, material: str | None = None, angle: float = 0.0, seed: int = 0
 ) -> EnergyScan:
-    """A scene, ready to be seen at `energies` (keV).
+    """A scene, prepared for `energies` (keV).
 
     Args:
         name: a scene file, or the name of a shipped scene.
-        material: that is looked at; None: the one with a state of charge.
-        angle: radians at which the stage stands.
+        material: whose contrast is measured; None: the one with a state of charge.
+        angle: of the stage, radians.
         seed: of all random numbers.
 
     Raises:
-        ConfigError: there is no such scene, its sample is grey, or the material is not to be seen.
+        ConfigError: there is no such scene, its sample is grey, or the material is not visible.
     """
     opened = open_scene(name)
     mapping = dict(read(opened.text, str(opened.path)).data)
-    said = opened.scene.beam
-    # Light of all the range makes any phantom of materials a mixture, whose chords serve every energy.
+    own = opened.scene.beam
+    # With both ends of the range any phantom of materials is a mixture, whose chords are used for every energy.
     ends: dict[str, Any] = {"spectrum": [[float(energies.min()), 1.0], [float(energies.max()), 1.0]]}
     kept = {key: value for key, value in mapping["beam"].items() if key in ("photons_per_s", "sod", "sdd")}
     try:
@@ -127,50 +127,50 @@ def open_energy_scan(
         raise ConfigError(f"{opened.path}: {error}. Nothing was simulated.") from None
     if not isinstance(scene.sample, Mixture):
         raise ConfigError(
-            f"{opened.path}: no solid of the sample names a material, so that it is alike at every energy; give them "
+            f"{opened.path}: no solid of the sample has a material, so that it is the same at every energy; give them "
             "material: instead of attenuation:. Nothing was simulated."
         )
-    beam = Beam(said.photons_per_s, said.sod, said.sdd, float(energies.mean()), said.bandwidth, said.harmonics)
+    beam = Beam(own.photons_per_s, own.sod, own.sdd, float(energies.mean()), own.bandwidth, own.harmonics)
     chosen = _chosen(scene.sample, material)
     scan = Scan.of(scene, seed)
     try:
         regions = _regions(scene.sample, chosen, scan, angle)
     except ValueError as error:
         raise ConfigError(f"{opened.path}: {chosen} cannot be compared: {error}. Nothing was simulated.") from None
-    made = EnergyScan(opened.path.stem, scan, scene.sample, beam, energies, angle, chosen, regions)
+    energy_scan = EnergyScan(opened.path.stem, scan, scene.sample, beam, energies, angle, chosen, regions)
     try:
         for end in (float(energies.min()), float(energies.max())):
-            seen = made._at(end).sample  # with its bandwidth and harmonics, which may lie outside the tables
-            for constituent in seen.constituents:
-                constituent.attenuation(seen.spectrum.energies)
+            sample = energy_scan._at(end).sample  # with bandwidth and harmonics, which may be outside the tables
+            for constituent in sample.constituents:
+                constituent.attenuation(sample.spectrum.energies)
     except ValueError as error:
         raise ConfigError(f"{opened.path}: {error}. Nothing was simulated.") from None
-    return made
+    return energy_scan
 
 
 def _chosen(sample: Mixture, wanted: str | None) -> str:
-    """The material to look at. Raises ConfigError: it is not there, or several could be meant."""
-    there = {c.material.name: c.material for c in sample.constituents if c.material is not None}
+    """The material to measure. Raises ConfigError: the scene lacks it, or several are possible."""
+    present = {c.material.name: c.material for c in sample.constituents if c.material is not None}
     if wanted is None:
-        charged = [name for name, material in there.items() if material.state_of_charge is not None]
+        charged = [name for name, material in present.items() if material.state_of_charge is not None]
         if len(charged) == 1:
             return charged[0]
         raise ConfigError(
-            f"{len(charged)} materials of the scene have a state_of_charge; say which one to look at with --material, "
-            f"of {', '.join(there)}. Nothing was simulated."
+            f"{len(charged)} materials of the scene have a state_of_charge; choose one with --material, "
+            f"of {', '.join(present)}. Nothing was simulated."
         )
-    if wanted not in there:
-        raise ConfigError(f"The scene has no material {wanted!r}; it has {', '.join(there)}. Nothing was simulated.")
+    if wanted not in present:
+        raise ConfigError(f"The scene has no material {wanted!r}; it has {', '.join(present)}. Nothing was simulated.")
     return wanted
 
 
 def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Regions:
-    """Pixels with much of the material, and those next to it with none of it but in the sample (or in the air)."""
+    """Pixels with much of the material, and those near it without it, in the sample if possible, else in air."""
     thickness = sample.thickness(angle, scan.detector)
     mine = np.array([_is(c, material) for c in sample.constituents])
     own = thickness[mine].sum(axis=0)
     if not own.max() > 0:
-        raise ValueError("nothing of it is in the field of view")
+        raise ValueError("it is not in the field of view")
     inside = own >= THICK * own.max()
     near = binary_dilation(own > 0, iterations=min(NEAR, max(own.shape))) & (own == 0)
     matter = near & (thickness != 0).any(axis=0)

@@ -1,4 +1,4 @@
-"""Figure: a simulated scan at one look: a dark, a flat and some views, with the labelled anomalies framed."""
+"""Figure: overview of a simulated scan: a dark, a flat and some views, with frames around labelled anomalies."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from simulators.scenes.shots import Scan
 
 COLUMNS, PICTURES = 4, 8
 _COLOURS = ("tab:orange", "tab:cyan", "tab:pink", "tab:olive", "tab:green", "tab:red", "tab:purple")
-FLATTEST, TALLEST = 0.1, 3.0  # heights of a picture over its width; frames beyond get margins
-MOST = 512  # pixels a side that a picture of 2 inches can show
+FLATTEST, TALLEST = 0.1, 3.0  # limits of a picture's height over its width; other frames get margins
+MOST = 512  # pixels a side that a picture of 2 inches can resolve
 
 
 def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
-    """PNG. Frames are made again for it, so that it can be had without a file.
+    """PNG. Its frames are computed again, so that it needs no file.
 
     Args:
-        marked: frames that should be among those shown: where an anomaly begins.
+        marked: frames to include, such as those with anomalies.
     """
     numbers = _chosen(scan, marked)
-    made = [(n, scan.frame(n)) for n in numbers]
-    frames = [expose(scan.scene, planned.shot) for _, planned in made]
+    chosen = [(n, scan.frame(n)) for n in numbers]
+    frames = [expose(scan.scene, planned.shot) for _, planned in chosen]
     step = max(1, -(-max(scan.detector.shape) // MOST))
     small = [frame[::step, ::step].astype(np.float32) for frame in frames]
-    shown = [frame for frame, (_, planned) in zip(small, made, strict=True) if planned.kind is FrameKind.PROJECTION]
-    low, high = grey_window(shown, 0.5, 99.8)
+    views = [frame for frame, (_, planned) in zip(small, chosen, strict=True) if planned.kind is FrameKind.PROJECTION]
+    low, high = grey_window(views, 0.5, 99.8)
     rows = -(-len(frames) // COLUMNS)
     tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
     figure = Figure(figsize=(10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), dpi=110)
     FigureCanvasAgg(figure)
     anomalies = [effect.name for effect in scan.scene.chain.effects if isinstance(effect, Anomaly)]
-    for place, ((number, planned), frame) in enumerate(zip(made, small, strict=True), start=1):
+    for place, ((number, planned), frame) in enumerate(zip(chosen, small, strict=True), start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)
         axes.imshow(frame, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
         axes.set_xticks([])
@@ -64,7 +64,7 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
 
 
 def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:
-    """A dark and a flat where there are any, frames that are marked, and views spread over the rest."""
+    """A dark and a flat, if any, marked frames, and views spread over the scan."""
     settings = scan.scene.scan
     first_view = settings.darks + settings.flats
     numbers = [0] if settings.darks else []

@@ -1,4 +1,4 @@
-"""Labels: which frames show which injected anomaly and where, as JSON beside a simulated scan, to judge monitors by."""
+"""Labels: the frames and regions of simulated anomalies, as JSON beside a simulated scan, to test monitors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Run:
-    """An anomaly in consecutive frames; of several of its kind in a frame, one.
+    """One anomaly in consecutive frames.
 
     Attributes:
         kind: the anomaly's name.
-        first: frame, counted in the file from 0.
-        regions: one a frame: (first row, row after the last, first column, column after the last).
+        first: its first frame, counted in the file from 0.
+        regions: one for each frame: (first row, row after the last, first column, column after the last).
     """
 
     kind: str
@@ -38,7 +38,7 @@ class Run:
 
 @dataclass
 class LabelLog:
-    """Takes the labels of one frame after the other."""
+    """Collects the labels of consecutive frames."""
 
     _frames: list[tuple[int, Label]] = field(default_factory=list)
 
@@ -46,7 +46,7 @@ class LabelLog:
         self._frames.extend((frame, label) for label in labels)
 
     def runs(self, n_frames: float = math.inf) -> tuple[Run, ...]:
-        """In the order in which they begin; of the first `n_frames`, where not all came into the file."""
+        """Runs in the order of their first frames, of the first `n_frames` only."""
         open_runs: dict[tuple[str, int], Run] = {}
         done: list[Run] = []
         for frame, label in (entry for entry in self._frames if entry[0] < n_frames):
@@ -61,17 +61,17 @@ class LabelLog:
 
 
 def labels_path(scan: Path) -> Path:
-    """Where the labels of a scan file stand."""
+    """Path of the labels of a scan file."""
     return scan.with_suffix(".labels.json")
 
 
 def write_labels(path: Path, runs: Sequence[Run], n_frames: int) -> None:
-    """All or nothing; also where there is no anomaly, for that is a statement too.
+    """Write the labels, also where there are none. The file is complete or absent.
 
     Raises:
-        DataError: `path` exists, or the disk refuses.
+        DataError: `path` exists or cannot be written.
     """
-    said: dict[str, Any] = {
+    content: dict[str, Any] = {
         "frames": n_frames,
         "region": "first row, row after the last, first column, column after the last",
         "anomalies": [
@@ -80,13 +80,13 @@ def write_labels(path: Path, runs: Sequence[Run], n_frames: int) -> None:
         ],
     }
     with named_on_failure(path), whole_file(path) as partial:
-        partial.write_text(json.dumps(said) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 def read_labels(path: Path) -> tuple[Run, ...]:
-    """What `write_labels` wrote."""
-    said = json.loads(path.read_text(encoding="utf-8"))
+    """The labels of a file from `write_labels`."""
+    content = json.loads(path.read_text(encoding="utf-8"))
     return tuple(
         Run(entry["kind"], entry["first_frame"], tuple(tuple(region) for region in entry["regions"]))
-        for entry in said["anomalies"]
+        for entry in content["anomalies"]
     )

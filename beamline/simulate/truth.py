@@ -1,4 +1,4 @@
-"""Truth: the attenuation and the labels of a simulated sample, on the grid that a reconstruction of its scan has."""
+"""Truth: attenuation and labels of a simulated sample, on the grid of a reconstruction of its scan."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ from simulators.frame.detector import Detector
 from simulators.samples.sample import Sample
 
 LARGEST = 256
-"""Voxels across, unless asked otherwise: 256³ take 84 MB with the labels."""
-MAKING = 16
-"""Bytes of memory a voxel while it is made, as measured: 12 of solids (float64 and float32), 16 of volumes."""
+"""Voxels across by default: 256³ take 84 MB with the labels."""
+BYTES_A_VOXEL = 16
+"""Peak memory as measured: 12 for solids (float64 and float32), 16 for volumes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Attributes:
-    attenuation: float32 [z, y, x], 1/mm.
-    labels: uint8 [z, y, x]; 0 is air, k the k-th of `names`.
+    """True attenuation and labels of a sample.
+
+    Attributes:
+        attenuation: float32 [z, y, x], 1/mm.
+        labels: uint8 [z, y, x]; 0 is air, k the k-th of `names`.
     """
 
     grid: Grid
@@ -36,7 +38,7 @@ class Truth:
 
 
 def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
-    """The simulated rays as reconstructions know them; of a cone, the detector is taken to stand at the sample."""
+    """The simulated rays as a reconstruction's geometry; a cone's detector is placed at the sample."""
     if np.isfinite(detector.sod):
         return Geometry.cone(
             angles,
@@ -51,18 +53,17 @@ def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
 
 
 def binning_of(detector: Detector) -> int:
-    """The least binning with which a volume is no larger than LARGEST voxels across; of a frame with fewer rows (or
-    columns) than that, as many as it has."""
+    """The least binning for a volume of LARGEST voxels across at most, limited by the frame's rows and columns."""
     return max(1, min(-(-max(detector.shape) // LARGEST), *detector.shape))
 
 
 def memory_of(detector: Detector, binning: int) -> int:
-    """Bytes of memory that `truth_of` takes at most.
+    """Peak memory of `truth_of` in bytes.
 
     Raises:
         ValueError: the binning does not fit into the frame.
     """
-    return MAKING * math.prod(_grid(detector, binning).shape)
+    return BYTES_A_VOXEL * math.prod(_grid(detector, binning).shape)
 
 
 def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
@@ -73,8 +74,8 @@ def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
     """
     grid = _grid(detector, binning)
     z, y, x = grid.centre
-    there = replace(grid, centre=(z + _above(detector, binning), y, x))
-    return Truth(grid, sample.attenuation(there), sample.labels(there), sample.names)
+    shifted = replace(grid, centre=(z + _above(detector, binning), y, x))
+    return Truth(grid, sample.attenuation(shifted), sample.labels(shifted), sample.names)
 
 
 def _grid(detector: Detector, binning: int) -> Grid:
@@ -82,8 +83,8 @@ def _grid(detector: Detector, binning: int) -> Grid:
 
 
 def _above(detector: Detector, binning: int) -> float:
-    """mm by which a reconstruction's z = 0 lies above the scene's: a parallel beam's is the middle of the rows that
-    make whole bins, see Geometry.binned."""
+    """z of a reconstruction's origin in the scene, mm: in a parallel beam the middle of the rows in whole bins, see
+    Geometry.binned."""
     if np.isfinite(detector.sod):
         return 0.0
     rows = detector.shape[0] // binning * binning
@@ -91,10 +92,11 @@ def _above(detector: Detector, binning: int) -> float:
 
 
 def write_truth(path: Path, truth: Truth) -> None:
-    """An HDF5 file with entry/data/data (which `beamline recon --truth` reads) and entry/data/labels; all or nothing.
+    """Write an HDF5 file with entry/data/data (read by `beamline recon --truth`) and entry/data/labels, complete or not
+    at all.
 
     Raises:
-        DataError: `path` exists, or the disk refuses.
+        DataError: `path` exists or cannot be written.
     """
     with named_on_failure(path), whole_file(path) as partial, hdf5.created(partial) as file:
         file.attrs["default"] = "entry"

@@ -1,4 +1,4 @@
-"""Write: a simulated scan frame by frame into a file like an instrument's, with the labels of what was put in it."""
+"""Write: writes a simulated scan frame by frame into a file like an instrument's, with the labels of its anomalies."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from simulators.scenes.expose import expose
 from simulators.scenes.shots import Planned, Scan
 
 PREVIEW_BIN = 4
-SAY_EVERY = 0.1  # real s between `frame` events
+REPORT_EVERY = 0.1  # s of real time between `frame` events
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """What was written: `stopped` says that it ended before all frames were made."""
+    """The written files; `stopped` where the scan ended before its last frame."""
 
     path: Path
     labels: Path
@@ -43,8 +43,8 @@ class Simulated:
     stopped: bool
 
 
-def refuse(scan: Scan, out: Path) -> None:
-    """Before anything is written. Raises DataError: file or labels are in the way, or the disk has too little room."""
+def check_output(scan: Scan, out: Path) -> None:
+    """Raises DataError where the file or its labels exist, or the disk has too little space. Nothing is written."""
     for path in (out, labels_path(out)):
         refuse_existing(path)
     rows, cols = scan.detector.shape
@@ -53,25 +53,25 @@ def refuse(scan: Scan, out: Path) -> None:
     free = shutil.disk_usage(out.parent).free
     if needed > free:
         raise DataError(
-            f"{out} would take {size(needed)} with {len(scan)} frames, its disk has {size(free)} free. Make fewer or "
-            "smaller frames, or name another disk. Nothing was written."
+            f"{out} would take {size(needed)} with {len(scan)} frames, its disk has {size(free)} free. Simulate fewer "
+            "or smaller frames, or use another disk. Nothing was written."
         )
 
 
 def write_scan(
-    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, stopped: Callable[[], bool]
+    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, check_stop: Callable[[], bool]
 ) -> Simulated:
-    """Make every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
+    """Compute every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
 
     Args:
-        stopped: asked before each frame; where it says so, file and labels are complete as far as they go.
+        check_stop: called before each frame; true ends the scan with a valid file and labels.
 
     Raises:
-        DataError: a file is in the way, or the disk refuses or is too small.
+        DataError: a file exists or cannot be written, or the disk is too small.
     """
-    refuse(scan, out)
+    check_output(scan, out)
     labels = labels_path(out)
-    log, begun, said = LabelLog(), time.monotonic(), -SAY_EVERY
+    log, start, reported = LabelLog(), time.monotonic(), -REPORT_EVERY
     n = 0
     writer = NXtomoWriter(
         out, _info(scene, scan), scan.detector.shape, clock=clock, preview_bin=_preview_bin(scan.detector.shape)
@@ -79,22 +79,22 @@ def write_scan(
     try:
         with writer:
             for planned in scan:
-                if stopped():
+                if check_stop():
                     writer.close("stopped")
                     break
                 log.add(n, _write(scan, planned, n, writer))
                 n += 1
-                now = time.monotonic() - begun
-                if now - said >= SAY_EVERY or n == len(scan):
-                    said = now
+                now = time.monotonic() - start
+                if now - reported >= REPORT_EVERY or n == len(scan):
+                    reported = now
                     sink(Event("frame", clock.now(), _progress(n, len(scan), now, scan.detector.shape, planned.kind)))
     except BaseException:
-        with suppress(DataError):  # why the scan ended is what is told
+        with suppress(DataError):  # the first error is the one to report
             write_labels(labels, log.runs(), n)
         raise
     runs = log.runs()
     write_labels(labels, runs, n)
-    return Simulated(out, labels, n, runs, time.monotonic() - begun, n < len(scan))
+    return Simulated(out, labels, n, runs, time.monotonic() - start, n < len(scan))
 
 
 def _write(scan: Scan, planned: Planned, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:
@@ -124,7 +124,7 @@ def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: 
 
 def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
     settings, beam = scene.scene.scan, scene.scene.beam
-    asked = {"views": scan.views, "range_deg": settings.range_deg, "fly": settings.fly, "seed": scan.seed}
+    plan = {"views": scan.views, "range_deg": settings.range_deg, "fly": settings.fly, "seed": scan.seed}
     magnification = 1.0 if beam.sod is None or beam.sdd is None else beam.sdd / beam.sod
     return ScanInfo(
         sample=scene.path.stem,
@@ -136,7 +136,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         exposure=scene.scene.detector.exposure_s,
         period=scan.period,
         axis_col=scan.detector.axis_col,
-        plan=json.dumps(asked),
+        plan=json.dumps(plan),
         config=scene.text,
         devices={"simulator": {"seed": scan.seed, "electrons_per_count": scan.frame(0).shot.conversion}},
     )

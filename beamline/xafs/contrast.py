@@ -1,4 +1,4 @@
-"""Contrast: how a region stands out of what is around it in a radiograph, and the curve of that over energies."""
+"""Contrast: of a region against its surroundings in a radiograph, and its curve over energies."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Mask = NDArray[np.bool_]
 
 NEARLY_BEST = 0.95
 WINDOW = 7  # energies
-ENOUGH = 50  # pixels to take a noise from
-FEWEST = 16  # of them, to take any
-DARK = 0.01  # of a region's pixels: with more of them dark, nothing is known of it
-KNOWN = 0.5  # of a region's pixels, at least
+ENOUGH = 50  # pixels inside the rim for an estimate of the noise; with fewer the rim is used, too
+FEWEST = 16  # pixels for any estimate of the noise
+DARK = 0.01  # largest share of dark pixels in a region
+KNOWN = 0.5  # least share of pixels with a value in a region
 
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Which pixels are compared.
+    """The pixels that are compared.
 
     Attributes:
         inside: bool [row, col], of the material.
-        around: bool [row, col], of what it is compared with, none of it inside; None: with nothing.
+        around: bool [row, col], of its surroundings, disjoint from `inside`; None: no comparison.
         thickness: mm of the material, mean over `inside`; None: not known.
     """
 
@@ -40,7 +40,7 @@ class Regions:
     def __post_init__(self) -> None:
         for name, mask in (("inside", self.inside), ("around", self.around)):
             if mask is not None and mask.sum() < 1:
-                raise ValueError(f"the region {name} the material has no pixel")
+                raise ValueError(f"the region {name} the material has no pixels")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,12 @@ class Curve:
 
     Attributes:
         energies: keV, rising, [n].
-        absorption: [n], of the region less what is around it, in `unit`.
+        absorption: [n], of the region less that of its surroundings, in `unit`.
         contrast: the same as a line integral, [n]; None where only the absorption is known.
         noise: rms noise of the difference of a pixel inside and one around, as a line integral, [n]; None likewise, and
-            where the regions are too small to tell.
-        unit: "1/mm" where the thickness is known, else "line integral" or the file's own word.
-        left_out: keV, rising, of the energies at which too little light came through, or too few pixels had a value.
+            where the regions are too small.
+        unit: "1/mm" where the thickness is known, else "line integral" or that of the file.
+        left_out: keV, rising, energies at which too little light was transmitted or too few pixels had a value.
     """
 
     energies: Reals
@@ -66,10 +66,10 @@ class Curve:
 
     @property
     def contrast_to_noise(self) -> Reals | None:
-        """|contrast| over noise, [n]; None where either is unknown or there is no noise at all.
+        """|contrast| over noise, [n]; None where either is unknown or the noise is 0.
 
-        The noise of a few hundred pixels is known to 5 % only, which is as much as energies differ: it is smoothed over
-        neighbouring ones.
+        The noise of a few hundred pixels is known to 5 % only, as much as it differs between energies: it is smoothed
+        over neighbouring ones.
         """
         if self.contrast is None or self.noise is None or not (self.noise > 0).all():
             return None
@@ -78,14 +78,13 @@ class Curve:
 
     @property
     def best(self) -> int:
-        """Position of the energy of the highest contrast-to-noise; of the highest contrast, or absorption, where noise
-        is unknown."""
+        """Index of the energy of the highest contrast-to-noise; of the highest absorption where noise is unknown."""
         by = self.contrast_to_noise
         return int(np.argmax(np.abs(self.absorption) if by is None else by))
 
     @property
     def nearly_best(self) -> tuple[float, float]:
-        """keV from and to which, around the best, at least 95 % of it is kept."""
+        """Range in keV around the best energy with at least 95 % of its contrast-to-noise."""
         by = self.contrast_to_noise
         values = np.abs(self.absorption) if by is None else by
         good = values >= NEARLY_BEST * values[self.best]
@@ -97,12 +96,12 @@ class Curve:
         return float(self.energies[first]), float(self.energies[last])
 
 
-def measured(frame: Reals, regions: Regions) -> tuple[float, float]:
+def contrast_of(frame: Reals, regions: Regions) -> tuple[float, float]:
     """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
-    pixels to tell).
+    pixels).
 
-    Both are NaN where nothing is known of a region: more than 1 % of its pixels are dark (+inf; what is left of such a
-    region is not its mean, and the noise of no light is none), or less than half of them have a value.
+    Both are NaN where a region is not usable: more than 1 % of its pixels are dark (+inf; the mean of the others is not
+    the region's, and pixels without light have no noise), or less than half of them have a value.
     """
     inside, noise = _level(frame, regions.inside)
     if regions.around is None:
@@ -112,7 +111,7 @@ def measured(frame: Reals, regions: Regions) -> tuple[float, float]:
 
 
 def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Regions) -> Curve:
-    """The curve of the points that `measured` gave, in the order of the energies, of those that are known."""
+    """The curve of points from `contrast_of`, sorted by energy; unknown points are left out."""
     order = np.argsort(energies, kind="stable")
     contrast, noise = np.array(points, dtype=np.float64).reshape(-1, 2).T[:, order]
     known, e = np.isfinite(contrast), energies[order]
@@ -125,12 +124,12 @@ def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Re
 def _level(frame: Reals, mask: Mask) -> tuple[float, float]:
     """Mean over the mask, and the noise of a pixel of it.
 
-    The noise is what is left of the image after a mask to which planes and products of lines are nothing (Immerkaer,
-    Comput. Vis. Image Underst. 64, 300, 1996); its median over the pixels, for a normal distribution, so that edges
-    within the region count for little. The region's own rim is left out where enough pixels are within it.
+    The noise is the response of a filter that removes planes and products of lines (Immerkaer, Comput. Vis. Image
+    Underst. 64, 300, 1996), scaled from its median over the pixels for a normal distribution, so that edges within the
+    region have little influence. The region's rim is excluded where enough pixels are within it.
     """
     rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    # Only the region and the pixels next to it: frames may be far larger.
+    # Only the region and its neighbouring pixels: frames may be far larger.
     part = slice(max(rows[0] - 1, 0), rows[-1] + 2), slice(max(cols[0] - 1, 0), cols[-1] + 2)
     frame, mask = frame[part], mask[part]
     values = frame[mask]

@@ -1,4 +1,4 @@
-"""Depth: line integrals of counts, and what stands where there are none."""
+"""Depth: line integrals of counts, +inf without transmitted light and NaN without a value."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 Reals = NDArray[np.float64]
 
 LEAST = 0.5
-"""Counts above the dark that are light at all."""
+"""Fewest counts above the dark level that count as light."""
 LEAST_SHARE = 1e-3
-"""The same as a share of the flat, where that is the less: flats of 1 are as good as flats of 5000."""
+"""The same as a share of the flat, where that is less, so that flats may be normalised to 1."""
 
 
 def line_integrals(signal: Reals, flat: Reals) -> Reals:
-    """-log(signal / flat), [row, col], of counts above the dark; +inf where no light came through, NaN where the flat
-    has none either, or either of them is no number."""
+    """-log(signal / flat), [row, col], of counts above the dark level; +inf where no light was transmitted, NaN where
+    the flat has none either, or either is not finite."""
     lit = np.minimum(LEAST, LEAST_SHARE * flat)
     out = np.full(np.broadcast_shapes(signal.shape, flat.shape), np.nan)
     known = np.isfinite(signal) & (flat > 0) & (flat < np.inf)

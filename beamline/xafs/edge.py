@@ -1,4 +1,4 @@
-"""Edge: where an absorption curve has its edge and its white line, and whether it has any."""
+"""Edge: finds the edge and the white line of an absorption curve, if it has them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ Reals = NDArray[np.float64]
 LEAST = 9
 """Energies that a curve must have."""
 WINDOW = 5  # points of a local parabola
-SURE = 5.0  # times the noise that what is not smooth must be
-FALSE_ALARM = 1e-6  # of a curve without an edge, under normal noise of any size
-SMOOTH = 1e-3  # of the absorption: what a smooth curve may differ from Victoreen's by without any noise
+SURE = 5.0  # least ratio of the misfit of a smooth curve to the noise
+FALSE_ALARM = 1e-6  # probability for a curve without an edge, under normal noise of any size
+SMOOTH = 1e-3  # of the absorption: tolerated difference of a noiseless smooth curve from Victoreen's
 
 
 @dataclass(frozen=True)
 class Edge:
-    """What a curve shows.
+    """Edge and white line of a curve.
 
     Attributes:
-        seen: there is an edge within the range.
-        why: in a sentence, where there is none.
-        energy: keV of the steepest rise; None where no edge is seen.
+        found: there is an edge within the range.
+        reason: why there is none, as a sentence.
+        energy: keV of the steepest rise; None where no edge is found.
         white_line: keV of the top above it; None where there is none, or it is not within the range.
         misfit: rms difference from the best smooth curve, in units of the absorption.
         noise: rms noise of the curve, likewise.
     """
 
-    seen: bool
-    why: str
+    found: bool
+    reason: str
     energy: float | None
     white_line: float | None
     misfit: float
@@ -46,11 +46,11 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
     """The edge of a curve.
 
     A curve without an edge is Victoreen's, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise. There
-    is an edge where a step upwards at one of the energies makes it fit better than chance would in one of a million
-    such curves (Student's t of the step, times the number of places where it may stand), or where it differs from
-    Victoreen's by five times its noise, which is taken from second differences: these see hardly anything else. The
-    edge is the maximum of the slope near that step (of parabolas through five points), and the white line the top
-    above it, if that stands out of the noise and of the curve's far end, continued.
+    is an edge where a step upwards at one of the energies improves the fit more than chance would in one of a million
+    such curves (Student's t of the step, times the number of its possible places), or where the curve differs from
+    Victoreen's by five times its noise, which is estimated from second differences. The edge is the maximum of the
+    slope near that step (of parabolas through five points). The white line is the maximum above it, if it exceeds the
+    noise and the extrapolation of the curve's far end.
 
     Args:
         energies: keV, rising, [n].
@@ -67,8 +67,8 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
     misfit = float(np.sqrt(np.mean(rest**2)))
     step, chance = _step(rest, basis)
 
-    def none(why: str) -> Edge:
-        return Edge(False, why, None, None, misfit, noise)
+    def none(reason: str) -> Edge:
+        return Edge(False, reason, None, None, misfit, noise)
 
     stands_out = chance < FALSE_ALARM or misfit > SURE * noise
     if not stands_out or misfit <= SMOOTH * float(np.abs(absorption).mean()):
@@ -86,16 +86,16 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
 
 
 def _step(rest: Reals, basis: Reals) -> tuple[int, float]:
-    """Where a step upwards explains most of what is left of a curve, and the chance that noise alone does as much: the
-    first energy above the step, and at most 1.
+    """The step upwards that explains most of a residual: the index of the first energy above it, and the probability
+    (at most 1) that noise alone explains as much.
 
     Args:
-        rest: [n], without what `basis` holds.
+        rest: [n], residual after a projection on `basis`.
         basis: orthonormal, [n, k].
     """
     at = np.arange(2, rest.size - 1)
     above, held = (np.cumsum(values[::-1], axis=0)[::-1][at] for values in (rest, basis))
-    free = np.maximum(rest.size - at - (held**2).sum(axis=1), 1e-9)  # of the step, squared: what no smooth curve has
+    free = np.maximum(rest.size - at - (held**2).sum(axis=1), 1e-9)  # squared norm outside of the basis
     gain = np.where(above > 0, above**2 / free, 0.0)
     best, left = int(np.argmax(gain)), rest.size - basis.shape[1] - 1
     noise = max(float(rest @ rest) - float(gain[best]), 0.0) / left
@@ -109,7 +109,7 @@ def _white_line(energies: Reals, absorption: Reals, edge: int, noise: float) -> 
     far = energies > (energies[top] + energies[-1]) / 2
     if top > energies.size - 3 or far.sum() < 3:
         return None
-    # The far end as a + b E^-3: what a long range falls by, the top of a bare step stands above the end as well.
+    # The far end as a + b E^-3: over a long range the top of a bare step is above the end, too.
     basis = _victoreen(energies)[:, :2]
     of_far = np.linalg.pinv(basis[far]).T @ basis[top]
     stands = float(absorption[top] - of_far @ absorption[far])

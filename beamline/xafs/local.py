@@ -9,8 +9,8 @@ Reals = NDArray[np.float64]
 
 
 def local_parabolas(x: Reals, y: Reals, window: int) -> tuple[Reals, Reals]:
-    """Value and slope at each x of the parabola through the nearest `window` points (Savitzky & Golay, Anal. Chem. 36,
-    1627, 1964, which these are where x is evenly spaced); both [n], of at least `window` points."""
+    """Value and slope at each x of the parabola through the nearest `window` points (for even spacing the filter of
+    Savitzky & Golay, Anal. Chem. 36, 1627, 1964); both [n], of at least `window` points."""
     values, slopes = np.empty_like(y), np.empty_like(y)
     for i in range(y.size):
         first = min(max(i - window // 2, 0), y.size - window)

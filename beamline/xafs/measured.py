@@ -1,4 +1,4 @@
-"""Measured: energies with absorption or radiographs, from a text table or an HDF5 file."""
+"""Measured: reads energies with absorption or radiographs, from a text table or an HDF5 file."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ Reals = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 
 EV_BEYOND, KEV_BELOW = 500.0, 0.05
-"""keV: an energy above the first was eV, one below the second was keV already; no beamline has such."""
+"""keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
 _KEV = {"keV": 1.0, "eV": 1e-3}
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Energies in keV and absorption, each [n], as they stand in a file."""
+    """Energies in keV and absorption of a file, each [n]."""
 
     energies: Reals
     absorption: Reals
 
 
 def read_table(path: Path, unit: str | None) -> Table:
-    """Two columns of text, energy and absorption, split by commas, semicolons, tabs or blanks; lines that begin with a
-    letter, # or % are left out. Where something else splits the columns, a comma may be the decimal point.
+    """Two columns of text, energy and absorption, separated by commas, semicolons, tabs or blanks; lines that begin
+    with a letter, # or % are skipped. With another separator the comma may be the decimal point.
 
     Args:
         unit: of the energy, "keV" or "eV"; None: keV.
 
     Raises:
-        DataError: it is not there, or not such a table.
+        DataError: it does not exist, or is not such a table.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -70,14 +70,15 @@ def _fields(line: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Which part of a file, and what it does not say itself.
+class FileOptions:
+    """The part of a file that is used, and properties that it does not state.
+
 
     Attributes:
         low, high: keV, the first and the last energy.
         region, around: (first row, row after the last, first column, column after the last) of the material, and of
-            what it is compared with, less the material; None: all of the frame, and nothing.
-        unit: of the energies, "keV" or "eV"; None: as the file says, else keV.
+            its surroundings, from which the material is excluded; None: all of the frame, and none.
+        unit: of the energies, "keV" or "eV"; None: as in the file, else keV.
         quantity: of the frames, "counts" or "line_integrals"; None: counts.
     """
 
@@ -90,38 +91,38 @@ class Asked:
 
 
 @contextmanager
-def open_series(path: Path, asked: Asked) -> Iterator[Series | Curve]:
-    """A file's curve, or the radiographs that make one, while it is open.
+def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
+    """The curve or the radiographs of a file, which is open within the context.
 
     Raises:
-        ConfigError: a region is not in the frame, or there is nothing around it.
-        DataError: it is no such file, see `open_measured`, or an energy is there twice.
+        ConfigError: a region is not in the frame, or has no surroundings.
+        DataError: not such a file, see `open_measured`, or an energy occurs twice.
     """
-    with open_measured(path, asked.unit, asked.quantity) as found:
-        order = np.argsort(found.energies, kind="stable")
-        kept = order[(found.energies[order] >= asked.low) & (found.energies[order] <= asked.high)]
-        energies = found.energies[kept]
+    with open_measured(path, options.unit, options.quantity) as source:
+        order = np.argsort(source.energies, kind="stable")
+        kept = order[(source.energies[order] >= options.low) & (source.energies[order] <= options.high)]
+        energies = source.energies[kept]
         if not (rises := np.diff(energies) > 0).all():
             raise DataError(
-                f"{path}: {energies[np.argmin(rises)]:.9g} keV is there more than once; take the mean of what belongs "
-                "to one energy. Nothing was written."
+                f"{path}: {energies[np.argmin(rises)]:.9g} keV occurs more than once; average the values of "
+                "each energy. Nothing was written."
             )
-        if isinstance(found, Table):
-            if asked.region or asked.around:
-                raise ConfigError(f"{path} holds no frames, so that regions say nothing of it. Nothing was written.")
-            yield Curve(energies, found.absorption[kept], unit="as in the file")
+        if isinstance(source, Table):
+            if options.region or options.around:
+                raise ConfigError(f"{path} has no frames, so that regions do not apply. Nothing was written.")
+            yield Curve(energies, source.absorption[kept], unit="as in the file")
             return
-        inside = _mask(found.shape, asked.region or (0, found.shape[0], 0, found.shape[1]))
-        around = None if asked.around is None else _mask(found.shape, asked.around) & ~inside
+        inside = _mask(source.shape, options.region or (0, source.shape[0], 0, source.shape[1]))
+        around = None if options.around is None else _mask(source.shape, options.around) & ~inside
         if around is not None and not around.any():
             raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
         part = _bounds(inside if around is None else inside | around)
         regions = Regions(inside[part], None if around is None else around[part])
-        yield Series(path.name, kept.size, found.line_integrals(kept.tolist(), part), regions)
+        yield Series(path.name, kept.size, source.line_integrals(kept.tolist(), part), regions)
 
 
 def _bounds(mask: NDArray[np.bool_]) -> Part:
-    """The rows and columns that hold it and the pixels next to it: no more of a frame is read."""
+    """The rows and columns of the mask and its neighbouring pixels: no more of a frame is read."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
 
@@ -143,11 +144,11 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
     ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]).
 
     Args:
-        unit: of the energies, "keV" or "eV"; None: as the dataset says, else keV.
+        unit: of the energies, "keV" or "eV"; None: as in the dataset, else keV.
         quantity: "line_integrals" where frames need no flats.
 
     Raises:
-        DataError: it is not such a file.
+        DataError: not such a file.
     """
     if path.is_file() and not h5py.is_hdf5(path):
         yield read_table(path, unit)
@@ -164,7 +165,7 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
             flats = None
         elif flats is None:
             raise DataError(
-                f"{path}: frames without flats may be counts or line integrals. Add flats, or say --quantity "
+                f"{path}: frames without flats may be counts or line integrals. Add flats, or give --quantity "
                 "line-integrals."
             )
         elif flats.shape not in (frames.shape, frames.shape[1:]):
@@ -174,10 +175,10 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
 
 def _energies(path: Path, file: h5py.File, unit: str | None) -> Reals:
     item = _needed(path, file, "energy")
-    if unit is None and (said := hdf5.attribute(item, "units").lower()):
-        unit = {"kev": "keV", "ev": "eV"}.get(said)
+    if unit is None and (stated := hdf5.attribute(item, "units").lower()):
+        unit = {"kev": "keV", "ev": "eV"}.get(stated)
         if unit is None:
-            raise DataError(f"{path}: energies are in {said!r}, which is neither keV nor eV; say --unit.")
+            raise DataError(f"{path}: energies are in {stated!r}, which is neither keV nor eV; give --unit.")
     return _in_kev(path, reals(item[()]).reshape(-1), unit)
 
 
@@ -229,6 +230,6 @@ def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
     if not KEV_BELOW <= low <= high <= EV_BEYOND:
         other = "keV" if high < EV_BEYOND and unit == "eV" else "eV"
         raise DataError(
-            f"{path}: energies from {low:g} to {high:g} keV cannot be; where they are {other}, say --unit {other}."
+            f"{path}: energies from {low:g} to {high:g} keV are impossible; if they are {other}, give --unit {other}."
         )
     return energies

@@ -1,4 +1,4 @@
-"""Radiographs: frames over energies in an HDF5 file, read one by one, and of each no more than is asked for."""
+"""Radiographs: frames over energies in an HDF5 file, read one by one, only the requested part of each."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Radiographs:
 
     def line_integrals(self, which: Sequence[int], part: Part = EVERYTHING) -> Iterator[tuple[float, Reals]]:
         """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each; +inf where no light
-        came through, NaN where nothing is known, as of whole numbers that are the largest of their type.
+        was transmitted, NaN without a value, also for integers that are the largest of their type.
 
         Raises:
-            DataError: the file does not give what it holds.
+            DataError: the file cannot be read.
         """
         try:
             dark = _mean(self.darks, part)
@@ -56,12 +56,12 @@ class Radiographs:
                     own = _counts(self.flats[i, part[0], part[1]]) - dark if flat is None else flat
                     frame = line_integrals(frame - dark, own)
                 yield float(self.energies[i]), frame
-        except OSError as error:  # what h5py makes of HDF5's errors
+        except OSError as error:  # h5py's form of HDF5's errors
             raise DataError(f"{self.frames.file.filename} cannot be read ({hdf5.reason(error)}).") from error
 
 
 def _mean(item: h5py.Dataset | None, part: Part) -> Reals:
-    """Of the one frame or the several that a dataset holds, one after the other; 0 where there is none."""
+    """Mean of the frame or frames of a dataset, read one by one; 0 without a dataset."""
     if item is None:
         return np.zeros(1)
     if item.ndim == 2:
@@ -75,7 +75,7 @@ def reals(values: Any) -> Reals:
 
 
 def _counts(values: Any) -> Reals:
-    """NaN where whole numbers are the largest that their type holds: the sensor may have had more."""
+    """NaN where integers are the largest of their type: the pixel may be saturated."""
     found = reals(values)
     if values.dtype.kind in "ui":
         found[values == np.iinfo(values.dtype).max] = np.nan

@@ -1,4 +1,4 @@
-"""Results: what an energy scan shows, as sentences, as a table and as a picture."""
+"""Results: an energy scan's result as sentences, as a table and as a picture."""
 
 from __future__ import annotations
 
@@ -20,37 +20,39 @@ from beamline.xafs.edge import Edge
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Attributes:
-    what: whose absorption it is.
+class XafsResult:
+    """The curve of an energy scan and its edge.
+
+    Attributes:
+        title: what was scanned.
     """
 
-    what: str
+    title: str
     curve: Curve
     edge: Edge
 
     @property
-    def by(self) -> str:
-        """What the best energy is best in."""
+    def criterion(self) -> str:
+        """The quantity that is largest at the best energy."""
         return "absorption" if self.curve.contrast_to_noise is None else "contrast-to-noise"
 
     def data(self) -> dict[str, Any]:
-        """For programs; energies in keV."""
+        """Values for programs; energies in keV."""
         curve, edge = self.curve, self.edge
         first, last = curve.nearly_best
         cnr = curve.contrast_to_noise
         return {
-            "what": self.what,
+            "what": self.title,
             "n_energies": curve.energies.size,
             "n_left_out": curve.left_out.size,
             "from_kev": curve.energies[0],
             "to_kev": curve.energies[-1],
-            "edge_seen": edge.seen,
-            "why_not": edge.why or None,
+            "edge_seen": edge.found,
+            "why_not": edge.reason or None,
             "edge_kev": edge.energy,
             "white_line_kev": edge.white_line,
             "best_kev": curve.energies[curve.best],
-            "best_by": self.by,
+            "best_by": self.criterion,
             "best_from_kev": first,
             "best_to_kev": last,
             "contrast_to_noise": None if cnr is None else cnr[curve.best],
@@ -60,33 +62,33 @@ class Found:
         }
 
 
-def lines(found: Found) -> list[str]:
-    """For people."""
-    curve, edge = found.curve, found.edge
-    said = [f"{found.what}: {curve.energies.size} energies, {curve.energies[0]:.4f} to {curve.energies[-1]:.4f} keV"]
+def lines(result: XafsResult) -> list[str]:
+    """Sentences for people."""
+    curve, edge = result.curve, result.edge
+    text = [f"{result.title}: {curve.energies.size} energies, {curve.energies[0]:.4f} to {curve.energies[-1]:.4f} keV"]
     if curve.left_out.size:
-        said.append(f"left out    {left_out(curve)}")
+        text.append(f"left out    {left_out(curve)}")
     if edge.energy is None:
-        said.append(f"no edge     {edge.why}")
+        text.append(f"no edge     {edge.reason}")
     else:
-        said.append(f"edge        {edge.energy:.4f} keV, where the absorption rises most steeply")
-        said.append(
+        text.append(f"edge        {edge.energy:.4f} keV, where the absorption rises most steeply")
+        text.append(
             "white line  none above the edge within the range"
             if edge.white_line is None
             else f"white line  {edge.white_line:.4f} keV, the top of the absorption"
         )
     first, last = curve.nearly_best
     cnr = curve.contrast_to_noise
-    height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel, as thick as it is"
-    said.append(
-        f"best        {curve.energies[curve.best]:.4f} keV: highest {found.by}{height} "
+    height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel at this thickness"
+    text.append(
+        f"best        {curve.energies[curve.best]:.4f} keV: highest {result.criterion}{height} "
         f"(95 % of it from {first:.4f} to {last:.4f} keV)"
     )
-    return said
+    return text
 
 
 def left_out(curve: Curve) -> str:
-    """At how many energies nothing is known of a region, and where these are."""
+    """The energies that are left out, as a sentence."""
     e = curve.left_out
     where = f"{e[0]:.4f} keV" if e.size == 1 else f"{e.size} energies between {e[0]:.4f} and {e[-1]:.4f} keV"
     return f"{where}: too dark, too bright for the sensor, or without values"
@@ -106,14 +108,14 @@ def table(curve: Curve) -> str:
     return out.getvalue()
 
 
-def picture(found: Found) -> bytes:
+def picture(result: XafsResult) -> bytes:
     """PNG: the absorption over energy with edge, white line and best energy, and the contrast-to-noise below."""
-    curve, edge, cnr = found.curve, found.edge, found.curve.contrast_to_noise
+    curve, edge, cnr = result.curve, result.edge, result.curve.contrast_to_noise
     figure = Figure(figsize=(8.6, 3.4 if cnr is None else 5.4), dpi=110, layout="constrained")
     panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(1 if cnr is None else 2, 1, sharex=True))))
     top = panels[0]
     top.plot(curve.energies, curve.absorption, color="0.25", lw=1.2, marker=".", ms=3)
-    top.set(ylabel=f"absorption ({curve.unit})", title=found.what)
+    top.set(ylabel=f"absorption ({curve.unit})", title=result.title)
     if cnr is not None:
         panels[1].plot(curve.energies, cnr, color="tab:green", lw=1.2, marker=".", ms=3)
         panels[1].set(ylabel="contrast-to-noise a pixel")
@@ -130,12 +132,12 @@ def picture(found: Found) -> bytes:
             if energy is not None:
                 axes.axvline(energy, color=colour, lw=1.1, ls="--", label=f"{name} {energy:.4f} keV")
         axes.grid(alpha=0.3)
-    top.legend(fontsize=8, title=None if edge.seen else "no edge seen")
+    top.legend(fontsize=8, title=None if edge.found else "no edge found")
     return png(figure)
 
 
 def table_beside(target: Path) -> Path:
-    """Where the table of a picture stands."""
+    """Path of the table that belongs to a picture."""
     return target.with_suffix(".csv")
 
 
@@ -145,14 +147,14 @@ def refuse_existing_results(target: Path) -> None:
         refuse_existing(path)
 
 
-def write(found: Found, target: Path) -> None:
+def write(result: XafsResult, target: Path) -> None:
     """The picture and the table beside it.
 
     Raises:
         DataError: one of them exists, or the disk refuses; then neither is there.
     """
     with ExitStack() as undo:
-        for path, content in ((target, picture(found)), (table_beside(target), table(found.curve).encode())):
+        for path, content in ((target, picture(result)), (table_beside(target), table(result.curve).encode())):
             with named_on_failure(path), whole_file(path) as partial:
                 partial.write_bytes(content)
             undo.callback(path.unlink)

@@ -60,7 +60,7 @@ def test_where_there_is_no_edge_it_says_so(folder: Path) -> None:
     result = _beamline("edge_scan", "--from", "8.25", "--to", "8.29", "--step", "0.002", "-o", "far.png")
     assert result.exit_code == 6, result.output
     assert "no edge     the curve is as smooth as one without an edge" in result.stdout
-    assert "beamline: No absorption edge is seen" in result.stderr
+    assert "beamline: No absorption edge was found" in result.stderr
     assert _left(folder) == {"far.png", "far.csv"}
 
 
@@ -85,7 +85,7 @@ def test_measured_radiographs(folder: Path) -> None:
 def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
     folder: Path, monkeypatch: pytest.MonkeyPatch, energies: int, left: set[str]
 ) -> None:
-    taken = xafs.take
+    run_series = xafs.run_series
 
     def interrupted(series, sink, clock, stopped):  # type: ignore[no-untyped-def]
         def frames():  # type: ignore[no-untyped-def]
@@ -94,9 +94,9 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
                     signal.raise_signal(signal.SIGINT)
                 yield frame
 
-        return taken(xafs.Series(series.what, series.n, frames(), series.regions), sink, clock, stopped)
+        return run_series(xafs.Series(series.title, series.n, frames(), series.regions), sink, clock, stopped)
 
-    monkeypatch.setattr(xafs, "take", interrupted)
+    monkeypatch.setattr(xafs, "run_series", interrupted)
     result = _beamline("edge_scan", "--from", "8.335", "--to", "8.365")
     assert result.exit_code == 4, result.output
     assert f"Stopped after {energies} energies" in result.stderr
@@ -113,16 +113,16 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
         (["edge_scan", "--from", "nan", "--to", "9"], 2, "not a finite number"),
         (["edge_scan", "--from", "8.3", "--to", "8.4", "--region", "0:1,0:1"], 2, "--region is for measured files"),
         (["mu.csv", "--material", "Cu"], 2, "--material is for scenes"),
-        (["mu.csv"], 5, "say --unit eV"),
+        (["mu.csv"], 5, "give --unit eV"),
         (["mu.csv", "--unit", "eV", "--from", "8.395"], 5, "too few for an edge, which takes 9"),
         (["scan.h5", "--from", "9"], 5, "0 energies between --from and --to are too few for an edge, which takes 9"),
         (["scan.h5", "--from", "8.35", "--to", "8.34"], 5, "0 energies between"),
         (["scan.h5", "--region", "5:4,0:1"], 2, "is not ROW:END,COL:END"),
         (["scan.h5", "--region", "0:99,0:1"], 2, "is not in frames of 20 x 24 pixels"),
-        (["plain", "--from", "8.3", "--to", "8.4"], 2, "names a material"),
+        (["plain", "--from", "8.3", "--to", "8.4"], 2, "has a material"),
         (["nowhere", "--from", "8.3", "--to", "8.4"], 2, "There is no scene nowhere"),
         (["nowhere.h5"], 5, "nowhere.h5 is not there"),
-        (["mu.csv", "--unit", "eV", "-o", "it.jpg"], 2, "name a .png file"),
+        (["mu.csv", "--unit", "eV", "-o", "it.jpg"], 2, "give a .png file"),
         (["mu.csv", "--unit", "eV", "-o", "no/it.png"], 5, "does not exist"),
     ],
 )

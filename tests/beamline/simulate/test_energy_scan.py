@@ -12,7 +12,7 @@ import yaml
 from beamline.core.errors import ConfigError
 from beamline.simulate.energy_scan import open_energy_scan
 from beamline.xafs.edge import find_edge
-from beamline.xafs.series import take
+from beamline.xafs.series import run_series
 from drivers.clock import SystemClock
 from simulators.light.palette import palette_of
 
@@ -82,7 +82,7 @@ def test_a_series_of_charges_moves_the_edge_as_the_radiographs_show_it(tmp_path:
     for charge in (0.0, 0.5, 1.0):
         phantom = SCENE["phantom"] | {"materials": {"NMC811": {"state_of_charge": charge}}}
         series = open_energy_scan(_scene(tmp_path, phantom=phantom), energies).series()
-        curve = take(series, lambda event: None, SystemClock(), lambda: False).curve
+        curve = run_series(series, lambda event: None, SystemClock(), lambda: False).curve
         found.append(find_edge(curve.energies, curve.absorption))
     lines, edges = np.array([(edge.white_line, edge.energy) for edge in found]).T
     np.testing.assert_allclose(lines, [8.3465, 8.3475, 8.3485], atol=2.5e-4)
@@ -96,11 +96,11 @@ def test_energies_at_which_nothing_comes_through_are_left_out(tmp_path: Path) ->
     phantom = SCENE["phantom"] | {"solids": [bar]}
     path = _scene(tmp_path, phantom=phantom, effects=["photon_noise"])
     energies = np.arange(8.320, 8.365, 0.001)
-    taken = take(open_energy_scan(path, energies).series(), lambda event: None, SystemClock(), lambda: False)
-    assert taken.curve.energies.size >= 9 and taken.curve.energies.max() < 8.344
-    assert taken.curve.left_out.min() > 8.335 and taken.curve.left_out.max() == pytest.approx(8.364)
-    expected = palette_of("", SCENE["phantom"]["materials"])("NMC811").attenuation(taken.curve.energies[:5])
-    np.testing.assert_allclose(taken.curve.absorption[:5], expected, rtol=0.02)
+    run = run_series(open_energy_scan(path, energies).series(), lambda event: None, SystemClock(), lambda: False)
+    assert run.curve.energies.size >= 9 and run.curve.energies.max() < 8.344
+    assert run.curve.left_out.min() > 8.335 and run.curve.left_out.max() == pytest.approx(8.364)
+    expected = palette_of("", SCENE["phantom"]["materials"])("NMC811").attenuation(run.curve.energies[:5])
+    np.testing.assert_allclose(run.curve.absorption[:5], expected, rtol=0.02)
 
 
 def test_noise_is_the_seed_s(tmp_path: Path) -> None:
@@ -115,8 +115,8 @@ def test_noise_is_the_seed_s(tmp_path: Path) -> None:
 def test_a_beam_too_bright_for_the_sensor_tells_nothing(tmp_path: Path) -> None:
     """5e4 electrons where 7000 are the most: clipped flats would put the edge 4 eV too high."""
     path = _scene(tmp_path, beam=SCENE["beam"] | {"photons_per_s": 5e5})
-    taken = take(open_energy_scan(path, ENERGIES).series(), lambda event: None, SystemClock(), lambda: False)
-    assert (taken.curve.energies.size, taken.curve.left_out.size) == (0, 3)
+    run = run_series(open_energy_scan(path, ENERGIES).series(), lambda event: None, SystemClock(), lambda: False)
+    assert (run.curve.energies.size, run.curve.left_out.size) == (0, 3)
 
 
 def test_harmonics_beyond_the_tables_are_refused_before_anything_is_simulated(tmp_path: Path) -> None:
@@ -129,12 +129,12 @@ def test_harmonics_beyond_the_tables_are_refused_before_anything_is_simulated(tm
     ("changes", "material", "words"),
     [
         ({"phantom": {"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 1], "attenuation": 1}]}}, None,
-         "no solid of the sample names a material, so that it is alike at every energy"),
+         "no solid of the sample has a material, so that it is the same at every energy"),
         ({"phantom": SCENE["phantom"] | {"materials": {}}}, None, "0 materials of the scene have a state_of_charge"),
         ({}, "Cu", "The scene has no material 'Cu'; it has electrolyte, NMC811"),
         ({"beam": {"photons_per_s": 1}}, None, "materials need the beam's energy"),
         ({"detector": {"shape": [4, 4], "pixel_size_um": 0.1}, "axis_offset_px": 3000.0}, None,
-         "NMC811 cannot be compared: nothing of it is in the field of view"),
+         "NMC811 cannot be compared: it is not in the field of view"),
     ],
 )  # fmt: skip
 def test_scenes_that_cannot_be_scanned_are_refused(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beamline.xafs.contrast import Curve, Regions, curve_of, measured
+from beamline.xafs.contrast import Curve, Regions, contrast_of, curve_of
 
 ROWS, COLS = np.mgrid[:80, :90].astype(np.float64)
 INSIDE = np.hypot(ROWS - 40, COLS - 45) < 20
@@ -17,16 +17,16 @@ def test_contrast_and_noise_of_a_disk_on_a_slope() -> None:
     rng = np.random.default_rng(1)
     smooth = 0.3 + 1.5 * INSIDE + 0.002 * ROWS + 0.001 * COLS + 1e-5 * ROWS * COLS
     frame = smooth + rng.normal(0, 0.03, ROWS.shape) * INSIDE + rng.normal(0, 0.01, ROWS.shape) * ~INSIDE
-    contrast, noise = measured(frame, Regions(INSIDE, AROUND))
+    contrast, noise = contrast_of(frame, Regions(INSIDE, AROUND))
     assert contrast == pytest.approx(smooth[INSIDE].mean() - smooth[AROUND].mean(), abs=0.003)
     assert noise == pytest.approx(np.hypot(0.03, 0.01), rel=0.1)
-    level, own = measured(frame, Regions(INSIDE))
+    level, own = contrast_of(frame, Regions(INSIDE))
     assert (level, own) == (pytest.approx(frame[INSIDE].mean()), pytest.approx(0.03, rel=0.1))
 
 
 def test_a_frame_without_noise_has_none() -> None:
     frame = 0.3 + 0.01 * ROWS
-    assert measured(frame, Regions(INSIDE, AROUND))[1] == pytest.approx(0.0, abs=1e-12)
+    assert contrast_of(frame, Regions(INSIDE, AROUND))[1] == pytest.approx(0.0, abs=1e-12)
     curve = Curve(np.arange(9.0), np.arange(9.0), np.arange(9.0), np.zeros(9))
     assert curve.contrast_to_noise is None and curve.best == 8
 
@@ -63,16 +63,16 @@ def test_a_dark_material_stands_out_as_a_bright_one_does() -> None:
 def test_dead_pixels_count_for_nothing_and_a_region_without_light_is_not_told() -> None:
     rng = np.random.default_rng(1)
     frame = 0.3 + 1.5 * INSIDE + rng.normal(0, 0.01, ROWS.shape)
-    clean, noise = measured(frame, Regions(INSIDE, AROUND))
+    clean, noise = contrast_of(frame, Regions(INSIDE, AROUND))
     dead = np.where(rng.random(ROWS.shape) < 0.1, np.nan, frame)
-    assert measured(dead, Regions(INSIDE, AROUND)) == (
+    assert contrast_of(dead, Regions(INSIDE, AROUND)) == (
         pytest.approx(clean, abs=0.002),
         pytest.approx(noise, rel=0.2),
     )
-    assert np.isnan(measured(np.where(rng.random(ROWS.shape) < 0.6, np.nan, frame), Regions(INSIDE))).all()
+    assert np.isnan(contrast_of(np.where(rng.random(ROWS.shape) < 0.6, np.nan, frame), Regions(INSIDE))).all()
     for share, told in ((0.003, True), (0.03, False)):
         dark = np.where(rng.random(ROWS.shape) < share, np.inf, frame)
-        contrast, _ = measured(dark, Regions(INSIDE, AROUND))
+        contrast, _ = contrast_of(dark, Regions(INSIDE, AROUND))
         assert contrast == pytest.approx(clean, abs=0.002) if told else np.isnan(contrast)
 
 
@@ -89,7 +89,7 @@ def test_a_few_pixels_tell_a_contrast_and_no_noise() -> None:
     """The noise of one pixel is any number; which energy is best must not hang on it."""
     few = np.zeros_like(INSIDE)
     few[40, 45:48] = True
-    level, noise = measured(0.3 + 0.01 * ROWS, Regions(few))
+    level, noise = contrast_of(0.3 + 0.01 * ROWS, Regions(few))
     assert level == pytest.approx(0.7) and np.isnan(noise)
     curve = curve_of(np.array([8.0, 8.1]), [(0.4, 0.1), (0.5, np.nan)], Regions(few))
     assert curve.noise is None and curve.contrast_to_noise is None and curve.best == 1
@@ -101,7 +101,7 @@ def test_only_the_region_s_own_part_of_a_frame_matters(corner: tuple[int, int]) 
     region = np.zeros_like(INSIDE)
     region[corner[0] : corner[0] + 10, corner[1] : corner[1] + 10] = True
     part = slice(max(corner[0] - 1, 0), corner[0] + 11), slice(max(corner[1] - 1, 0), corner[1] + 11)
-    assert measured(frame, Regions(region)) == measured(frame[part], Regions(region[part]))
+    assert contrast_of(frame, Regions(region)) == contrast_of(frame[part], Regions(region[part]))
 
 
 def test_an_empty_region_is_refused() -> None:

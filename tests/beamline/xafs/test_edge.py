@@ -35,7 +35,7 @@ def test_edge_and_white_line_are_found_within_half_a_step_and_a_bit(
     energies = np.arange(8.30, 8.40, step)
     curve = _curve(energies, edge) + np.random.default_rng(seed).normal(0, noise, energies.size)
     found = find_edge(energies, curve)
-    assert found.seen and found.why == ""
+    assert found.found and found.reason == ""
     assert found.energy == pytest.approx(edge, abs=max(step, 0.0006))
     assert found.white_line == pytest.approx(edge + 0.006, abs=max(step / 2, 0.0005))
 
@@ -59,7 +59,7 @@ def test_the_spacing_may_be_uneven() -> None:
 def test_an_edge_without_a_white_line_has_none() -> None:
     energies = np.arange(8.30, 8.40, 0.001)
     found = find_edge(energies, _curve(energies, 8.343, line=0.0))
-    assert found.seen and found.energy == pytest.approx(8.343, abs=0.0005)
+    assert found.found and found.energy == pytest.approx(8.343, abs=0.0005)
     assert found.white_line is None
 
 
@@ -72,15 +72,15 @@ def test_a_curve_without_an_edge_has_none(low: float, width: float, noise: float
     """Whatever the noise: a false alarm in a million curves."""
     energies = np.linspace(low, low + width, 121)
     found = find_edge(energies, _smooth(energies) + np.random.default_rng(seed).normal(0, noise, 121))
-    assert not found.seen
+    assert not found.found
     assert (found.energy, found.white_line) == (None, None)
-    assert "as smooth as one without an edge" in found.why
+    assert "as smooth as one without an edge" in found.reason
 
 
 def test_an_edge_at_the_end_of_the_range_is_told_apart() -> None:
     for energies in (np.arange(8.30, 8.344, 0.001), np.arange(8.3437, 8.40, 0.001)):
         found = find_edge(energies, _curve(energies, 8.3437))
-        assert not found.seen and "steepest at the end of the range; widen the range" in found.why
+        assert not found.found and "steepest at the end of the range; widen the range" in found.reason
 
 
 @pytest.mark.parametrize("line", [0.0, 0.6])
@@ -90,7 +90,7 @@ def test_an_edge_of_six_times_the_noise_is_seen(line: float) -> None:
     for seed in range(20):
         noise = np.random.default_rng(seed).normal(0, 1 / 6, energies.size)
         found = find_edge(energies, _curve(energies, 8.3437, line, jump=1.0) + noise)
-        assert found.seen and found.energy == pytest.approx(8.3437, abs=0.004)
+        assert found.found and found.energy == pytest.approx(8.3437, abs=0.004)
 
 
 @pytest.mark.parametrize("n", [LEAST, 40])
@@ -120,7 +120,7 @@ def test_what_only_falls_has_no_edge() -> None:
     energies = np.arange(8.30, 8.40, 0.001)
     fall = -np.arctan((energies - 8.35) * 1e3 / 2) - 20 * (energies - 8.3)
     found = find_edge(energies, fall)
-    assert not found.seen and found.why == "the absorption rises nowhere"
+    assert not found.found and found.reason == "the absorption rises nowhere"
 
 
 def test_the_noise_is_that_of_the_curve() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.xafs.contrast import Curve
-from beamline.xafs.measured import Asked, Radiographs, Table, open_measured, open_series
+from beamline.xafs.measured import FileOptions, Radiographs, Table, open_measured, open_series
 from beamline.xafs.series import Series
 
 ENERGIES = np.linspace(8.3, 8.4, 11)
@@ -60,12 +60,14 @@ def test_energies_in_ev_are_read_where_it_is_said(tmp_path: Path) -> None:
     with open_measured(tmp_path / "mu.csv", "eV", None) as table:
         np.testing.assert_allclose(table.energies, [8.3, 8.31])
     with (
-        pytest.raises(DataError, match=r"energies from 0.0083 to 0.00831 keV cannot be; .* are keV, say --unit keV"),
+        pytest.raises(
+            DataError, match=r"energies from 0.0083 to 0.00831 keV are impossible; .* are keV, give --unit keV"
+        ),
         open_measured(_text(tmp_path / "kev.csv", "8.30 1\n8.31 2"), "eV", None),
     ):
         pass
     with (
-        pytest.raises(DataError, match="energies from 8300 to 8310 keV cannot be; where they are eV, say --unit eV"),
+        pytest.raises(DataError, match="energies from 8300 to 8310 keV are impossible; if they are eV, give --unit eV"),
         open_measured(tmp_path / "mu.csv", None, None),
     ):
         pass
@@ -108,34 +110,34 @@ def test_a_series_is_of_the_range_and_regions_asked_for(tmp_path: Path) -> None:
     content = _counts()
     back = {name: content[name][::-1] for name in ("energy", "frames")}
     path = _hdf5(tmp_path / "scan.h5", **content | back)
-    with open_series(path, Asked(8.325, 8.365, region=(1, 4, 2, 6), around=(4, 6, 0, 8))) as series:
+    with open_series(path, FileOptions(8.325, 8.365, region=(1, 4, 2, 6), around=(4, 6, 0, 8))) as series:
         assert isinstance(series, Series)
-        assert (series.what, series.n) == ("scan.h5", 4)
+        assert (series.title, series.n) == ("scan.h5", 4)
         np.testing.assert_allclose([energy for energy, _ in series.frames], [8.33, 8.34, 8.35, 8.36])
         assert series.regions.inside.sum() == 12
         assert series.regions.around is not None and series.regions.around.sum() == 16
-    with open_series(path, Asked(region=(3, 4, 2, 3), around=(2, 5, 2, 3))) as part:
+    with open_series(path, FileOptions(region=(3, 4, 2, 3), around=(2, 5, 2, 3))) as part:
         assert isinstance(part, Series) and part.regions.around is not None
         np.testing.assert_array_equal(np.argwhere(part.regions.inside), [[2, 1]])
         np.testing.assert_array_equal(np.argwhere(part.regions.around), [[1, 1], [3, 1]])  # the material is not around
         assert [frame.shape for _, frame in part.frames] == [(5, 3)] * 11  # no more of a frame is read
     with (
         pytest.raises(ConfigError, match="no pixel outside of"),
-        open_series(path, Asked(region=(0, 2, 0, 2), around=(0, 1, 0, 1))),
+        open_series(path, FileOptions(region=(0, 2, 0, 2), around=(0, 1, 0, 1))),
     ):
         pass
-    with open_series(path, Asked()) as whole:
+    with open_series(path, FileOptions()) as whole:
         assert isinstance(whole, Series) and whole.regions.inside.all() and whole.regions.around is None
 
 
 def test_a_table_is_a_curve_already(tmp_path: Path) -> None:
     (tmp_path / "mu.txt").write_text("8.32 3\n8.30 1\n8.31 2\n8.4 9", encoding="utf-8")
-    with open_series(tmp_path / "mu.txt", Asked(high=8.35)) as curve:
+    with open_series(tmp_path / "mu.txt", FileOptions(high=8.35)) as curve:
         assert isinstance(curve, Curve)
         assert (curve.energies.tolist(), curve.absorption.tolist()) == ([8.30, 8.31, 8.32], [1.0, 2.0, 3.0])
     with (
-        pytest.raises(ConfigError, match="holds no frames"),
-        open_series(tmp_path / "mu.txt", Asked(region=(0, 1, 0, 1))),
+        pytest.raises(ConfigError, match="has no frames"),
+        open_series(tmp_path / "mu.txt", FileOptions(region=(0, 1, 0, 1))),
     ):
         pass
 
@@ -149,7 +151,7 @@ def _without(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
     [
         (_without("energy"), "has no dataset energy"),
         (_without("frames"), "has no dataset frames"),
-        (_without("flats"), "may be counts or line integrals. Add flats, or say --quantity line-integrals"),
+        (_without("flats"), "may be counts or line integrals. Add flats, or give --quantity line-integrals"),
         (lambda c: c | {"frames": c["frames"][1:]}, r"they must be \[energy, row, col\] of 11"),
         (lambda c: c | {"flats": c["flats"][1:]}, r"flats are \(10, 6, 8\); they must be \(11, 6, 8\) or \(6, 8\)"),
         (lambda c: c | {"darks": np.zeros((6, 9))}, r"darks are \(6, 9\)"),
@@ -177,7 +179,10 @@ def test_an_energy_that_is_there_twice_is_named(tmp_path: Path, table: bool) -> 
         path = _text(tmp_path / "mu.csv", "\n".join(f"{e} 1" for e in twice))
     else:
         path = _hdf5(tmp_path / "scan.h5", **_counts() | {"energy": twice})
-    with pytest.raises(DataError, match=r"8.34 keV is there more than once; take the mean"), open_series(path, Asked()):
+    with (
+        pytest.raises(DataError, match=r"8.34 keV occurs more than once; average"),
+        open_series(path, FileOptions()),
+    ):
         pass
 
 
@@ -222,6 +227,6 @@ def test_other_units_missing_files_and_text_are_refused(tmp_path: Path) -> None:
         pass
     with (
         pytest.raises(ConfigError, match="The region 0:7,0:8 is not in frames of 6 x 8 pixels"),
-        open_series(_hdf5(tmp_path / "good.h5", **_counts()), Asked(region=(0, 7, 0, 8))),
+        open_series(_hdf5(tmp_path / "good.h5", **_counts()), FileOptions(region=(0, 7, 0, 8))),
     ):
         pass

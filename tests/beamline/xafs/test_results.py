@@ -12,12 +12,12 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import Edge
-from beamline.xafs.results import Found, lines, refuse_existing_results, table, write
+from beamline.xafs.results import XafsResult, lines, refuse_existing_results, table, write
 
 ENERGIES = np.linspace(8.30, 8.40, 11)
 ABSORPTION = np.linspace(1.0, 2.0, 11)
 SEEN = Edge(True, "", 8.3437, 8.3485, 0.2, 0.01)
-FOUND = Found("NMC811", Curve(ENERGIES, ABSORPTION, 0.1 * ABSORPTION, np.full(11, 0.01), "1/mm"), SEEN)
+FOUND = XafsResult("NMC811", Curve(ENERGIES, ABSORPTION, 0.1 * ABSORPTION, np.full(11, 0.01), "1/mm"), SEEN)
 
 
 def test_people_are_told_edge_line_and_best() -> None:
@@ -25,7 +25,7 @@ def test_people_are_told_edge_line_and_best() -> None:
         "NMC811: 11 energies, 8.3000 to 8.4000 keV",
         "edge        8.3437 keV, where the absorption rises most steeply",
         "white line  8.3485 keV, the top of the absorption",
-        "best        8.4000 keV: highest contrast-to-noise of 20 a pixel, as thick as it is "
+        "best        8.4000 keV: highest contrast-to-noise of 20 a pixel at this thickness "
         "(95 % of it from 8.3900 to 8.4000 keV)",
     ]
     bare = replace(FOUND, edge=replace(SEEN, white_line=None), curve=Curve(ENERGIES, ABSORPTION))

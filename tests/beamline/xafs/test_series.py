@@ -6,7 +6,7 @@ import numpy as np
 
 from beamline.core.events import Event
 from beamline.xafs.contrast import Regions
-from beamline.xafs.series import Series, take
+from beamline.xafs.series import Series, run_series
 from drivers.clock import SystemClock
 
 REGIONS = Regions(np.ones((4, 5), dtype=np.bool_))
@@ -15,10 +15,10 @@ FRAMES = [(8.0 + 0.1 * k, np.full((4, 5), float(k))) for k in range(6)]
 
 def test_a_series_becomes_a_curve_and_says_how_far_it_is() -> None:
     events: list[Event] = []
-    taken = take(Series("it", 6, reversed(FRAMES), REGIONS), events.append, SystemClock(), lambda: False)
-    assert not taken.cut
-    np.testing.assert_allclose(taken.curve.energies, 8.0 + 0.1 * np.arange(6))
-    np.testing.assert_array_equal(taken.curve.absorption, np.arange(6.0))
+    run = run_series(Series("it", 6, reversed(FRAMES), REGIONS), events.append, SystemClock(), lambda: False)
+    assert not run.stopped
+    np.testing.assert_allclose(run.curve.energies, 8.0 + 0.1 * np.arange(6))
+    np.testing.assert_array_equal(run.curve.absorption, np.arange(6.0))
     assert (events[-1].event, events[-1].data["stage"], events[-1].data["n"], events[-1].data["of"]) == (
         "progress", "xafs", 6, 6,
     )  # fmt: skip
@@ -26,10 +26,10 @@ def test_a_series_becomes_a_curve_and_says_how_far_it_is() -> None:
 
 def test_an_early_end_keeps_the_energies_so_far() -> None:
     asked = iter([False, False, True])
-    taken = take(Series("it", 6, iter(FRAMES), REGIONS), lambda event: None, SystemClock(), lambda: next(asked))
-    assert taken.cut and taken.curve.energies.size == 3
+    run = run_series(Series("it", 6, iter(FRAMES), REGIONS), lambda event: None, SystemClock(), lambda: next(asked))
+    assert run.stopped and run.curve.energies.size == 3
 
 
 def test_a_stop_at_the_last_energy_cuts_nothing() -> None:
-    taken = take(Series("it", 1, iter(FRAMES[:1]), REGIONS), lambda event: None, SystemClock(), lambda: True)
-    assert not taken.cut and taken.curve.energies.size == 1
+    run = run_series(Series("it", 1, iter(FRAMES[:1]), REGIONS), lambda event: None, SystemClock(), lambda: True)
+    assert not run.stopped and run.curve.energies.size == 1
