@@ -203,8 +203,8 @@ class _Run:
         )
         self.emit("scan_done", {**asdict(result), "status": status})
         if follower is not None:
-            said = follower.finish(self._give_up(unfinished is not None), lambda: self.stop.aborting)
-            result = replace(result, recon=said)
+            recon = follower.finish(self._give_up(unfinished is not None), lambda: self.stop.aborting)
+            result = replace(result, recon=recon)
         if error is not None:
             raise error
         return replace(result, seconds=time.monotonic() - self.began)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -17,10 +18,12 @@ from beamline.core.events import Event
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS
 from beamline.monitor.digest import digest
 from beamline.simulate.labels import Run, write_labels
+from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.frame import FrameKind
 from drivers.protocols import BeamReading
+from recon.base.volume import Grid
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
@@ -126,6 +129,12 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     assert unmatched(paths(tmp_path / "fbp.h5", tmp_path / "r2.h5"), names("Volume file")) == (set(), set())
     assert unmatched(paths(tmp_path / "checkpoint.h5"), names("Checkpoint")) == (set(), set())
     assert_on_the_page(events)
+
+
+def test_truth_file(tmp_path: Path) -> None:
+    grid = Grid((2, 3, 4), 0.5)
+    write_truth(tmp_path / "t.h5", Truth(grid, np.ones(grid.shape, "f4"), np.ones(grid.shape, "u1"), ("ellipsoid",)))
+    assert unmatched(paths(tmp_path / "t.h5"), names("Truth file")) == (set(), set())
 
 
 def test_labels(tmp_path: Path) -> None:

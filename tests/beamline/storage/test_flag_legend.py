@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +60,15 @@ def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: 
         names[0] = "a check of a later version"
         assert read_legend(file)[0] == FlagBit("a check of a later version", 0)
     assert describe(path)["attributes"]["flags"] == "a check of a later version 2, mass 1"
+
+
+def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:
+    """Nothing can be created while a scan is written, and a follower may read the legend at any time."""
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+        assert writer.rows == 0
+        code = "import sys, h5py; f = h5py.File(sys.argv[1], swmr=True, locking=False); print(*f[sys.argv[2]].asstr())"
+        words = [sys.executable, "-c", code, str(writer.path), f"{LEGEND}/name"]
+        assert subprocess.run(words, capture_output=True, text=True, check=True).stdout.split() == NAMES
 
 
 @given(st.lists(st.sets(st.sampled_from(NAMES)), max_size=20))
