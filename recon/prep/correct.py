@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from recon.base.masks import NEIGHBOURS, Image, Mask, fill, plan_fill
-
-_MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
-_UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
+from recon.base.masks import Image, Mask, fill, plan_fill
+from recon.prep.air import air_columns, air_level, edge_profiles
+from recon.prep.defects import dead_pixels, zingers
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,39 +79,6 @@ class Projections:
     replaced: float = 0.0
 
 
-def dead_pixels(references: References, hot_threshold: float = CorrectionSettings.hot_threshold) -> Mask:
-    """Mask [row, col] of unusable pixels: not finite, blind or unlit (flat near dark), or unlike their neighbours.
-
-    Raises:
-        ValueError: where more than half of the detector is dead: no beam, or darks and flats exchanged.
-    """
-    dark = np.asarray(references.dark, np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        nets = [np.asarray(flat, np.float32) - dark for _, flat in references.flats]
-    dead = np.logical_or.reduce([~((net > 0) & np.isfinite(net)) for net in nets])
-    if dead.mean() > 0.5:
-        raise ValueError(
-            f"{dead.mean():.0%} of the pixels have flat <= dark (median flat {np.median(references.flats[0][1]):.4g}, "
-            f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
-        )
-    # Behind a slit, flat and view are both noise, and their ratio has no meaning.
-    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], 90) for net in nets)])
-    response = np.median([np.median(net[~dead]) for net in nets])
-
-    def outliers(image: Image, least: float) -> Mask:
-        filled = np.where(dead, np.median(image[~dead]), image)
-        difference = np.abs(filled - ndimage.median_filter(filled, 3, mode="nearest"))
-        sigma = max(_MAD * float(np.median(difference)), least)
-        return difference > hot_threshold * sigma
-
-    # Smaller deviations (dark below 1 % of the beam, response below 10 %) are corrected by the division.
-    hot = outliers(dark, 1e-3 * float(response))
-    for net in nets:
-        filled = np.where(dead, response, net)
-        hot |= outliers(filled / ndimage.median_filter(filled, 3, mode="nearest"), 0.01)
-    return dead | hot
-
-
 def _flat_at(position: float, groups: list[tuple[float, Image]]) -> Image:
     """Net flat at a frame's position: interpolated between groups, the nearest group outside."""
     at = [p for p, _ in groups]
@@ -123,74 +89,177 @@ def _flat_at(position: float, groups: list[tuple[float, Image]]) -> Image:
     return groups[upper - 1][1] * (1 - weight) + groups[upper][1] * weight
 
 
-def air_columns(transmission: NDArray[np.float32], tolerance: float = 0.03) -> tuple[int, int]:
-    """Number of columns at the left and right edge that show air in all views; (0, 0) if none do.
+@dataclass(frozen=True, eq=False)
+class Transmission:
+    """Views divided by the flat, before air and zingers are dealt with.
 
-    Air columns are nowhere darker than the outermost ones by more than the tolerance (or the noise, if larger), in
-    every view and over the whole height. A sample that fills the view is thinnest at the edge, so a trend towards
-    darker is sample; a slow trend towards brighter is the beam. A side of fewer than 4 % of the columns, or darker than
-    the other side by more than 10 %, counts as 0.
-
-    Args:
-        transmission: float32 [view, row, col].
+    Attributes:
+        data: float32 [view, row, col], finite; `Correction.line_integrals` takes it over.
+        view_ids: int64 [view].
+        repaired: int64 [view], live pixels that were not finite; filled from their neighbours.
     """
-    _, rows, cols = transmission.shape
-    bands = [b for b in np.array_split(np.arange(rows), min(rows, 8)) if b.size]
-    widest, least = max(cols // 8, 1), max(3, cols // 25)
-    counts, levels = [], []
-    for side in (transmission[:, :, :widest], transmission[:, :, ::-1][:, :, :widest]):
-        profile = np.stack([np.median(side[:, b[:: max(b.size // 32, 1)]], axis=1) for b in bands], axis=1)
-        level = np.median(profile[:, :, :3], axis=(1, 2))
-        relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
-        noise = _MAD * float(np.median(np.abs(np.diff(relative, axis=2)))) / np.sqrt(2) if widest > 1 else 0.0
-        # One view in twenty may deviate: the median over the columns tolerates that, and noise has tails.
-        darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
-        steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)
-        n = int(np.argmin(np.append(steady, False)))
-        n -= n // 4  # keep a distance from the sample's edge and its phase fringes
-        trend = np.median(relative[:, :, n // 2 : n]) - np.median(relative[:, :, : n // 2]) if n > 1 else -np.inf
-        counts.append(n if n >= least and trend > -tolerance / 2 else 0)
-        levels.append(float(np.median(level)))
-    left, right = (n if level > 0.9 * max(levels) else 0 for n, level in zip(counts, levels, strict=True))
-    return left, right
+
+    data: NDArray[np.float32]
+    view_ids: NDArray[np.int64]
+    repaired: NDArray[np.int64]
 
 
-def _air(transmission: NDArray[np.float32], left: int, right: int) -> NDArray[np.float32]:
-    """Median transmission of the air columns in each view, with equal weight for both sides."""
-    cols = transmission.shape[2]
-    sides = [side for side in (transmission[:, :, :left], transmission[:, :, cols - right :]) if side.shape[2]]
-    if not sides:
-        return np.ones(transmission.shape[0], np.float32)
-    return np.mean([np.median(side, axis=(1, 2)) for side in sides], axis=0).astype(np.float32)
+class Correction:
+    """Correction of one scan's views, which come in the order they were taken, in batches of any size.
 
-
-def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """Median and third brightest of the eight neighbours of each (r, c); at the image edge the brightest."""
-    rows, cols = image.shape
-    nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
-    inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
-    values = np.where(inside, image[np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)], np.float32(np.nan))
-    values.sort(axis=1)  # NaN, the places outside, come last
-    n, at = inside.sum(axis=1), np.arange(r.size)
-    return (values[at, (n - 1) // 2] + values[at, n // 2]) / 2, values[at, np.where(n == 8, 5, n - 1)]
-
-
-def _zingers(view: Image, others: list[Image], threshold: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Image]:
-    """Pixels (r, c) hit by a stray photon, and the median around each.
-
-    Compared in √transmission, where photon noise is uniform. A bright feature of the sample is also in the neighbouring
-    views, or is larger than the two or three pixels of a zinger; a zinger is brighter than both.
+    For each batch: `transmission`, then `survey`, then `line_integrals`. A view depends on the references, on the air
+    columns (those of all views surveyed so far, where they are found), and on its two neighbours. So the newest view
+    waits for the next one, and with the same references and air columns the line integrals are the same to the bit,
+    however the views were split into batches.
     """
-    root = np.sqrt(np.maximum(view, 0))
-    step = max(1, int(np.sqrt(view.size / 4096)))
-    r, c = (a.ravel() for a in np.meshgrid(*(np.arange(0, n, step) for n in view.shape), indexing="ij"))
-    spread = root[r, c] - _around(root, r, c)[0]
-    limit = threshold * max(_MAD * float(np.median(np.abs(spread))), 0.005)
-    before = np.sqrt(np.maximum(np.maximum.reduce(others), 0)) if others else np.zeros_like(root)
-    r, c = np.nonzero(root > before + limit)
-    middle, brightest = _around(root, r, c)
-    spikes = root[r, c] > brightest + limit
-    return r[spikes], c[spikes], middle[spikes] ** 2
+
+    def __init__(
+        self, references: References, settings: CorrectionSettings | None = None, masked: Mask | None = None
+    ) -> None:
+        """Take the references.
+
+        Args:
+            references: darks and flats of the detector area of the views.
+            settings: None: the defaults.
+            masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
+
+        Raises:
+            ValueError: for shapes that do not fit, no flats, or no beam in the flats.
+        """
+        self._settings = CorrectionSettings() if settings is None else settings
+        _check(references, self._settings)
+        self._dark = np.asarray(references.dark, np.float32)
+        if masked is not None and np.shape(masked) != self._dark.shape:
+            raise ValueError(f"masked must have shape {self._dark.shape}, got {np.shape(masked)}")
+        if masked is None:
+            masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
+        self.masked = masked
+        self._fill = plan_fill(masked)
+        with np.errstate(invalid="ignore", over="ignore"):
+            self._flats = [
+                (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - self._dark))
+                for position, flat in sorted(references.flats, key=lambda group: group[0])
+            ]
+        self._profiles: list[NDArray[np.float32]] = []
+        self._before: Image | None = None  # the last view given out, before the logarithm
+        self._waiting: tuple[Transmission, NDArray[np.float32]] | None = None  # the newest view, and its air
+
+    @property
+    def waiting(self) -> bool:
+        """The newest view waits for the one after it."""
+        return self._waiting is not None
+
+    @property
+    def air_columns(self) -> tuple[int, int]:
+        """(left, right) columns of air, as far as the views surveyed tell; (0, 0) for none."""
+        air = self._settings.air
+        if air == "auto":
+            return air_columns(np.concatenate(self._profiles), self._dark.shape[1]) if self._profiles else (0, 0)
+        return (0, 0) if air == "none" else air
+
+    def transmission(
+        self,
+        counts: NDArray[np.generic],
+        positions: NDArray[np.float64],
+        view_ids: NDArray[np.int64] | None = None,
+    ) -> Transmission:
+        """(counts - dark) / (flat - dark), with every bad pixel filled from its neighbours.
+
+        Args:
+            counts: [view, row, col], any real type.
+            positions: [view], frame of the scan, on the scale of the flats' positions.
+            view_ids: int64 [view]; None: 0, 1, 2 ...
+
+        Raises:
+            ValueError: for shapes that do not fit, positions or more than half of a view not finite.
+        """
+        self._check_views(counts, positions)
+        ids = np.arange(len(counts), dtype=np.int64) if view_ids is None else np.asarray(view_ids, np.int64)
+        if ids.shape != counts.shape[:1]:
+            raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {ids.shape}")
+        data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
+        for v, view in enumerate(data):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                np.subtract(counts[v], self._dark, out=view, casting="unsafe")
+                view /= _flat_at(float(positions[v]), self._flats)
+            bad = ~np.isfinite(view) & ~self.masked
+            repaired[v] = bad.sum()
+            if repaired[v] > view.size / 2:
+                raise ValueError(
+                    f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
+                )
+            fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
+        return Transmission(data, ids, repaired)
+
+    def survey(self, views: Transmission) -> None:
+        """Let the views take part in finding the air columns."""
+        if self._settings.air == "auto":
+            self._profiles.append(edge_profiles(views.data))
+
+    def line_integrals(self, views: Transmission, last: bool = True) -> Projections:
+        """Line integrals of these views and of the one that waited; without `last` the newest of them waits in turn.
+
+        Raises:
+            ValueError: for views whose air columns are dark, by number.
+        """
+        settings, columns = self._settings, self.air_columns
+        air = air_level(views.data, *columns)
+        unlit = views.view_ids[~(air > settings.floor)]
+        if unlit.size:
+            raise ValueError(
+                f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
+                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
+            )
+        data, ids, repaired = views.data, views.view_ids, views.repaired
+        data /= air[:, None, None]
+        if self._waiting is not None:
+            first, first_air = self._waiting
+            data = np.concatenate((first.data, data))
+            ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
+            repaired = np.concatenate((first.repaired, repaired))
+        n = len(data) if last else max(len(data) - 1, 0)
+        replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n)
+        self._waiting = None
+        if n < len(data):
+            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:]), air[n:]
+        if n:
+            self._before = data[n - 1].copy()
+        data, floored = data[:n], 0
+        for view in data:
+            low = view < settings.floor
+            floored += int((low & ~self.masked).sum())
+            view[low] = settings.floor
+            np.negative(np.log(view, out=view), out=view)
+        live = max(int((~self.masked).sum()) * n, 1)
+        return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live)
+
+    def _remove_zingers(self, data: NDArray[np.float32], n: int) -> int:
+        """Take zingers out of the first `n` views; how many pixels they hit."""
+        if not np.isfinite(self._settings.zinger_threshold):
+            return 0
+        replaced = 0
+        for v in range(n):
+            before = data[v - 1] if v else self._before
+            after = data[v + 1] if v + 1 < len(data) else None
+            others = [image for image in (before, after) if image is not None]
+            r, c, value = zingers(data[v], others, self._settings.zinger_threshold)
+            data[v, r, c] = value
+            replaced += r.size
+        return replaced
+
+    def _check_views(self, counts: NDArray[np.generic], positions: NDArray[np.float64]) -> None:
+        if counts.ndim != 3 or counts.size == 0:
+            raise ValueError(f"counts must be [view, row, col] with at least one view, got shape {counts.shape}")
+        if counts.shape[1:] != self._dark.shape:
+            raise ValueError(f"the dark has shape {self._dark.shape}, the views {counts.shape[1:]}")
+        if np.shape(positions) != counts.shape[:1]:
+            raise ValueError(
+                f"positions must hold one number for each of {len(counts)} views, got shape {np.shape(positions)}"
+            )
+        if not np.isfinite(positions).all():
+            raise ValueError(
+                f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
+            )
 
 
 def correct(
@@ -201,103 +270,48 @@ def correct(
     view_ids: NDArray[np.int64] | None = None,
     masked: Mask | None = None,
 ) -> Projections:
-    """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views.
+    """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, by a `Correction` fed at once.
 
     All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
     Memory beyond the result: a few frames.
 
     Args:
-        counts: [view, row, col], any real type, in the order of acquisition.
-        positions: [view], number of the frame in the scan, as in the flats' positions.
-        references: darks and flats of the same detector area.
-        settings: None: the defaults.
-        view_ids: int64 [view]; None: 0, 1, 2 ...
-        masked: bool [row, col], pixels to fill, from an earlier part of the same scan; None: `dead_pixels(references)`.
+        counts, positions, view_ids: of the views in the order they were taken, see `Correction.transmission`.
+        references, settings, masked: see `Correction`.
 
     Raises:
-        ValueError: for shapes that disagree, no flats, no beam in the flats, or unusable views, whose numbers it gives.
+        ValueError: as `Correction` and its methods.
     """
-    settings = CorrectionSettings() if settings is None else settings
-    _check(counts, positions, references, settings)
-    for name, given, shape in (("view_ids", view_ids, counts.shape[:1]), ("masked", masked, counts.shape[1:])):
-        if given is not None and np.shape(given) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {np.shape(given)}")
-    dead = dead_pixels(references, settings.hot_threshold) if masked is None else masked
-    data, replaced = _transmission(counts, positions, references, dead)
-    left, right = air_columns(data) if settings.air == "auto" else (0, 0) if settings.air == "none" else settings.air
-    air = _air(data, left, right)
-    unlit = np.flatnonzero(~(air > settings.floor))
-    if unlit.size:
-        raise ValueError(
-            f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, {left} left and "
-            f"{right} right, are dark; leave these views out"
-        )
-    data /= air[:, None, None]
-    if np.isfinite(settings.zinger_threshold):
-        for v in range(len(data)):
-            others = [data[w] for w in (v - 1, v + 1) if 0 <= w < len(data)]
-            r, c, value = _zingers(data[v], others, settings.zinger_threshold)
-            data[v, r, c] = value
-            replaced += r.size
-    floored = 0
-    for view in data:
-        low = view < settings.floor
-        floored += int((low & ~dead).sum())
-        view[low] = settings.floor
-        np.negative(np.log(view, out=view), out=view)
-    ids = np.arange(len(data), dtype=np.int64) if view_ids is None else np.asarray(view_ids, np.int64)
-    live = max(int((~dead).sum()) * len(data), 1)
-    return Projections(data, ids, floored / live, air, dead, (left, right), replaced / live)
+    correction = Correction(references, settings, masked)
+    views = correction.transmission(counts, positions, view_ids)
+    correction.survey(views)
+    return correction.line_integrals(views)
 
 
-def _transmission(
-    counts: NDArray[np.generic], positions: NDArray[np.float64], references: References, dead: Mask
-) -> tuple[NDArray[np.float32], int]:
-    """(counts - dark) / (flat - dark) with bad pixels filled, and the number of pixels bad in one view only."""
-    dark = np.asarray(references.dark, np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        groups = [
-            (position, np.where(dead, np.float32(1), np.asarray(flat, np.float32) - dark))
-            for position, flat in sorted(references.flats, key=lambda group: group[0])
-        ]
-    data = np.empty(counts.shape, np.float32)
-    plan = plan_fill(dead)
-    replaced = 0
-    for v, view in enumerate(data):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            np.subtract(counts[v], dark, out=view, casting="unsafe")
-            view /= _flat_at(float(positions[v]), groups)
-        bad = ~np.isfinite(view) & ~dead
-        n = int(bad.sum())
-        if n == 0:
-            fill(view, plan)
-            continue
-        if n > view.size / 2:
-            raise ValueError(f"view {v}: {n} of {view.size} pixels are not finite; leave this view out")
-        fill(view, plan_fill(bad | dead))
-        replaced += n
-    return data, replaced
+def joined(parts: Sequence[Projections]) -> Projections:
+    """Batches of one scan's views as one; the parts' air columns are the last one's."""
+    n = np.array([len(part.data) for part in parts], np.float64)
+    weights = n / max(n.sum(), 1)
+    return Projections(
+        np.concatenate([part.data for part in parts]),
+        np.concatenate([part.view_ids for part in parts]),
+        float(weights @ [part.floored for part in parts]),
+        np.concatenate([part.air for part in parts]),
+        parts[-1].masked,
+        parts[-1].air_columns,
+        float(weights @ [part.replaced for part in parts]),
+    )
 
 
-def _check(
-    counts: NDArray[np.generic], positions: NDArray[np.float64], references: References, settings: CorrectionSettings
-) -> None:
-    if counts.ndim != 3 or counts.size == 0:
-        raise ValueError(f"counts must be [view, row, col] with at least one view, got shape {counts.shape}")
-    views, shape, cols = counts.shape[0], counts.shape[1:], counts.shape[2]
-    if np.shape(positions) != (views,):
-        raise ValueError(f"positions must hold one number for each of {views} views, got shape {np.shape(positions)}")
-    if not np.isfinite(positions).all():
-        raise ValueError(
-            f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
-        )
+def _check(references: References, settings: CorrectionSettings) -> None:
     if not references.flats:
         raise ValueError("there is no flat: without one, counts cannot be converted to line integrals")
-    for name, image in [("dark", references.dark), *((f"flat at {p:g}", flat) for p, flat in references.flats)]:
-        if image.shape != shape:
-            raise ValueError(f"{name} has shape {image.shape}, the views {shape}")
+    shape = np.shape(references.dark)
+    for position, flat in references.flats:
+        if np.shape(flat) != shape or len(shape) != 2:
+            raise ValueError(f"the dark has shape {shape}, the flat at {position:g} {np.shape(flat)}")
     at = sorted(p for p, _ in references.flats)
     if len(set(at)) < len(at) or not np.isfinite(at).all():
         raise ValueError(f"each group of flats needs a position of its own, got {at}; average the flats taken together")
-    if isinstance(settings.air, tuple) and not (min(settings.air) >= 0 and 0 < sum(settings.air) <= cols):
-        raise ValueError(f"air columns (left, right) {settings.air} do not fit {cols} columns")
+    if isinstance(settings.air, tuple) and not (min(settings.air) >= 0 and 0 < sum(settings.air) <= shape[1]):
+        raise ValueError(f"air columns (left, right) {settings.air} do not fit {shape[1]} columns")

@@ -12,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.prep.correct import CorrectionSettings, Projections, References, air_columns, correct, dead_pixels
+from recon.prep.air import air_columns, edge_profiles
+from recon.prep.correct import Correction, CorrectionSettings, Projections, References, correct, joined
+from recon.prep.defects import dead_pixels
 
 PLAIN = CorrectionSettings(hot_threshold=np.inf, zinger_threshold=np.inf, air="none")
 
@@ -135,7 +137,7 @@ def test_blind_and_hot_pixels_are_filled_from_their_neighbours(rng: np.random.Ge
     flat[10, 8] += 5_000
     flat[9, 12] *= 0.5  # answers unlike its neighbours
     counts[:, 5, 5] = counts[:, 7:9, 20:23] = counts[:, 3, 30] = 0
-    masked = dead_pixels(references)
+    masked = dead_pixels(references.dark, [flat for _, flat in references.flats])
     expected = np.zeros_like(masked)
     expected[5, 5] = expected[7:9, 20:23] = expected[0, 0] = expected[3, 30] = expected[10, 8] = expected[9, 12] = True
     np.testing.assert_array_equal(masked, expected)
@@ -202,7 +204,7 @@ def test_a_sample_that_fills_the_view_has_no_air(rng: np.random.Generator, densi
 def test_sample_on_one_side_leaves_the_other_side_for_air() -> None:
     transmission = np.ones((5, 4, 64), np.float32)
     transmission[:, :, 40:] = 0.5
-    left, right = air_columns(transmission)
+    left, right = air_columns(edge_profiles(transmission), 64)
     assert left >= 3
     assert right == 0
 
@@ -211,7 +213,7 @@ def test_sample_in_a_few_rows_only_is_still_no_air() -> None:
     """A pin wider than the sample: its rows at the bottom have no air at the edge."""
     transmission = np.ones((5, 32, 64), np.float32)
     transmission[:, 24:, 2:62] = 0.3
-    assert air_columns(transmission) == (0, 0)
+    assert air_columns(edge_profiles(transmission), 64) == (0, 0)
 
 
 def test_zingers_are_restored_and_only_they(rng: np.random.Generator) -> None:
@@ -251,6 +253,59 @@ def test_one_view_alone_can_be_corrected(rng: np.random.Generator) -> None:
 
 def good() -> tuple[NDArray[np.float64], References]:
     return beer_lambert(sphere(), np.random.default_rng(0))
+
+
+def in_batches(
+    counts: NDArray[np.generic], references: References, options: CorrectionSettings, ends: list[int]
+) -> Projections:
+    """All views surveyed, then corrected in batches that end at `ends`; the last one ends with the scan."""
+    correction, at = Correction(references, options), positions(counts)
+    for view in range(len(counts)):
+        correction.survey(correction.transmission(counts[view : view + 1], at[view : view + 1]))
+    parts = []
+    for first, end in zip([0, *ends], [*ends, len(counts)], strict=True):
+        batch = slice(first, end)
+        views = correction.transmission(counts[batch], at[batch], np.arange(first, end))
+        parts.append(correction.line_integrals(views, last=end == len(counts)))
+    assert not correction.waiting
+    return joined(parts)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    views=st.integers(2, 9),
+    cuts=st.sets(st.integers(1, 8)),
+    air=st.sampled_from(["auto", "none", (4, 3)]),
+)
+@settings(max_examples=40, deadline=None)
+def test_batches_of_any_size_are_the_views_at_once_to_the_bit(
+    seed: int, views: int, cuts: set[int], air: object
+) -> None:
+    rng = np.random.default_rng(seed)
+    counts, references = beer_lambert(sphere(views), rng, noise=0.01)
+    counts[rng.random(counts.shape) < 2e-3] += 60_000  # zingers, which the neighbouring views tell
+    counts[rng.random(counts.shape) < 2e-3] = np.nan
+    flats = (*references.flats, (views / 2, references.flats[0][1] * np.float32(1.1)))
+    references, options = References(references.dark, flats), CorrectionSettings(air=air)  # type: ignore[arg-type]
+    whole = correct(counts, positions(counts), references, options)
+    parts = in_batches(counts, references, options, sorted(cut for cut in cuts if cut < views))
+    np.testing.assert_array_equal(parts.data, whole.data)
+    np.testing.assert_array_equal(parts.air, whole.air)
+    np.testing.assert_array_equal(parts.view_ids, whole.view_ids)
+    assert (parts.masked == whole.masked).all() and parts.air_columns == whole.air_columns
+    assert (parts.replaced, parts.floored) == pytest.approx((whole.replaced, whole.floored), rel=1e-12)
+
+
+def test_a_view_waits_for_the_one_after_it(rng: np.random.Generator) -> None:
+    counts, references = beer_lambert(sphere(3), rng)
+    correction = Correction(references, CorrectionSettings(air="none"))
+    given = [
+        correction.line_integrals(
+            correction.transmission(counts[v : v + 1], np.array([float(v)]), np.array([v])), last=v == 2
+        ).view_ids.tolist()
+        for v in range(3)
+    ]
+    assert given == [[], [0], [1, 2]]
 
 
 def test_bad_input_is_refused_with_its_values() -> None:

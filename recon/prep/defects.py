@@ -1,0 +1,76 @@
+"""Pixels that cannot be trusted: dead and hot ones in all views, and zingers in single ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.base.masks import NEIGHBOURS, Image, Mask
+
+_MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
+_UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
+
+
+def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0) -> Mask:
+    """Mask [row, col] of unusable pixels: not finite, blind or unlit (flat near dark), or unlike their neighbours.
+
+    Raises:
+        ValueError: where more than half of the detector is dead: no beam, or darks and flats exchanged.
+    """
+    dark = np.asarray(dark, np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        nets = [np.asarray(flat, np.float32) - dark for flat in flats]
+    dead = np.logical_or.reduce([~((net > 0) & np.isfinite(net)) for net in nets])
+    if dead.mean() > 0.5:
+        raise ValueError(
+            f"{dead.mean():.0%} of the pixels have flat <= dark (median flat {np.median(flats[0]):.4g}, "
+            f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
+        )
+    # Behind a slit, flat and view are both noise, and their ratio has no meaning.
+    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], 90) for net in nets)])
+    response = np.median([np.median(net[~dead]) for net in nets])
+
+    def outliers(image: Image, least: float) -> Mask:
+        filled = np.where(dead, np.median(image[~dead]), image)
+        difference = np.abs(filled - ndimage.median_filter(filled, 3, mode="nearest"))
+        sigma = max(_MAD * float(np.median(difference)), least)
+        return difference > hot_threshold * sigma
+
+    # Smaller deviations (dark below 1 % of the beam, response below 10 %) are corrected by the division.
+    hot = outliers(dark, 1e-3 * float(response))
+    for net in nets:
+        filled = np.where(dead, response, net)
+        hot |= outliers(filled / ndimage.median_filter(filled, 3, mode="nearest"), 0.01)
+    return dead | hot
+
+
+def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
+    """Median and third brightest of the eight neighbours of each (r, c); at the image edge the brightest."""
+    rows, cols = image.shape
+    nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
+    inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
+    values = np.where(inside, image[np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)], np.float32(np.nan))
+    values.sort(axis=1)  # NaN, the places outside, come last
+    n, at = inside.sum(axis=1), np.arange(r.size)
+    return (values[at, (n - 1) // 2] + values[at, n // 2]) / 2, values[at, np.where(n == 8, 5, n - 1)]
+
+
+def zingers(view: Image, others: list[Image], threshold: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Image]:
+    """Pixels (r, c) hit by a stray photon, and the median around each.
+
+    Compared in √transmission, where photon noise is uniform. A bright feature of the sample is also in the neighbouring
+    views, or is larger than the two or three pixels of a zinger; a zinger is brighter than both.
+    """
+    root = np.sqrt(np.maximum(view, 0))
+    step = max(1, int(np.sqrt(view.size / 4096)))
+    r, c = (a.ravel() for a in np.meshgrid(*(np.arange(0, n, step) for n in view.shape), indexing="ij"))
+    spread = root[r, c] - _around(root, r, c)[0]
+    limit = threshold * max(_MAD * float(np.median(np.abs(spread))), 0.005)
+    before = np.sqrt(np.maximum(np.maximum.reduce(others), 0)) if others else np.zeros_like(root)
+    r, c = np.nonzero(root > before + limit)
+    middle, brightest = _around(root, r, c)
+    spikes = root[r, c] > brightest + limit
+    return r[spikes], c[spikes], middle[spikes] ** 2
