@@ -1,4 +1,4 @@
-"""Corrector: frames of a scan become line integrals as they are read, by the references that the scan has."""
+"""Correction of a scan's frames: line integrals as they are read, at once or in batches while the scan still runs."""
 
 from __future__ import annotations
 
@@ -13,59 +13,128 @@ from beamline.core.errors import DataError
 from beamline.projections.read import read_binned, read_references
 from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
-from recon.prep.correct import CorrectionSettings, Projections, References, correct
+from drivers.frame import FrameKind
+from recon.prep.correct import Correction, Projections, References
 
 Warn = Callable[[str], None]
-"""Is told, in a sentence, of what is not as it should be though work goes on."""
+"""Takes a sentence about something that is wrong though work goes on."""
 
 
-class Corrector:
-    """Reads frames of one scan as line integrals, in the rows and with the binning asked for."""
+class ScanCorrection:
+    """Reads frames of one scan as line integrals, in the rows and with the binning of a selection.
+
+    `at_once` corrects frames that are all there. `feed` takes them in batches as they come and gives the same line
+    integrals to the bit, as long as the references and the air columns stay what they were; `outdated` says when they
+    did not. Then `renewed` corrects by what is known now.
+    """
 
     def __init__(self, source: ScanSource, selection: Selection, warn: Warn) -> None:
-        """Read the reference frames of a scan that `refuse` has nothing against.
+        """Read the reference frames that the scan has.
 
         Raises:
             ConfigError: rows or binning that do not fit the detector.
+            DataError: references that cannot be used.
         """
-        self._source, self._settings, self._warn = source, selection.correction, warn
+        self._source, self._selection, self._warn = source, selection, warn
         self.rows, self.binning = rows_of(source, selection), selection.binning
-        self.references: References | None = None
+        self._n_references = _count_references(source)
+        self._references: References | None = None
         if source.quantity == "counts":
-            self.references = read_references(source, self.rows, self.binning)
+            self._references = read_references(source, self.rows, self.binning)
+        self._stream: Correction | None = None
+        self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 
-    def line_integrals(
-        self, frames: NDArray[np.int64], rows: slice | None = None, settings: CorrectionSettings | None = None
-    ) -> Projections:
+    def at_once(self, frames: NDArray[np.int64], rows: slice | None = None) -> Projections:
         """Line integrals of `frames` (rows of the file), without those that hold no finite pixel: see `view_ids`.
 
         Args:
-            frames: rows of the file.
+            frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
-            settings: other than the selection's.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
         """
+        data, frames = self._read(frames, rows)
+        if not frames.size:
+            raise DataError(f"{self._source.path}: none of the pixels of the views chosen is a finite number.")
+        if self._references is None:
+            return _as_given(data, frames)
+        return self._corrected(self._correction(rows), data, frames, last=True)
+
+    def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
+        """Line integrals of the next frames; None where there are none yet, since the newest view waits for the next.
+
+        Args:
+            frames: rows of the file, those after the frames fed before; may be none where `last`.
+            last: no frame will come after these.
+
+        Raises:
+            DataError: as `at_once`.
+        """
+        data, frames = self._read(frames, None)
+        if self._references is None:
+            return _as_given(data, frames) if frames.size else None
+        if self._stream is None:
+            self._stream = self._correction(None)
+        if not frames.size and not (last and self._stream.waiting):
+            return None
+        part = self._corrected(self._stream, data, frames, last)
+        if not part.view_ids.size:
+            return None
+        self._columns.add(part.air_columns)
+        return part
+
+    @property
+    def outdated(self) -> bool:
+        """Views that were fed would be corrected otherwise now: by references that came later, or other air columns."""
+        if self._references is None or self._stream is None:
+            return False
+        return _count_references(self._source) != self._n_references or self._columns != {self._stream.air_columns}
+
+    def renewed(self) -> ScanCorrection:
+        """A correction of the same views by all references that are there now."""
+        return ScanCorrection(self._source, self._selection, self._warn)
+
+    def _read(self, frames: NDArray[np.int64], rows: slice | None) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Pixels [frame, row, col] of the frames that hold a finite one, and these frames."""
         first, end = self.rows.start, self.rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // self.binning)
             first, end = first + start * self.binning, first + stop * self.binning
         data = read_binned(self._source, frames, slice(first, end), self.binning)
         alive = np.isfinite(data).any(axis=(1, 2))
-        if not alive.any():
-            raise DataError(f"{self._source.path}: none of the pixels of the {len(frames)} views is a finite number.")
         if not alive.all():
             lost = frames[~alive]
             self._warn(f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out.")
             data, frames = data[alive], frames[alive]
-        if self.references is None:
-            return _as_given(data, frames)
-        references = self.references if rows is None else _narrowed(self.references, rows)
+        return data, frames
+
+    def _correction(self, rows: slice | None) -> Correction:
+        assert self._references is not None
+        references = self._references if rows is None else _narrowed(self._references, rows)
         try:
-            return correct(data, frames.astype(np.float64), references, settings or self._settings, view_ids=frames)
+            return Correction(references, self._selection.correction)
         except ValueError as error:
-            raise DataError(f"{self._source.path} cannot be corrected: {error}") from error
+            raise self._refusal(error) from error
+
+    def _corrected(
+        self, correction: Correction, data: NDArray[Any], frames: NDArray[np.int64], last: bool
+    ) -> Projections:
+        try:
+            views = None
+            if frames.size:
+                views = correction.transmission(data, frames.astype(np.float64), frames)
+                correction.survey(views)
+            return correction.line_integrals(views, last)
+        except ValueError as error:
+            raise self._refusal(error) from error
+
+    def _refusal(self, error: ValueError) -> DataError:
+        return DataError(f"{self._source.path} cannot be corrected: {error}")
+
+
+def _count_references(source: ScanSource) -> int:
+    return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
 
 
 def _narrowed(references: References, rows: slice) -> References:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import Corrector, Warn
+from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.selection import (
     Selection,
     check_axis,
@@ -69,24 +69,57 @@ def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
-    findings = source_findings(source)
-    refuse(source, findings)
-    for finding in findings:
-        if finding.severity == "warning":
-            warn(finding.message)
+    check(source, warn)
     scan_frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
-    corrector = Corrector(source, selection, warn)
+    correction = ScanCorrection(source, selection, warn)
     axis_col, axis = selection.axis_col, None
     if axis_col is None:
         if cone_of(source, selection) is not None:
             axis_col = stated_axis(source)
         else:
-            axis_col, axis = locate_axis(source, corrector, scan_frames, warn)
+            axis_col, axis = locate_axis(source, correction, scan_frames, warn)
     check_axis(source, axis_col)
     period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
     chosen = choose_views(source, scan_frames, selection, period)
-    projections = corrector.line_integrals(scan_frames[chosen])
+    projections = correction.at_once(scan_frames[chosen])
+    rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
+    held_out = None
+    if rest.size:
+        others = correction.at_once(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
+        held_out = others.data, geometry_of(source, selection, axis_col, source.angles[others.view_ids])
+    return assemble(source, selection, projections, (axis_col, axis), warn, held_out)
+
+
+def check(source: ScanSource, warn: Warn) -> None:
+    """Refuse a finished scan that cannot be reconstructed; warn of what else its file lacks.
+
+    Raises:
+        DataError: with what to do about it.
+    """
+    findings = source_findings(source)
+    refuse(source, findings)
+    for finding in findings:
+        if finding.severity == "warning":
+            warn(finding.message)
+
+
+def assemble(
+    source: ScanSource,
+    selection: Selection,
+    projections: Projections,
+    axis: tuple[float, AxisEstimate | None],
+    warn: Warn,
+    held_out: tuple[NDArray[np.float32], Geometry] | None = None,
+) -> Prepared:
+    """Corrected views with their geometry, after a look at what correction had to repair.
+
+    Args:
+        axis: the column, and how it was found; None where it was given.
+
+    Raises:
+        DataError: fewer than two views, or nothing in the beam.
+    """
     report_defects(projections, warn)
     if projections.view_ids.size < 2:
         raise DataError(
@@ -94,18 +127,14 @@ def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
         )
     if not projections.data.any():
         raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
-    rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
-    held_out = None
-    if rest.size:
-        others = corrector.line_integrals(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
-        held_out = others.data, geometry_of(source, selection, axis_col, source.angles[others.view_ids])
+    axis_col, estimate = axis
     return Prepared(
         projections=projections,
         geometry=geometry_of(source, selection, axis_col, source.angles[projections.view_ids]),
         axis_col=axis_col,
-        axis=axis,
+        axis=estimate,
         held_out=held_out,
-        n_projections=int(scan_frames.size),
+        n_projections=int((source.image_key == FrameKind.PROJECTION).sum()),
         length_unit="px" if pixel_size(source, selection) is None else "mm",
         quantity=source.quantity,
     )
@@ -139,7 +168,7 @@ def stated_axis(source: ScanSource) -> float:
 
 
 def locate_axis(
-    source: ScanSource, corrector: Corrector, frames: NDArray[np.int64], warn: Warn
+    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
 
@@ -148,10 +177,10 @@ def locate_axis(
     Raises:
         DataError: no axis in the search range explains the views.
     """
-    height = (corrector.rows.stop - corrector.rows.start) // corrector.binning
+    height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
     frames = frames[_spread(np.arange(frames.size), _AXIS_VIEWS)]
-    band = corrector.line_integrals(frames, slice(start, min(height, start + _AXIS_ROWS)))
+    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)))
     try:
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:
@@ -159,7 +188,7 @@ def locate_axis(
             f"{source.path}: the rotation axis was not found: {error}. Give it with --axis COLUMN (0 is the centre of "
             "the first column)."
         ) from error
-    found = unbinned(estimate.value, corrector.binning)
+    found = unbinned(estimate.value, correction.binning)
     if estimate.confident:
         return found, estimate
     if source.axis_col is not None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopScope, never_stopped
-from beamline.projections.prepare import prepare
 from beamline.reconstruct.growing import Growing
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
@@ -69,11 +68,8 @@ def follow(
         growing = Growing(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
         with stop_scope() as stopped:
-            made = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
+            made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
-        # All flats are there now; the geometry stays the one that the volume has grown in.
-        prepared = prepare(source, replace(options.selection, axis_col=growing.axis_col), warn)
-        prepared = replace(prepared, axis=growing.axis)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = Context(facts, options.selection, options.command, options.seed, warn.messages, started)
     metrics = deliver(made, prepared, truth, options.target, context, sink, clock)

@@ -12,19 +12,27 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch
-from beamline.projections.correction import Corrector
-from beamline.projections.prepare import correction_blockers, locate_axis, refuse, stated_axis
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.prepare import (
+    Prepared,
+    assemble,
+    check,
+    correction_blockers,
+    locate_axis,
+    refuse,
+    stated_axis,
+)
 from beamline.projections.selection import check_axis, cone_of, geometry_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import Made
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.validate import reconstruction_blockers
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
 from drivers.frame import FrameKind
 from recon.base.method import Progress
 from recon.prep.align import AxisEstimate
+from recon.prep.correct import Projections, joined
 from recon.splatting.stream import StreamingFit
 
 _FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
@@ -40,11 +48,12 @@ class Growing:
         self.source, self.axis_col = source, source.axis_col if given is None else given
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
         self.axis: AxisEstimate | None = None  # how the axis was found; None where it was given or stated
-        self._corrector: Corrector | None = None
+        self._correction: ScanCorrection | None = None
+        self._parts: list[Projections] = []  # line integrals of the views taken: what the volume grows from
         self._late = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
-        self._taken = 0  # frames that the fit has, or that are no views
+        self._taken = 0  # frames that were corrected, or that are no views
         self._axis_settled = self.axis_col is not None
         self._next_axis = _FIRST_AXIS_VIEWS
         self._history: list[Progress] = []
@@ -69,24 +78,25 @@ class Growing:
         if views.size == 0:
             self._taken = n
             return grown
-        if self._corrector is None:
+        if self._correction is None:
             blockers = correction_blockers(self.source)
             if not ended and (self._late or any(finding.rule == "references" for finding in blockers)):
                 self._wait_for_references()
                 return grown
             refuse(self.source, blockers)
-            self._corrector = Corrector(self.source, self._options.selection, self._warn)
+            self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
         if not self._axis_settled:
-            self._settle_axis(self._corrector, views, ended)
+            self._settle_axis(self._correction, views, ended)
         if self.axis_col is None:
             return grown
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)
         new = views[views >= self._taken]
         batch = new[:_BATCH]
-        if batch.size:
-            corrected = self._corrector.line_integrals(batch)
-            self._fit.add_views(corrected.data, self.source.angles[corrected.view_ids])
+        part = self._correction.feed(batch, last=ended and batch.size == new.size)
+        if part is not None:
+            self._parts.append(part)
+            self._fit.add_views(part.data, self.source.angles[part.view_ids])
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
 
@@ -97,7 +107,7 @@ class Growing:
             self._sink(Event("state", self._clock.now(), {"state": "waiting", "message": message}))
         self._late = True
 
-    def _settle_axis(self, corrector: Corrector, views: NDArray[np.int64], ended: bool) -> None:
+    def _settle_axis(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
         """Look for the axis each time the views have grown by half, and once more when all are there.
 
         While views come only a clear optimum counts. Where it moves by much, the fit begins anew with all views; by
@@ -111,7 +121,7 @@ class Growing:
         self._next_axis, self._axis_settled = views.size + views.size // 2, ended
         last_chance = ended and self.axis_col is None
         try:
-            found, estimate = locate_axis(self.source, corrector, views, self._warn if last_chance else _quiet)
+            found, estimate = locate_axis(self.source, correction, views, self._warn if last_chance else _quiet)
         except DataError:
             if last_chance:
                 raise
@@ -119,7 +129,7 @@ class Growing:
         if not (estimate.confident or last_chance):
             return
         if self.axis_col is None or abs(found - self.axis_col) > _AXIS_MOVES:
-            self._fit, self._taken = None, 0
+            self._fit = None
         elif self._fit is not None:
             self._fit.move_axis(self._binned(found))
         self.axis_col, self.axis = found, estimate
@@ -139,7 +149,23 @@ class Growing:
         }
         self._sink(Event("recon_started", self._clock.now(), data))
         options = self._options
-        return options.streaming.stream(template, options.seed, self._clock.now)
+        fit = options.streaming.stream(template, options.seed, self._clock.now)
+        for part in self._parts:
+            fit.add_views(part.data, self.source.angles[part.view_ids])
+        return fit
+
+    def _correct_again(self) -> None:
+        """Line integrals by all references and air columns, in place of those that the model has learnt from."""
+        assert self._correction is not None and self._fit is not None
+        if not self._correction.outdated:
+            return
+        message = "Flats or darks came after views, or air columns changed: all views are corrected again"
+        self._sink(Event("state", self._clock.now(), {"state": "correcting", "message": message}))
+        self._correction = self._correction.renewed()
+        frames = np.concatenate([part.view_ids for part in self._parts])
+        self._parts = []
+        self._parts = [self._correction.at_once(frames)]
+        self._fit.replace_views(self._parts[0].data)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False where there is nothing to fit yet."""
@@ -179,10 +205,18 @@ class Growing:
         data = {"path": self.snapshot_path, "n_views": self._fit.n_views, "seconds": seconds}
         self._sink(Event("snapshot", self._clock.now(), data))
 
-    def finish(self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]) -> Made:
-        """The last round over all views in `seconds` or until `stopped`, with snapshots, and the volume."""
-        refuse(self.source, reconstruction_blockers(self.source))
-        assert self._fit is not None  # two views are there, and the axis was settled with them
+    def finish(self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]) -> tuple[Made, Prepared]:
+        """The last round over all views in `seconds` or until `stopped`, with snapshots.
+
+        Returns the volume, and the line integrals that it grew from, to judge it by.
+
+        Raises:
+            DataError: a scan without two views that can be used, or whose views hold no matter.
+        """
+        check(self.source, self._warn)
+        assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
+        self._correct_again()
+        prepared = self._prepared(self.axis_col)
         self._sink(
             Event(
                 "state",
@@ -213,7 +247,13 @@ class Growing:
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
         method, seconds = self._options.method.name, self._clock.now() - self._begin
-        return Made(volume, method, seconds, self._history, settings, self._options.filter)
+        made = Made(volume, method, seconds, self._history, settings, self._options.filter)
+        return made, prepared
+
+    def _prepared(self, axis_col: float) -> Prepared:
+        projections = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
+        self._parts = [projections]
+        return assemble(self.source, self._options.selection, projections, (axis_col, self.axis), self._warn)
 
 
 def _quiet(text: str) -> None:

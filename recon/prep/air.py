@@ -1,4 +1,4 @@
-"""Air beside the sample: which columns at the detector's edges see none of it, and how much light each view gets there."""
+"""Air beside the sample: the columns at the detector's edges that see only air, and each view's light there."""
 
 from __future__ import annotations
 

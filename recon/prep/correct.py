@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -196,13 +195,20 @@ class Correction:
         if self._settings.air == "auto":
             self._profiles.append(edge_profiles(views.data))
 
-    def line_integrals(self, views: Transmission, last: bool = True) -> Projections:
+    def line_integrals(self, views: Transmission | None, last: bool = True) -> Projections:
         """Line integrals of these views and of the one that waited; without `last` the newest of them waits in turn.
+
+        Args:
+            views: the next ones, which the result takes over; None: the scan has ended with the one that waits.
+            last: no view comes after these.
 
         Raises:
             ValueError: for views whose air columns are dark, by number.
         """
         settings, columns = self._settings, self.air_columns
+        if views is None:
+            rows, cols = self._dark.shape
+            views = Transmission(np.empty((0, rows, cols), np.float32), np.empty(0, np.int64), np.empty(0, np.int64))
         air = air_level(views.data, *columns)
         unlit = views.view_ids[~(air > settings.floor)]
         if unlit.size:
@@ -288,19 +294,21 @@ def correct(
     return correction.line_integrals(views)
 
 
-def joined(parts: Sequence[Projections]) -> Projections:
-    """Batches of one scan's views as one; the parts' air columns are the last one's."""
+def joined(parts: list[Projections]) -> Projections:
+    """Batches of one scan's views as one; the list is emptied on the way, so that no view is in memory twice for long.
+
+    The air columns and the mask are those of the last batch.
+    """
     n = np.array([len(part.data) for part in parts], np.float64)
-    weights = n / max(n.sum(), 1)
-    return Projections(
-        np.concatenate([part.data for part in parts]),
-        np.concatenate([part.view_ids for part in parts]),
-        float(weights @ [part.floored for part in parts]),
-        np.concatenate([part.air for part in parts]),
-        parts[-1].masked,
-        parts[-1].air_columns,
-        float(weights @ [part.replaced for part in parts]),
-    )
+    weights, last = n / max(n.sum(), 1), parts[-1]
+    ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
+    floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
+    data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
+    while parts:
+        part = parts.pop(0).data
+        data[at : at + len(part)] = part
+        at += len(part)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced)
 
 
 def _check(references: References, settings: CorrectionSettings) -> None:

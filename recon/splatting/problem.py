@@ -122,6 +122,16 @@ def extend(
     return replace(_with_views(problem, *masked(projections, weights, largest)), geometry=geometry)
 
 
+def with_projections(problem: FitProblem, projections: F32) -> FitProblem:
+    """The problem with other line integrals [view, row, col] for the views that it has.
+
+    Raises:
+        ValueError: a view has no value that can be used.
+    """
+    empty = replace(problem, images=(), target_maps=(), weights=())
+    return _with_views(empty, *masked(projections, None, _LARGEST_LATER * problem.half_field * problem.unit))
+
+
 def joined(geometry: Geometry, factor: int) -> Geometry:
     """The geometry of factor x factor joined pixels, each in the middle of its own, while the sample stays in place.
 

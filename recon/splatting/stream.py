@@ -24,7 +24,7 @@ from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
-from recon.splatting.problem import FitProblem, extend
+from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
 
 Clock = Callable[[], float]
@@ -133,15 +133,31 @@ class StreamingFit:
         expected = (theta.size, *self._template.detector_shape)
         if theta.ndim != 1 or np.shape(data) != expected:
             raise ValueError(f"{theta.size} angles need projections of shape {expected}, got {np.shape(data)}")
-        with np.errstate(over="ignore"):  # what float32 cannot hold is told as not finite
-            images = np.array(data, np.float32)
-        if not (np.isfinite(images).all() and np.isfinite(theta).all()):
-            raise ValueError("new views hold values or angles that are not finite; nothing was added")
+        images = _finite(data)
+        if not np.isfinite(theta).all():
+            raise ValueError("new views hold values or angles that are not finite; nothing was changed")
         if self._problem is None:
             self._data.extend(images)
         else:
             self._problem = extend(self._problem, images, theta)
         self._angles.extend(theta.tolist())
+
+    def replace_views(self, data: F32) -> None:
+        """Other line integrals [view, row, col] of all views so far, in their order: their correction has changed.
+
+        The model stays and goes on from where it is.
+
+        Raises:
+            ValueError: where the shape is not that of the views so far, or values are not finite; nothing is changed.
+        """
+        expected = (self.n_views, *self._template.detector_shape)
+        if np.shape(data) != expected:
+            raise ValueError(f"the views so far have shape {expected}, got {np.shape(data)}")
+        images = _finite(data)
+        if self._problem is None:
+            self._data = list(images)
+        else:
+            self._problem = with_projections(self._problem, images)
 
     def move_axis(self, axis_col: float) -> None:
         """Say that the rotation axis lies elsewhere. The model stays: a fraction of a pixel is soon learnt again.
@@ -253,6 +269,15 @@ class StreamingFit:
         self._state = fit.init(placed, self._rng)
         self._placed = placed.n
         self._data = []  # the problem holds them from now on
+
+
+def _finite(data: F32) -> F32:
+    """A copy as float32, whose values are finite."""
+    with np.errstate(over="ignore"):  # what float32 cannot hold counts as not finite
+        images = np.array(data, np.float32)
+    if not np.isfinite(images).all():
+        raise ValueError("new views hold values or angles that are not finite; nothing was changed")
+    return images
 
 
 def _span(theta: NDArray[np.float64]) -> float:

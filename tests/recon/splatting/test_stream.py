@@ -150,9 +150,9 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
         model.add_views(data[:2], ANGLES[:3])
     bad = data[:1].copy()
     bad[0, 3, 3] = np.nan
-    with pytest.raises(ValueError, match="nothing was added"):
+    with pytest.raises(ValueError, match="nothing was changed"):
         model.add_views(bad, ANGLES[:1])
-    with pytest.raises(ValueError, match="nothing was added"):
+    with pytest.raises(ValueError, match="nothing was changed"):
         model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])  # type: ignore[arg-type]
     assert model.n_views == 0
     with pytest.raises(ValueError, match="at least one Gaussian"):
