@@ -41,6 +41,9 @@ REGISTRY: dict[str, Entry] = {
 DEFAULT = "r2"
 """The method where none is named."""
 
+BASELINE = "fbp"
+"""The method that reports compare all others with."""
+
 
 def names() -> tuple[str, ...]:
     """Names of all methods; loads none of them."""

@@ -77,6 +77,11 @@ def takers(option: str) -> tuple[str, ...]:
     return with_trait(_TRAITS[option]) if option in _TRAITS else taking(SETTINGS[option])
 
 
+def _of(option: str) -> str:
+    """Names of the methods that take an option, for its help."""
+    return ", ".join(takers(option))
+
+
 def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None:
     """Raises UsageError for options that exclude each other, or are of another method.
 
@@ -110,11 +115,13 @@ def _option(name: str) -> str:
 
 
 _OPTIONS = (
-    click.option("--steps", type=click.IntRange(min=1), help=f"Steps of the fit (r2). Default: {DEFAULT_STEPS}."),
+    click.option(
+        "--steps", type=click.IntRange(min=1), help=f"Steps of the fit ({_of('steps')}). Default: {DEFAULT_STEPS}."
+    ),
     click.option(
         "--seconds",
         type=POSITIVE,
-        help="Time for the fit (r2), instead of --steps; with --follow, after the scan has ended.",
+        help=f"Time for the fit ({_of('seconds')}), instead of --steps; with --follow, after the scan has ended.",
     ),
     click.option(
         "--budget",
@@ -127,44 +134,47 @@ _OPTIONS = (
         type=click.Choice(list(PRESETS)),
         help="A preset of steps and Gaussians, instead of naming them.",
     ),
-    click.option("--gaussians", type=click.IntRange(min=1), help="How many to start from (r2)."),
+    click.option("--gaussians", type=click.IntRange(min=1), help=f"How many to start from ({_of('gaussians')})."),
     click.option(
         "--start",
         type=click.Choice(get_args(Start)),
         default="fbp",
         show_default=True,
-        help="Volume that the first Gaussians are drawn from (r2); tv is slower, without streaks of few views.",
+        help=f"Volume that Gaussians are first drawn from ({_of('start')}); tv: slower, without streaks of few views.",
     ),
     click.option(
         "--loss",
         type=click.Choice(get_args(Loss)),
         default="l1",
         show_default=True,
-        help="Misfit of the fit (r2), beside SSIM: absolute, squared, or squared and weighed as photon noise is.",
+        help=f"Misfit of the fit ({_of('loss')}), beside SSIM: absolute, squared, or squares weighed by photon noise.",
     ),
-    click.option("--device", default="cpu", show_default=True, metavar="cpu|cuda", help="Of the fit (r2)."),
+    click.option(
+        "--device", default="cpu", show_default=True, metavar="cpu|cuda", help=f"Of the fit ({_of('device')})."
+    ),
     click.option(
         "--early-stop",
         is_flag=True,
-        help="End the fit (r2) when views held out no longer gain; every tenth is held out where --views leaves none.",
+        help=f"End the fit ({_of('early_stop')}) when views held out no longer gain; every tenth is held out where "
+        "--views leaves none.",
     ),
     click.option(
         "--polish",
         type=click.IntRange(min=0),
         default=0,
         show_default=True,
-        help="Sweeps on voxels after the fit (r2) for what Gaussians could not say; 3 gain 0.3 to 2 dB of sharp edges.",
+        help=f"Sweeps on voxels after the fit ({_of('polish')}), which sharpen edges: 3 gain 0.3 to 2 dB.",
     ),
     click.option(
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
         callback=checkpoint_output,
-        help="Keep the fit's state here (r2): every minute, when it ends, and at Ctrl-C.",
+        help=f"Keep the fit's state here ({_of('checkpoint')}): every minute, when it ends, and at Ctrl-C.",
     ),
     click.option(
         "--resume",
         type=click.Path(path_type=Path, dir_okay=False),
-        help="Go on from a checkpoint of the same data and options (r2).",
+        help=f"Go on from a checkpoint of the same data and options ({_of('resume')}).",
     ),
     click.option(
         "--iterations", type=click.IntRange(min=1), help="Of an iterative method. Default: each method's own."
@@ -172,6 +182,6 @@ _OPTIONS = (
     click.option(
         "--tv-weight",
         type=POSITIVE,
-        help="Of the total variation in fista-tv and os-sirt-tv, in units of the sample's density.",
+        help=f"Of the total variation ({_of('tv_weight')}), in units of the sample's density.",
     ),
 )

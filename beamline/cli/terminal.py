@@ -18,6 +18,7 @@ from beamline.core.events import Event
 from beamline.core.narration import sentence
 from beamline.report.metrics import METRICS, formatted
 from drivers.manual import Ask
+from recon.methods import BASELINE
 
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
@@ -160,8 +161,8 @@ def results(data: Mapping[str, Any]) -> str:
         if key in data:
             lines.append(f"{name:<10}{data[key]}")
     columns = {str(data["method"]): data}
-    if "fbp" in data:
-        columns["fbp"] = data["fbp"]
+    if BASELINE in data:
+        columns[BASELINE] = data[BASELINE]
     lines.append("")
     lines.append(f"{'':<30}" + "".join(f"{name:>14}" for name in columns))
     for name, metric in METRICS.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
@@ -10,6 +10,12 @@ from beamline.config.devices import DeviceSection
 from beamline.config.monitor import MonitorSection
 from beamline.config.section import Section
 from beamline.plan.plan import Mode, Place
+from recon.methods import DEFAULT, names
+
+if TYPE_CHECKING:
+    MethodName = str
+else:
+    MethodName = Literal[names()]
 
 
 class Sample(Section):
@@ -120,7 +126,8 @@ class Storage(Section):
 
 class Recon(Section):
     live: bool = True
-    method: Literal["r2", "fbp"] = "r2"
+    method: MethodName = DEFAULT
+    """Of the live volume; one that needs the whole scan is run afterwards, by `beamline recon`."""
     seconds: PositiveFloat = 30.0
     """Time for the fit after the last view."""
     axis: Literal["auto"] | FiniteFloat = "auto"

@@ -22,9 +22,8 @@ from drivers.frame import FrameKind
 from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
 from recon.base.method import Progress
 from recon.base.volume import Volume
-from recon.methods import by_name
+from recon.methods import BASELINE, by_name
 from recon.splatting.settings import FitSettings
-from recon.voxels.direct import Fbp
 from recon.voxels.fbp import Filter
 
 
@@ -164,8 +163,8 @@ def compose(
         f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
         f"{prepared.n_projections} views in {made.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
-    if Fbp.name in metrics and made.method != Fbp.name:
-        summary += f" (FBP of the same views: {formatted(best, metrics[Fbp.name][best])})"
+    if BASELINE in metrics and made.method != BASELINE:
+        summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
     if made.next_decibel_said:

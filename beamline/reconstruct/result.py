@@ -19,9 +19,9 @@ from beamline.report.record import history_arrays
 from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
 from drivers.clock import Clock
 from recon.base.volume import Volume
-from recon.methods import by_name
+from recon.methods import BASELINE, by_name
 from recon.prep.align import AxisEstimate
-from recon.voxels.direct import Fbp, direct, has_direct_method
+from recon.voxels.direct import direct, has_direct_method
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ def deliver(
     if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
         before = clock.now()
         data = direct(prepared.projections.data, prepared.geometry, made.volume.grid, made.filter)
-        volumes = {Fbp.name: Volume(data, made.volume.grid), **volumes}
-        metrics = {Fbp.name: judged(volumes[Fbp.name], clock.now() - before), **metrics}
+        volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
+        metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     own = metrics[made.method]
     parameters = parameters_of(made, prepared, context)
     record = ReconRecord(
@@ -98,7 +98,7 @@ def deliver(
     if (further := made.next_decibel) is not None:
         summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_said}
     if len(metrics) > 1:
-        summary[Fbp.name] = metrics[Fbp.name]
+        summary[BASELINE] = metrics[BASELINE]
     sink(Event("done", clock.now(), summary))
     return own
 

@@ -1,4 +1,4 @@
-"""The fit: init, step and run over an explicit state; it prints nothing, reads no clock, can stop after any step."""
+"""The fit over an explicit state: init, step, run_steps; it prints nothing, reads no clock, can stop after any step."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def step(
     return state
 
 
-def run(
+def run_steps(
     state: FitState,
     problem: FitProblem,
     settings: FitSettings,

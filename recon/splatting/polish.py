@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.method import ReconProblem
 from recon.base.volume import Volume
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
@@ -26,15 +26,10 @@ _TV_WEIGHT = 0.002
 def polish(
     volume: Volume,
     gaussians: Gaussians,
-    projections: F32,
-    geometry: Geometry,
+    problem: ReconProblem,
     sweeps: int,
-    *,
-    weights: F32 | None = None,
-    rays: RayModel | None = None,
-    truncation: Truncation | None = None,
+    settings: FitSettings | None = None,
     should_stop: Callable[[], bool] | None = None,
-    seed: int = 0,
 ) -> Volume:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -48,23 +43,21 @@ def polish(
     Args:
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
-        projections: [view, row, col]; values that are not finite get weight 0.
-        geometry: geometry of the views, without roll and tilt.
+        problem: the views that were fitted, without roll and tilt, and the weights of their rays.
         sweeps: 1 or more.
-        weights: weight of each ray [view, row, col], 0 or more.
-        rays, truncation: as in the fit.
+        settings: of the fit; None: the defaults.
         should_stop: called after each sweep; True ends the iteration.
-        seed: seed of the order of the subsets.
 
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
     """
-    projector = Projector(geometry, volume.grid)
-    data, known = masked(projections, weights)
-    modelled = project(gaussians, geometry, truncation=truncation, model=rays).numpy()
+    fit = settings or FitSettings()
+    projector = Projector(problem.geometry, volume.grid)
+    data, known = masked(problem.projections, problem.use.weights)
+    modelled = project(gaussians, problem.geometry, truncation=fit.truncation, model=fit.rays).numpy()
     data = data - modelled
     data += projector.forward(volume.data)
     return solve(
         OsSirtTv(sweeps, tv_weight=_TV_WEIGHT), projector, data, weight=known, start=volume,
-        on_iteration=lambda *_: should_stop is not None and should_stop(), seed=seed,
+        on_iteration=lambda *_: should_stop is not None and should_stop(), seed=problem.seed,
     )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
+from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
@@ -155,11 +155,8 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         state = state_from(tracker.kept, backend)
     volume, model = fit.volume_of(state, problem.grid, settings, backend), fit.gaussians_of(state, backend)
     if method.polish:
-        volume = polish(
-            volume, model, data[used], seen, method.polish,
-            weights=known, rays=settings.rays, truncation=settings.truncation, should_stop=control.should_stop,
-            seed=problem.seed,
-        )  # fmt: skip
+        fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
+        volume = polish(volume, model, fitted, method.polish, settings, control.should_stop)
     record = {
         **asdict(settings), "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import recon
 from recon import AsdPocs, FistaTv, OsSirtTv, Sirt
 from recon.assess.metrics import psnr, ssim3d
+from recon.base.method import ReconProblem
 from recon.splatting.polish import polish
 from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import fbp
@@ -119,10 +120,11 @@ def _compare(
         table.add(name, fitted)
         model = made[0].gaussians
         assert model is not None
+        problem = ReconProblem(data, geometry, grid, recon.DataUse(), 0, "cpu")
         for n in sweeps:
             table.add(
                 f"{name}, {n} sweeps",
-                lambda n=n, model=model, made=made: polish(made[0].volume, model, data, geometry, n).data,  # type: ignore[misc]
+                lambda n=n, model=model, made=made, problem=problem: polish(made[0].volume, model, problem, n).data,  # type: ignore[misc]
                 after=name,
             )
     name, peer = table.best("FISTA")

@@ -111,7 +111,7 @@ def test_detectors_of_one_row_or_column_with_a_pixel_missing_are_the_cpus(
     for device in ("cpu", "cuda"):
         backend = backend_for(device)
         problem = fit.problem_of(data, views, flat, 0.7, settings, backend)
-        state = fit.run(fit.init(some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
+        state = fit.run_steps(fit.init(some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
         states.append({name: backend.numpy(values) for name, values in state.parameters.items()})
     for name, expected in states[0].items():
         np.testing.assert_allclose(states[1][name], expected, atol=2e-5 * float(np.abs(expected).max()), err_msg=name)

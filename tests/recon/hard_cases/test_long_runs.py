@@ -45,7 +45,7 @@ def test_steps_without_drift(steps: int, residual: float) -> None:
         losses.append(float(state.loss))
         return False
 
-    fit.run(state, problem, settings, steps, kept)
+    fit.run_steps(state, problem, settings, steps, kept)
     # The path of Adam on absolute differences depends on every bit while rates are high. Over 16 seeds the running loss
     # of 20 steps rose to 2.4 times its best so far, a mean over a twentieth of the run to 1.6 times, and the last one
     # was within 1.1 of the best.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.method import DataUse, ReconProblem
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
@@ -40,10 +41,14 @@ def _of(g: Gaussians, grid: Grid = GRID) -> Volume:
     return Volume(voxelize(g, grid).numpy(), grid)
 
 
+def _problem(data: F32, weights: F32 | None = None) -> ReconProblem:
+    return ReconProblem(data, VIEWS, GRID, DataUse(weights), 0, "cpu")
+
+
 def test_a_model_that_explains_all_is_only_smoothed() -> None:
     g = _blob()
     volume = _of(g)
-    polished = polish(volume, g, project(g, VIEWS).numpy(), VIEWS, 3)
+    polished = polish(volume, g, _problem(project(g, VIEWS).numpy()), 3)
     assert np.abs(polished.data - volume.data).max() < 0.02 * volume.data.max()
 
 
@@ -52,7 +57,7 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)
     truth = _of(g).data + missing
     qualities = [psnr(truth, _of(g).data)]
-    qualities += [psnr(truth, polish(_of(g), g, data, VIEWS, sweeps).data) for sweeps in (1, 3, 9)]
+    qualities += [psnr(truth, polish(_of(g), g, _problem(data), sweeps).data) for sweeps in (1, 3, 9)]
     assert all(later > before + 1 for before, later in pairwise(qualities))
     assert qualities[-1] > 30
 
@@ -63,7 +68,7 @@ def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
     small = Grid((8, 40, 18), 1.0, (0.0, 0.0, -8.0))
     missing = _box(small)
     data = project(g, VIEWS).numpy() + Projector(VIEWS, small).forward(missing)
-    polished = polish(_of(g, small), g, data, VIEWS, 9)
+    polished = polish(_of(g, small), g, _problem(data), 9)
     assert psnr(missing + _of(g, small).data, polished.data) > 30
 
 
@@ -74,10 +79,10 @@ def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     bad[:, 3:5, 7:9] = True
     volumes = []
     for value in (np.nan, np.inf):
-        volumes.append(polish(_of(g), g, np.where(bad, np.float32(value), data), VIEWS, 2).data)
+        volumes.append(polish(_of(g), g, _problem(np.where(bad, np.float32(value), data)), 2).data)
     np.testing.assert_array_equal(*volumes)
     weights = (~bad).astype(np.float32)
-    weighed = polish(_of(g), g, np.where(bad, np.float32(1), data), VIEWS, 2, weights=weights).data
+    weighed = polish(_of(g), g, _problem(np.where(bad, np.float32(1), data), weights), 2).data
     np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)
 
 

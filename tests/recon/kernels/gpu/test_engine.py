@@ -32,7 +32,9 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettin
     weights = (rng.random(data.shape) > 0.1).astype(np.float32)
     problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
     state, told = fit.init(g, 11, 1.5, backend), []
-    fit.run(state, problem, settings, 5, lambda s: told.append((s.n, float(s.loss), float(s.residual))) is not None)
+    fit.run_steps(
+        state, problem, settings, 5, lambda s: told.append((s.n, float(s.loss), float(s.residual))) is not None
+    )
     return state, [*told, fit.misfit_of(state, problem, settings)]
 
 
