@@ -143,7 +143,7 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
         ({"method": R2(early_stop=True)}, "there are none"),
         ({"use": DataUse(held_out=(24,))}, "views 0 to 23"),
         ({"use": DataUse(held_out=tuple(range(24)))}, "none is left"),
-        ({"control": RunControl(resume={})}, "no checkpoint"),
+        ({"control": RunControl(resume={})}, "not a checkpoint"),
         ({"device": "abacus"}, "'abacus' was asked for"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
     ],
