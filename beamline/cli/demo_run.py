@@ -12,11 +12,11 @@ from beamline.core.events import Event, Sink, fan_out
 from beamline.core.narration import sentence
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
-from beamline.projections.prepare import prepare
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.recon_report import Context, Made, facts_of
-from beamline.reconstruct.result import Target, axis_of, deliver
-from beamline.report.record import history_from
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.result import OutputPaths, axis_of, write_result
+from beamline.report.record import history_of
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 from beamline.scan.run_folder import RECON, RECON_LOG
@@ -45,7 +45,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     """
     clock = SystemClock()
     started = clock.now()
-    keeper = _Keeper()
+    checkpoints = _Keeper()
     outside = fan_out(*sinks)
 
     def all_but_done(event: Event) -> None:
@@ -57,7 +57,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
             raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
         truth = instrument.truth
         result = run_scan(
-            config, runs, [keeper, all_but_done], stop, live=follow_command(config), instrument=instrument
+            config, runs, [checkpoints, all_but_done], stop, live=follow_command(config), instrument=instrument
         )
     folder = result.path.parent
     if result.recon is None:
@@ -68,20 +68,20 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     with open_scan(result.path) as source:
         facts = facts_of(source)
         selection = Selection(axis_col=float(str(record.parameters["axis_col"])))
-        prepared = replace(prepare(source, selection, warnings.append), axis=axis_of(record.parameters))
+        prepared = replace(prepare_projections(source, selection, warnings.append), axis=axis_of(record.parameters))
     grid = Grid.matching(prepared.geometry)
     ideal = truth(grid)
-    made = Made(
+    made = ReconOutcome(
         volume=Volume(record.volume.data, grid),
         method=config.recon.method,
         seconds=record.metrics["seconds"],
-        history=history_from(record.history),
+        history=history_of(record.history),
         settings=record.parameters,
-        psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in keeper.snapshots],
+        psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in checkpoints.snapshots],
     )
-    context = Context(facts, selection, command, config.recon.seed, warnings, started, keeper.flags)
-    target = Target(folder / RECON, folder / REPORT, replace=True)
-    deliver(made, prepared, ideal, target, context, outside, clock)
+    context = ReportContext(facts, selection, command, config.recon.seed, warnings, started, checkpoints.flags)
+    target = OutputPaths(folder / RECON, folder / REPORT, replace=True)
+    write_result(made, prepared, ideal, target, context, outside, clock)
 
 
 class _Keeper:

@@ -19,11 +19,11 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
-from beamline.reconstruct.checkpoints import Keeper
-from beamline.reconstruct.finished import run
+from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.follow import follow as follow_scan
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import Target
+from beamline.reconstruct.result import OutputPaths
 from drivers.clock import SystemClock
 from recon.assess.time_model import Quality
 from recon.methods import DEFAULT, names
@@ -109,12 +109,12 @@ def recon(
     source, selection = chosen(file, seed, said)
     options = ReconOptions(
         source=source,
-        target=Target(output, page),
+        target=OutputPaths(output, page),
         selection=selection,
         method=method_with(method, {**settings, "filter": ramp}),
         budget=budget,
         quality=quality,
-        keeper=Keeper(checkpoint, resume),
+        checkpoints=CheckpointOptions(checkpoint, resume),
         device=device,
         filter=ramp,
         seed=seed,
@@ -126,7 +126,7 @@ def recon(
     last: list[Event] = []
     with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         sink = fan_out(last.append, *(json_sinks or [terminal]))
-        metrics = (follow_scan if follow else run)(options, sink, clock, stop_scope=StopOnSignal())
+        metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
     if not as_json:
         click.echo(results(last[-1].data))
     if last[-1].data.get("ended_early"):

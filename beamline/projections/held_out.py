@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from recon.base.geometry import Geometry
 
 _EVERY = 10  # one of so many views is kept back where all of them were chosen
@@ -29,7 +29,7 @@ def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) 
     return np.concatenate((projections, data)), together, list(range(geometry.n_views, together.n_views))
 
 
-def keep_back(prepared: Prepared) -> Prepared:
+def keep_back(prepared: PreparedProjections) -> PreparedProjections:
     """The same views with every tenth held out, where none is yet.
 
     Raises:

@@ -33,7 +33,7 @@ _HELD_OUT_VIEWS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedProjections:
     """Line integrals ready for reconstruction.
 
     Attributes:
@@ -57,7 +57,7 @@ class Prepared:
     quantity: str
 
 
-def prepare(source: ScanSource, selection: Selection, warn: Warn) -> Prepared:
+def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) -> PreparedProjections:
     """Read, correct and align what `selection` asks for.
 
     Args:
@@ -111,7 +111,7 @@ def assemble(
     axis: tuple[float, AxisEstimate | None],
     warn: Warn,
     held_out: tuple[NDArray[np.float32], Geometry] | None = None,
-) -> Prepared:
+) -> PreparedProjections:
     """Corrected views with their geometry, after a look at what correction had to repair.
 
     Args:
@@ -128,7 +128,7 @@ def assemble(
     if not projections.data.any():
         raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
     axis_col, estimate = axis
-    return Prepared(
+    return PreparedProjections(
         projections=projections,
         geometry=geometry_of(source, selection, axis_col, source.angles[projections.view_ids]),
         axis_col=axis_col,

@@ -12,7 +12,7 @@ import numpy as np
 import recon
 from beamline.projections.correction import Warn
 from beamline.projections.held_out import with_held_out
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from recon.assess.time_model import CURVES, Choice, Speeds, choose, parts_of
 from recon.base.binning import bin_views
 from recon.base.method import DataUse, Progress, RunControl
@@ -45,7 +45,7 @@ class Budgeted:
     """
 
     result: Reconstruction
-    prepared: Prepared
+    prepared: PreparedProjections
     choice: Choice
     speeds: Speeds
     seconds: float
@@ -78,7 +78,7 @@ class Budgeted:
 
 def within(
     budget: float,
-    prepared: Prepared,
+    prepared: PreparedProjections,
     seed: int,
     filter: Filter,
     now: Now,
@@ -145,7 +145,7 @@ def _least(choice: Choice, speeds: Speeds) -> float:
     return first + (speeds.start + speeds.fill) * choice.share + speeds.step / choice.binning**2
 
 
-def joined(prepared: Prepared, factor: int) -> Prepared:
+def joined(prepared: PreparedProjections, factor: int) -> PreparedProjections:
     """The same views with factor x factor pixels joined: means of line integrals."""
     if factor == 1:
         return prepared

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing
 from beamline.projections.correction import Warn
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.writers.recon_file import Value
 from recon.base.geometry import Geometry
@@ -25,7 +25,7 @@ from recon.splatting.settings import FitSettings
 _SHOWN = 40  # characters of a value that is told
 
 
-def made_from(prepared: Prepared, settings: FitSettings, others: Mapping[str, Value]) -> dict[str, Value]:
+def fit_origin(prepared: PreparedProjections, settings: FitSettings, others: Mapping[str, Value]) -> dict[str, Value]:
     """Everything that decides what a step does: data (by a checksum), geometry and settings.
 
     Args:
@@ -69,7 +69,7 @@ def _told(one: Value, other: Value) -> str:
 
 
 @dataclass(frozen=True)
-class Keeper:
+class CheckpointOptions:
     """Where a fit's state is kept and where it comes from.
 
     Attributes:

@@ -13,14 +13,14 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import keep_back, with_held_out
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.reconstruct.budget import within
-from beamline.reconstruct.checkpoints import made_from
+from beamline.reconstruct.checkpoints import fit_origin
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
-from beamline.reconstruct.recon_report import Context, Made, facts_of
-from beamline.reconstruct.result import deliver
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.result import write_result
 from drivers.clock import Clock
 from recon.base.method import DataUse, Method, Progress, RunControl
 from recon.base.volume import Grid
@@ -30,7 +30,9 @@ from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
 
-def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope = never_stopped) -> dict[str, float]:
+def reconstruct_file(
+    options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope = never_stopped
+) -> dict[str, float]:
     """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
 
     A fit that is stopped within `stop_scope` delivers what it has, marked `ended_early`.
@@ -40,7 +42,7 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope =
     """
     started = clock.now()
     options.target.refuse_existing()
-    options.keeper.refuse_existing()
+    options.checkpoints.refuse_existing()
     check_device(options.device)
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
@@ -54,7 +56,7 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope =
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
         facts = facts_of(source)
-        prepared = prepare(source, options.selection, warn)
+        prepared = prepare_projections(source, options.selection, warn)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = keep_back(prepared)
@@ -72,11 +74,11 @@ def run(options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope =
         else:
             made = _fit(work, options.method) if isinstance(options.method, R2) else _made(work)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
-    context = Context(facts, selection, options.command, options.seed, warn.messages, started)
-    return deliver(made, prepared, truth, options.target, context, sink, clock)
+    context = ReportContext(facts, selection, options.command, options.seed, warn.messages, started)
+    return write_result(made, prepared, truth, options.target, context, sink, clock)
 
 
-def announce(options: ReconOptions, prepared: Prepared, sink: Sink, clock: Clock) -> None:
+def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Say what is about to be reconstructed."""
     data = {
         "file": options.source.path,
@@ -103,7 +105,7 @@ class _Work:
     """What a reconstruction is made of and with."""
 
     options: ReconOptions
-    prepared: Prepared
+    prepared: PreparedProjections
     sink: Sink
     clock: Clock
     stop_latch: StopLatch
@@ -139,9 +141,9 @@ class _Work:
                 use=DataUse(held_out=held_out), control=control,
             )  # fmt: skip
 
-    def made(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> Made:
+    def made(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:
         """The result with what it was made with: its own settings, `settings`, and whether it ended early."""
-        return Made(
+        return ReconOutcome(
             volume=result.volume,
             method=result.method,
             seconds=result.seconds,
@@ -152,14 +154,14 @@ class _Work:
         )
 
 
-def _made(work: _Work) -> Made:
+def _made(work: _Work) -> ReconOutcome:
     """By a method without a state to keep."""
     result = work.run(work.options.method, RunControl(on_progress=work.listener()))
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
     return work.made(result, work.stop_latch.cut(reached, planned))
 
 
-def _fit(work: _Work, method: R2) -> Made:
+def _fit(work: _Work, method: R2) -> ReconOutcome:
     """Fit Gaussians; save the state of the fit and continue from a saved one where that is wanted."""
     options, prepared = work.options, work.prepared
     asked, chosen = method.gaussians, ""
@@ -167,17 +169,17 @@ def _fit(work: _Work, method: R2) -> Made:
         method = method.with_quality(
             options.quality, default_count(Grid.of_field(prepared.geometry, work.grid.voxel_size))
         )
-    steps, keeper = method.planned_steps or 0, options.keeper
+    steps, checkpoints = method.planned_steps or 0, options.checkpoints
     origin, resume = {}, None
-    if keeper.wanted:
+    if checkpoints.wanted:
         assert method.gaussians is None or isinstance(method.gaussians, int)
         others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
-        origin = made_from(prepared, method.fit, others)
-        resume = keeper.begin(origin, steps, work.warn)
-    keep = partial(keeper.write, origin, steps, work.warn)
+        origin = fit_origin(prepared, method.fit, others)
+        resume = checkpoints.begin(origin, steps, work.warn)
+    keep = partial(checkpoints.write, origin, steps, work.warn)
     control = RunControl(
         on_progress=work.listener(method.seconds),
-        on_checkpoint=None if keeper.path is None else keep,
+        on_checkpoint=None if checkpoints.path is None else keep,
         resume=resume,
     )
     result = work.run(method, control)
@@ -192,11 +194,11 @@ def _fit(work: _Work, method: R2) -> Made:
     result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     # Sweeps come after the last step, and end early as well.
     early = work.stop_latch.stopped if method.polish else work.stop_latch.cut(result.history[-1].step, steps)
-    resumed = {} if keeper.resume is None else {"resumed_from": str(keeper.resume)}
+    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return work.made(result, early, chosen, **resumed)
 
 
-def _spend(work: _Work, budget: float) -> tuple[Made, Prepared, int]:
+def _spend(work: _Work, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
     """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
     warm_up(geometry=work.prepared.geometry)  # compilation happens once on a machine; no budget pays for it
     with work.refused():

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopScope, never_stopped
-from beamline.reconstruct.growing import Growing
+from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.recon_report import Context, facts_of
-from beamline.reconstruct.result import deliver
+from beamline.reconstruct.recon_report import ReportContext, facts_of
+from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from drivers.clock import Clock
 from recon.warm_up import warm_up
@@ -20,7 +20,7 @@ DEFAULT_SECONDS = 20.0  # of the last round
 
 
 @dataclass(frozen=True)
-class Rhythm:
+class FollowTiming:
     """How a scan is followed; all in s.
 
     Attributes:
@@ -40,7 +40,7 @@ def follow(
     options: ReconOptions,
     sink: Sink,
     clock: Clock,
-    rhythm: Rhythm | None = None,
+    rhythm: FollowTiming | None = None,
     stop_scope: StopScope = never_stopped,
 ) -> dict[str, float]:
     """Reconstruct a scan while it runs (or one that has ended). Returns the metrics; the event `done` says the rest.
@@ -52,7 +52,7 @@ def follow(
         ConfigError: a method or selection that needs the whole scan.
         DataError: no scan, or one that stopped growing without being finished.
     """
-    rhythm = rhythm or Rhythm()
+    rhythm = rhythm or FollowTiming()
     method = options.streaming
     if options.selection.views != "all" or method.steps is not None:
         raise ConfigError(
@@ -65,19 +65,19 @@ def follow(
     sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
     warm_up()
     with _open(options, sink, clock, rhythm) as source:
-        growing = Growing(options, source, sink, clock, warn)
+        growing = ScanFollower(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
         with stop_scope() as stopped:
             made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
-    context = Context(facts, options.selection, options.command, options.seed, warn.messages, started)
-    metrics = deliver(made, prepared, truth, options.target, context, sink, clock)
+    context = ReportContext(facts, options.selection, options.command, options.seed, warn.messages, started)
+    metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
     growing.snapshot_path.unlink(missing_ok=True)
     return metrics
 
 
-def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm) -> ScanSource:
+def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> ScanSource:
     """Wait for the file to be there and readable."""
     begin = clock.now()
     told = False
@@ -93,7 +93,7 @@ def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: Rhythm) -> Sc
             clock.sleep(rhythm.poll)
 
 
-def _watch(growing: Growing, clock: Clock, rhythm: Rhythm) -> None:
+def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming) -> None:
     """Take views and fit, in turns, until the scan has ended."""
     last_frame = last_snapshot = clock.now()
     while True:

@@ -14,7 +14,7 @@ from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import (
-    Prepared,
+    PreparedProjections,
     assemble,
     check,
     correction_blockers,
@@ -25,7 +25,7 @@ from beamline.projections.prepare import (
 from beamline.projections.selection import check_axis, cone_of, geometry_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
-from beamline.reconstruct.recon_report import Made
+from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
@@ -40,7 +40,7 @@ _BATCH = 32  # views corrected before the fit goes on
 _AXIS_MOVES = 0.3  # px by which a better axis makes the fit begin anew
 
 
-class Growing:
+class ScanFollower:
     """A scan's file and the volume that grows with it. Who follows it says when to look, to fit and to finish."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
@@ -205,7 +205,9 @@ class Growing:
         data = {"path": self.snapshot_path, "n_views": self._fit.n_views, "seconds": seconds}
         self._sink(Event("snapshot", self._clock.now(), data))
 
-    def finish(self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]) -> tuple[Made, Prepared]:
+    def finish(
+        self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]
+    ) -> tuple[ReconOutcome, PreparedProjections]:
         """The last round over all views in `seconds` or until `stopped`, with snapshots.
 
         Returns the volume, and the line integrals that it grew from, to judge it by.
@@ -247,10 +249,10 @@ class Growing:
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
         method, seconds = self._options.method.name, self._clock.now() - self._begin
-        made = Made(volume, method, seconds, self._history, settings, self._options.filter)
+        made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter)
         return made, prepared
 
-    def _prepared(self, axis_col: float) -> Prepared:
+    def _prepared(self, axis_col: float) -> PreparedProjections:
         projections = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
         self._parts = [projections]
         return assemble(self.source, self._options.selection, projections, (axis_col, self.axis), self._warn)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from beamline.storage import hdf5
 from beamline.storage.volume_file import read_volume
 from recon.assess import metrics
@@ -85,7 +85,7 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
 
 
 def measure(
-    volume: Volume, prepared: Prepared, truth: Volume | None, mask: NDArray[np.int8] | None
+    volume: Volume, prepared: PreparedProjections, truth: Volume | None, mask: NDArray[np.int8] | None
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 

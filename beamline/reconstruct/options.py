@@ -7,8 +7,8 @@ from pathlib import Path
 
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
-from beamline.reconstruct.checkpoints import Keeper
-from beamline.reconstruct.result import Target
+from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.open import Quantity, ScanSource, open_scan
 from recon.assess.time_model import Quality
 from recon.base.method import Method
@@ -53,7 +53,7 @@ class ReconOptions:
         budget: s for everything from line integrals to volume; chooses the method and all settings.
         quality: a preset instead of the fit's steps, Gaussians and polish.
         device: to compute on.
-        keeper: of the fit's state.
+        checkpoints: of the fit's state.
         filter: of the FBP that the volume is compared with.
         seed: of everything random.
         truth: FILE or FILE:first:end to compare with.
@@ -62,13 +62,13 @@ class ReconOptions:
     """
 
     source: SourceOptions
-    target: Target
+    target: OutputPaths
     selection: Selection
     method: Method = field(default_factory=R2)
     budget: float | None = None
     quality: Quality | None = None
     device: str = "cpu"
-    keeper: Keeper = field(default_factory=Keeper)
+    checkpoints: CheckpointOptions = field(default_factory=CheckpointOptions)
     filter: Filter = "hann"
     seed: int = 0
     truth: str | None = None

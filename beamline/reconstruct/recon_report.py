@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.report import figures
 from beamline.report.html import Picture, Report
@@ -48,7 +48,7 @@ class ScanFacts:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class ReconOutcome:
     """A reconstruction and how it was made.
 
     Attributes:
@@ -105,7 +105,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Context:
+class ReportContext:
     """What surrounds a reconstruction: the scan, the selection, the command, and what was warned of so far."""
 
     facts: ScanFacts
@@ -147,13 +147,13 @@ def facts_of(source: ScanSource) -> ScanFacts:
 
 
 def compose(
-    made: Made,
-    prepared: Prepared,
+    made: ReconOutcome,
+    prepared: PreparedProjections,
     truth: Volume | None,
     volumes: Mapping[str, Volume],
     metrics: Mapping[str, Mapping[str, float]],
     parameters: Mapping[str, Value],
-    context: Context,
+    context: ReportContext,
 ) -> Report:
     """The report on a reconstruction."""
     name, geometry = label_of(made.method), prepared.geometry
@@ -198,7 +198,9 @@ def compose(
     )
 
 
-def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:
+def _pictures(
+    made: ReconOutcome, prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]
+) -> list[Picture]:
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
     row = geometry.detector_shape[0] // 2
     shown = {"Truth": truth} if truth is not None else {}
@@ -240,12 +242,12 @@ def _pictures(made: Made, prepared: Prepared, truth: Volume | None, volumes: Map
     return pictures
 
 
-def _grew(made: Made) -> bool:
+def _grew(made: ReconOutcome) -> bool:
     """The views came while the volume was fitted."""
     return len({progress.n_views for progress in made.history}) > 1
 
 
-def _told_by_history(made: Made) -> str:
+def _told_by_history(made: ReconOutcome) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit to the views it had"]

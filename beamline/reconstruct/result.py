@@ -11,9 +11,9 @@ import numpy as np
 
 from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions
-from beamline.reconstruct.recon_report import Context, Made, compose, label_of
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
@@ -25,7 +25,7 @@ from recon.voxels.direct import direct, has_direct_method
 
 
 @dataclass(frozen=True)
-class Target:
+class OutputPaths:
     """Where results go. `report` is None where none is wanted; `replace` takes the place of older results."""
 
     output: Path
@@ -40,8 +40,14 @@ class Target:
                 refuse_existing(self.report)
 
 
-def deliver(
-    made: Made, prepared: Prepared, truth: Volume | None, target: Target, context: Context, sink: Sink, clock: Clock
+def write_result(
+    made: ReconOutcome,
+    prepared: PreparedProjections,
+    truth: Volume | None,
+    target: OutputPaths,
+    context: ReportContext,
+    sink: Sink,
+    clock: Clock,
 ) -> dict[str, float]:
     """Measure the volume, write its file and the report, and send the event `done`. Returns the metrics.
 
@@ -103,7 +109,7 @@ def deliver(
     return own
 
 
-def parameters_of(made: Made, prepared: Prepared, context: Context) -> dict[str, Value]:
+def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
     """Everything that the volume depends on, by name."""
     selection, geometry = context.selection, prepared.geometry
     rows = selection.rows

@@ -15,7 +15,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.files import named_on_failure
 from beamline.core.machine import machine
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import SourceOptions
@@ -81,7 +81,7 @@ def run_tradeoff(
     warn = Warnings(sink, clock)
     with options.source.open() as source:
         facts = facts_of(source)
-        prepared = prepare(source, options.selection, warn)
+        prepared = prepare_projections(source, options.selection, warn)
     grid = Grid.matching(prepared.geometry)
     truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning).data
     data = split(prepared, truth)
@@ -127,7 +127,7 @@ def run_tradeoff(
     return table
 
 
-def split(prepared: Prepared, truth: Any) -> Data:
+def split(prepared: PreparedProjections, truth: Any) -> Data:
     """The views that trials may use, and those that none may: judging by data needs views that no trial has seen.
 
     Raises:

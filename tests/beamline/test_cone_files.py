@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.digest import digest
-from beamline.projections.prepare import prepare
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -67,7 +67,7 @@ def _never(message: str) -> None:
 def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> None:
     with open_scan(scan) as source:
         assert source.cone == (SOD, SDD)
-        prepared = prepare(source, PLAIN, _never)
+        prepared = prepare_projections(source, PLAIN, _never)
     geometry = prepared.geometry
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     assert geometry.period == pytest.approx(2 * np.pi)
@@ -83,8 +83,8 @@ def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> 
 
 def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:
     with open_scan(scan) as source:
-        whole = prepare(source, PLAIN, _never).geometry
-        rows = prepare(source, replace(PLAIN, rows=(10, 30), binning=2), _never).geometry
+        whole = prepare_projections(source, PLAIN, _never).geometry
+        rows = prepare_projections(source, replace(PLAIN, rows=(10, 30), binning=2), _never).geometry
     assert rows.detector_shape == (10, 24)
     # The central ray met row 19.5 of the detector: 9.5 of the rows that are read, 4.5 of these in pairs.
     assert (whole.axis_row, rows.axis_row) == (19.5, pytest.approx(4.5))
@@ -97,7 +97,7 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
     with open_scan(path) as source:
         assert source.cone is None  # a detector's distance alone is propagation in a parallel beam
         told = replace(PLAIN, cone=(SOD, SDD))
-        assert prepare(source, told, _never).geometry.is_cone
+        assert prepare_projections(source, told, _never).geometry.is_cone
 
 
 def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
@@ -108,4 +108,4 @@ def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.h5"
         _write(path, info, views=4)
         with open_scan(path) as source, pytest.raises(error, match=words):
-            prepare(source, PLAIN, _never)
+            prepare_projections(source, PLAIN, _never)

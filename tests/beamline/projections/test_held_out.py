@@ -9,7 +9,7 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.held_out import keep_back, with_held_out
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import SourceOptions
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -17,11 +17,11 @@ from tests.beamline.scans import TwoCylinders, write_exchange
 ANGLES = np.radians(np.arange(0, 180, 6.0))
 
 
-def _prepared(tmp_path: Path, views: str, angles: np.ndarray = ANGLES) -> Prepared:
+def _prepared(tmp_path: Path, views: str, angles: np.ndarray = ANGLES) -> PreparedProjections:
     scan = TwoCylinders(angles=angles, shape=(2, 40))
     write_exchange(tmp_path / "scan.h5", scan)
     with SourceOptions(tmp_path / "scan.h5").open() as source:
-        return prepare(source, Selection(views=views, axis_col=scan.axis_col), lambda said: None)
+        return prepare_projections(source, Selection(views=views, axis_col=scan.axis_col), lambda said: None)
 
 
 def test_every_tenth_view_is_kept_back_where_all_were_chosen(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections import prepare as pipeline
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan
 from recon.base.geometry import Geometry
@@ -24,10 +24,10 @@ SCAN = TwoCylinders()
 PLAIN = CorrectionSettings(air="none")
 
 
-def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[Prepared, list[str]]:
+def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[PreparedProjections, list[str]]:
     warnings: list[str] = []
     with open_scan(path, **said) as source:
-        return prepare(source, selection, warnings.append), warnings
+        return prepare_projections(source, selection, warnings.append), warnings
 
 
 def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
     data = np.concatenate([np.full((1, 4, 40), DARK), flats[0], views, flats[1]]).astype(np.float32)
     angles = np.concatenate([[np.nan] * 2, SCAN.angles, [np.nan]])
     source = ArraySource(data, [2, 1] + [0] * n + [1], angles)
-    prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
 
 
@@ -121,7 +121,7 @@ def exposed(flats: list[float], dark: float = 0.1, views: float = 0.1) -> ArrayS
 def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(flats: list[float], binning: int) -> None:
     """Without it every line integral would be off by log(flat exposure / view exposure)."""
     selection = Selection(axis_col=20.7, correction=PLAIN, binning=binning)
-    prepared = prepare(exposed(flats), selection, pytest.fail)  # type: ignore[arg-type]
+    prepared = prepare_projections(exposed(flats), selection, pytest.fail)  # type: ignore[arg-type]
     shape = (45, 4 // binning, binning, 40 // binning, binning)
     expected = -np.log(np.exp(-SCAN.line_integrals()).reshape(shape).mean(axis=(2, 4)))
     np.testing.assert_allclose(prepared.projections.data, expected, atol=1e-5)
@@ -133,14 +133,14 @@ def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
     source.exposures[source.image_key == (1 if unknown == "flats" else 0)] = np.nan
     source.exposures[source.image_key == (0 if unknown == "flats" else 1)] = 7.0
     source.exposures[source.image_key == 2] = np.nan
-    prepared = prepare(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
 
 
 def test_darks_of_another_exposure_are_told() -> None:
     warnings: list[str] = []
     selection = Selection(axis_col=20.7, correction=PLAIN)
-    prepare(exposed([0.1], dark=0.025), selection, warnings.append)  # type: ignore[arg-type]
+    prepare_projections(exposed([0.1], dark=0.025), selection, warnings.append)  # type: ignore[arg-type]
     assert len(warnings) == 1
     assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warnings[0]
 
@@ -214,12 +214,12 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     )
     source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
     warnings: list[str] = []
-    prepared = prepare(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
     assert prepared.axis_col == 18.0
     assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
     source.axis_col = 20.5
     warnings.clear()
-    prepared = prepare(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
     assert prepared.axis_col == 20.5
     assert any("the file's 20.50 is used" in text for text in warnings)
 

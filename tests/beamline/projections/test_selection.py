@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import ConfigError
-from beamline.projections.prepare import prepare
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection, unbinned
 from beamline.storage.readers.open import open_scan
 from recon.base.geometry import Geometry
@@ -35,4 +35,4 @@ def test_unbinned_inverts_the_geometrys_binning(column: float, binning: int) -> 
 def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: str) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders())
     with open_scan(path) as source, pytest.raises(ConfigError, match=said):
-        prepare(source, selection, pytest.fail)
+        prepare_projections(source, selection, pytest.fail)

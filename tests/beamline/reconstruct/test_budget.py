@@ -11,13 +11,13 @@ import pytest
 
 import recon
 from beamline.core.events import Event
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
 from beamline.reconstruct.budget import Budgeted, joined, within
-from beamline.reconstruct.finished import run
+from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions, SourceOptions
-from beamline.reconstruct.result import Target
+from beamline.reconstruct.result import OutputPaths
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.assess.metrics import psnr
@@ -46,19 +46,21 @@ class Ticking:
 
 
 @pytest.fixture
-def prepared(tmp_path: Path) -> Prepared:
+def prepared(tmp_path: Path) -> PreparedProjections:
     write_exchange(tmp_path / "scan.h5", SCAN)
     with SourceOptions(tmp_path / "scan.h5").open() as source:
-        return prepare(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
+        return prepare_projections(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
 
 
-def _spend(prepared: Prepared, budget: float, now: Ticking, warned: list[str] | None = None) -> Budgeted:
+def _spend(prepared: PreparedProjections, budget: float, now: Ticking, warned: list[str] | None = None) -> Budgeted:
     said = [] if warned is None else warned
     return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False, said.append)
 
 
 @pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
-def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+def test_the_time_is_used_and_not_exceeded(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
+) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
     done = _spend(prepared, budget, Ticking(0.01))
@@ -70,7 +72,9 @@ def test_the_time_is_used_and_not_exceeded(prepared: Prepared, monkeypatch: pyte
     assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
 
 
-def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_machine_takes_fbp_of_joined_pixels(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     done = _spend(prepared, 5.0, Ticking(0.01))
     assert not done.choice.fits and done.choice.binning == 2
@@ -79,7 +83,7 @@ def test_a_slow_machine_takes_fbp_of_joined_pixels(prepared: Prepared, monkeypat
 
 
 def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said_to_be_late(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = Ticking(0.01)
 
@@ -101,14 +105,18 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
 
 
 @pytest.mark.slow
-def test_the_shortest_fit_is_said_to_be_late_too(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_shortest_fit_is_said_to_be_late_too(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     warned: list[str] = []
     _spend(_cone(prepared, 3.6), 0.001, Ticking(0.01), warned)
     assert len(warned) == 1 and "the cheapest choice, r2, pixels joined" in warned[0]
 
 
-def _cone(prepared: Prepared, turn: float, magnification: float = 10.0, tilt: float = 0.0) -> Prepared:
+def _cone(
+    prepared: PreparedProjections, turn: float, magnification: float = 10.0, tilt: float = 0.0
+) -> PreparedProjections:
     """A cone's views of the same cylinders by the voxel projector, on pixels as large at the axis as before."""
     pitch = prepared.geometry.pixel_pitch
     angles = np.linspace(0, turn, 36, endpoint=False)
@@ -123,7 +131,7 @@ def _cone(prepared: Prepared, turn: float, magnification: float = 10.0, tilt: fl
     )
 
 
-def test_a_cones_budget_counts_pixels_at_the_axis(prepared: Prepared) -> None:
+def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections) -> None:
     """Magnified ten times, a pixel is ten voxels wide on the detector, and one at the axis."""
     cone = _cone(prepared, 2 * np.pi)
     done = _spend(cone, 8.0, Ticking(0.01))
@@ -135,13 +143,17 @@ def test_a_cones_budget_counts_pixels_at_the_axis(prepared: Prepared) -> None:
     assert done.result.history[-1].residual < 0.05
 
 
-def test_a_cone_is_placed_as_its_parallel_likeness_is(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cone_is_placed_as_its_parallel_likeness_is(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
     counts = [_spend(views, 3.0, Ticking(0.01)).placed for views in (prepared, _cone(prepared, 2 * np.pi))]
     assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) > 500
 
 
-def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(prepared: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     done = _spend(_cone(prepared, 2 * np.pi), 5.0, Ticking(0.01))
     assert done.said(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
@@ -149,7 +161,7 @@ def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(prepared: Prepared, m
 
 @pytest.mark.parametrize(("turn", "tilt"), [(3.6, 0.0), (2 * np.pi, 0.02)])
 def test_views_without_a_direct_method_get_the_shortest_fit(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, turn: float, tilt: float
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, turn: float, tilt: float
 ) -> None:
     """A cone's short scan, and views that lean, are for neither FBP nor FDK."""
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
@@ -159,7 +171,7 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
     assert done.result.volume.data.max() > 0
 
 
-def test_joined_views_keep_their_scale_and_place(prepared: Prepared) -> None:
+def test_joined_views_keep_their_scale_and_place(prepared: PreparedProjections) -> None:
     assert joined(prepared, 1) is prepared
     half = joined(prepared, 2)
     assert half.geometry.pixel_pitch == 2 * prepared.geometry.pixel_pitch
@@ -173,14 +185,14 @@ def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
     monkeypatch.setattr(module, "choose", lambda *_: Choice(2, 1.0, 100, 1.0))
     with SourceOptions(tmp_path / "scan.h5").open() as source:
-        grid = Grid.matching(prepare(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
+        grid = Grid.matching(prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
     np.save(tmp_path / "truth.npy", SCAN.truth(grid))
     options = ReconOptions(
-        SourceOptions(tmp_path / "scan.h5"), Target(tmp_path / "out.h5", tmp_path / "out.html"),
+        SourceOptions(tmp_path / "scan.h5"), OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
         Selection(axis_col=SCAN.axis_col), budget=1.0, truth=str(tmp_path / "truth.npy"),
     )  # fmt: skip
     events: list[Event] = []
-    metrics = run(options, events.append, SystemClock())
+    metrics = reconstruct_file(options, events.append, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
     assert record.volume.grid.shape == (3, 20, 20)
     assert (record.parameters["binning"], record.parameters["budget"]) == (2, 1.0)
@@ -195,11 +207,11 @@ def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
 def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     options = ReconOptions(
-        SourceOptions(tmp_path / "scan.h5"), Target(tmp_path / "out.h5", None), Selection(axis_col=SCAN.axis_col),
+        SourceOptions(tmp_path / "scan.h5"), OutputPaths(tmp_path / "out.h5", None), Selection(axis_col=SCAN.axis_col),
         quality="preview",
     )  # fmt: skip
     events: list[Event] = []
-    run(options, events.append, SystemClock())
+    reconstruct_file(options, events.append, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
     preview = PRESETS["preview"]
     assert record.parameters["steps"] == preview.steps
@@ -210,12 +222,12 @@ def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
     events: list[Event] = []
-    plain = replace(options, quality=None, method=R2(steps=5), target=Target(tmp_path / "plain.h5", None))
-    run(plain, events.append, SystemClock())
+    plain = replace(options, quality=None, method=R2(steps=5), target=OutputPaths(tmp_path / "plain.h5", None))
+    reconstruct_file(plain, events.append, SystemClock())
     return dict(events[-1].data)
 
 
-def test_a_real_budget_on_a_real_clock(prepared: Prepared) -> None:
+def test_a_real_budget_on_a_real_clock(prepared: PreparedProjections) -> None:
     """Four seconds, and a tenth of grace; a machine busy with other work may stop this process for a while."""
     warm_up()
     begin = time.perf_counter()

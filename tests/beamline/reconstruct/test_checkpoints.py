@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.checkpoints import Keeper, differences, made_from
+from beamline.reconstruct.checkpoints import CheckpointOptions, differences, fit_origin
 from beamline.reconstruct.options import SourceOptions
 from beamline.storage.writers.checkpoint import Checkpoint, write_checkpoint
 from recon.splatting import optimise as fit
@@ -28,26 +28,26 @@ SETTINGS = FitSettings()
 
 
 @pytest.fixture
-def prepared(tmp_path: Path) -> Prepared:
+def prepared(tmp_path: Path) -> PreparedProjections:
     write_exchange(tmp_path / "scan.h5", SCAN)
     with SourceOptions(tmp_path / "scan.h5").open() as source:
-        return prepare(source, Selection(axis_col=SCAN.axis_col), lambda said: None)
+        return prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda said: None)
 
 
-def _flipped(prepared: Prepared) -> Prepared:
+def _flipped(prepared: PreparedProjections) -> PreparedProjections:
     """One bit of one pixel is another."""
     data = prepared.projections.data.copy()
     data.view(np.uint32)[3, 1, 7] ^= 1
     return replace(prepared, projections=replace(prepared.projections, data=data))
 
 
-def _turned(prepared: Prepared) -> Prepared:
+def _turned(prepared: PreparedProjections) -> PreparedProjections:
     angles = prepared.geometry.angles.copy()
     angles[4] += 1e-9
     return replace(prepared, geometry=prepared.geometry.at(angles))
 
 
-CHANGES: dict[str, tuple[Callable[[Prepared], Prepared], FitSettings, dict[str, Any]]] = {
+CHANGES: dict[str, tuple[Callable[[PreparedProjections], PreparedProjections], FitSettings, dict[str, Any]]] = {
     "projections": (_flipped, SETTINGS, OTHERS),
     "angles": (_turned, SETTINGS, OTHERS),
     "axis_col": (lambda p: replace(p, geometry=replace(p.geometry, axis_col=20.0)), SETTINGS, OTHERS),
@@ -61,26 +61,26 @@ CHANGES: dict[str, tuple[Callable[[Prepared], Prepared], FitSettings, dict[str, 
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_every_change_is_told_by_its_name(prepared: Prepared, name: str) -> None:
-    before = made_from(prepared, SETTINGS, OTHERS)
+def test_every_change_is_told_by_its_name(prepared: PreparedProjections, name: str) -> None:
+    before = fit_origin(prepared, SETTINGS, OTHERS)
     change, settings, others = CHANGES[name]
-    found = differences(made_from(change(prepared), settings, others), before)
+    found = differences(fit_origin(change(prepared), settings, others), before)
     assert [said.split(" ")[0] for said in found] == [name]
 
 
-def test_fewer_views_are_told_by_number(prepared: Prepared) -> None:
+def test_fewer_views_are_told_by_number(prepared: PreparedProjections) -> None:
     few = replace(
         prepared,
         projections=replace(prepared.projections, data=prepared.projections.data[:20]),
         geometry=prepared.geometry.select(slice(20)),
     )
-    found = differences(made_from(few, SETTINGS, OTHERS), made_from(prepared, SETTINGS, OTHERS))
+    found = differences(fit_origin(few, SETTINGS, OTHERS), fit_origin(prepared, SETTINGS, OTHERS))
     assert "n_views (20, 30 in the checkpoint)" in found
 
 
-def test_views_held_out_do_not_matter(prepared: Prepared) -> None:
+def test_views_held_out_do_not_matter(prepared: PreparedProjections) -> None:
     spoilt = replace(prepared, held_out=(np.zeros((1, 2, 40), np.float32), prepared.geometry.select([0])))
-    assert not differences(made_from(spoilt, SETTINGS, OTHERS), made_from(prepared, SETTINGS, OTHERS))
+    assert not differences(fit_origin(spoilt, SETTINGS, OTHERS), fit_origin(prepared, SETTINGS, OTHERS))
 
 
 def _state(**changes: Any) -> dict[str, Any]:
@@ -89,11 +89,11 @@ def _state(**changes: Any) -> dict[str, Any]:
     return {**arrays_of(fit.init(model, 0)), **changes}
 
 
-def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: Prepared) -> None:
+def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: PreparedProjections) -> None:
     path, said = tmp_path / "fit.h5", list[str]()
-    origin = made_from(prepared, SETTINGS, OTHERS)
-    Keeper(path).write(origin, 100, said.append, _state())
-    again = Keeper(path, path)
+    origin = fit_origin(prepared, SETTINGS, OTHERS)
+    CheckpointOptions(path).write(origin, 100, said.append, _state())
+    again = CheckpointOptions(path, path)
     again.refuse_existing()  # the one that it begins from may be replaced
     state = again.begin(origin, 100, said.append)
     assert state is not None and not said
@@ -102,7 +102,7 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: Prepared) 
     again.begin(origin, 200, said.append)
     assert "100 steps, this one is over 200 steps" in said[0]
     with pytest.raises(DataError, match=r"loss \(l1, l2 in the checkpoint|loss \(l2, l1 in the checkpoint"):
-        again.begin(made_from(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
+        again.begin(fit_origin(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
 
 
 @pytest.mark.parametrize(
@@ -113,11 +113,13 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: Prepared) 
         (0, 200, "of a fit over a time, this one is over 200 steps:"),
     ],
 )
-def test_a_plan_without_steps_is_told(tmp_path: Path, prepared: Prepared, kept: int, wanted: int, words: str) -> None:
+def test_a_plan_without_steps_is_told(
+    tmp_path: Path, prepared: PreparedProjections, kept: int, wanted: int, words: str
+) -> None:
     path, said = tmp_path / "fit.h5", list[str]()
-    origin = made_from(prepared, SETTINGS, OTHERS)
-    Keeper(path).write(origin, kept, said.append, _state())
-    assert Keeper(path, path).begin(origin, wanted, said.append) is not None
+    origin = fit_origin(prepared, SETTINGS, OTHERS)
+    CheckpointOptions(path).write(origin, kept, said.append, _state())
+    assert CheckpointOptions(path, path).begin(origin, wanted, said.append) is not None
     assert len(said) == 1 and words in said[0]
 
 
@@ -134,7 +136,7 @@ def test_a_plan_without_steps_is_told(tmp_path: Path, prepared: Prepared, kept: 
 def test_a_damaged_checkpoint_is_to_blame_before_any_work(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
     write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(**changes), {}, 100))
     with pytest.raises(DataError, match=rf"checkpoint .*fit\.h5 is damaged: .*{said}"):
-        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+        CheckpointOptions(None, tmp_path / "fit.h5").refuse_existing()
 
 
 def test_a_checkpoint_that_lacks_arrays_is_to_blame(tmp_path: Path) -> None:
@@ -142,13 +144,13 @@ def test_a_checkpoint_that_lacks_arrays_is_to_blame(tmp_path: Path) -> None:
     del state["second.raw"]
     write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, {}, 100))
     with pytest.raises(DataError, match=r"fit\.h5 is damaged: .*second\.raw"):
-        Keeper(None, tmp_path / "fit.h5").refuse_existing()
+        CheckpointOptions(None, tmp_path / "fit.h5").refuse_existing()
 
 
 def test_a_plan_shorter_than_what_is_done_is_refused(tmp_path: Path) -> None:
     counts = np.array([100, 120, 0], np.int64)  # limit, step, seen
     write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(counts=counts), {}, 200))
-    again, said = Keeper(None, tmp_path / "fit.h5"), list[str]()
+    again, said = CheckpointOptions(None, tmp_path / "fit.h5"), list[str]()
     with pytest.raises(ConfigError, match=r"120 steps behind it, more than the 20 wanted: .* 120 with --steps"):
         again.begin({}, 20, said.append)
     assert again.begin({}, 120, said.append) is not None and again.begin({}, 0, said.append) is not None
@@ -157,15 +159,15 @@ def test_a_plan_shorter_than_what_is_done_is_refused(tmp_path: Path) -> None:
 def test_a_file_in_the_way_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "fit.h5").write_text("precious")
     with pytest.raises(DataError, match="never overwritten"):
-        Keeper(tmp_path / "fit.h5").refuse_existing()
+        CheckpointOptions(tmp_path / "fit.h5").refuse_existing()
     with pytest.raises(DataError, match="does not exist"):
-        Keeper(tmp_path / "no" / "fit.h5").refuse_existing()
+        CheckpointOptions(tmp_path / "no" / "fit.h5").refuse_existing()
     with pytest.raises(DataError, match="no checkpoint"):
-        Keeper(None, tmp_path / "fit.h5").refuse_existing()
-    assert Keeper().begin({}, 0, lambda said: None) is None and not Keeper().wanted
+        CheckpointOptions(None, tmp_path / "fit.h5").refuse_existing()
+    assert CheckpointOptions().begin({}, 0, lambda said: None) is None and not CheckpointOptions().wanted
 
 
 def test_a_disk_that_refuses_does_not_end_the_fit(tmp_path: Path) -> None:
     said: list[str] = []
-    Keeper(tmp_path / "no" / "fit.h5").write({}, 0, said.append, {})
+    CheckpointOptions(tmp_path / "no" / "fit.h5").write({}, 0, said.append, {})
     assert "left out" in said[0]

@@ -19,10 +19,10 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import checkpoints
 from beamline.reconstruct import finished as offline
 from beamline.reconstruct import result as deliver
-from beamline.reconstruct.checkpoints import Keeper
-from beamline.reconstruct.finished import run
+from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions, SourceOptions
-from beamline.reconstruct.result import Target
+from beamline.reconstruct.result import OutputPaths
 from beamline.storage.writers.checkpoint import read_checkpoint
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
@@ -47,7 +47,7 @@ def _options(tmp_path: Path, **changes: object) -> ReconOptions:
         write_exchange(tmp_path / "scan.h5", SCAN)
     options = ReconOptions(
         source=SourceOptions(tmp_path / "scan.h5"),
-        target=Target(tmp_path / "out.h5", None),
+        target=OutputPaths(tmp_path / "out.h5", None),
         selection=Selection(),
         method=Fbp(),
         command="beamline recon scan.h5 -m fbp",
@@ -61,7 +61,7 @@ def _names(folder: Path) -> set[str]:
 
 def test_fbp_is_the_object_in_inverse_millimetres(tmp_path: Path) -> None:
     events: list[Event] = []
-    metrics = run(_options(tmp_path), events.append, SystemClock())
+    metrics = reconstruct_file(_options(tmp_path), events.append, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
     truth = SCAN.truth(record.volume.grid)
     inside = truth == truth.max()
@@ -81,10 +81,10 @@ def test_fbp_is_the_object_in_inverse_millimetres(tmp_path: Path) -> None:
 def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -> None:
     events: list[Event] = []
     np.savez(tmp_path / "truth.npz", volume=SCAN.truth(Grid.matching(Geometry.parallel([0.0], (2, 40), 0.5))))
-    target = Target(tmp_path / "out.h5", tmp_path / "out.html")
+    target = OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")
     options = _options(tmp_path, method=R2(steps=150, gaussians=400), target=target, truth=str(tmp_path / "truth.npz"))
     options = replace(options, selection=Selection(views="fixed:12", axis_col=SCAN.axis_col))
-    metrics = run(options, events.append, SystemClock())
+    metrics = reconstruct_file(options, events.append, SystemClock())
     assert metrics["psnr"] > events[-1].data["fbp"]["psnr"]  # 12 views: FBP has streaks
     assert metrics["residual_held_out"] < events[-1].data["fbp"]["residual_held_out"]
     assert {"ssim3d", "nrmse", "residual", "seconds"} <= set(metrics)
@@ -112,7 +112,7 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
 
     monkeypatch.setattr(offline, "warm_up", compiled)
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
-    run(_options(tmp_path, selection=selection, **changes), lambda event: None, SystemClock())
+    reconstruct_file(_options(tmp_path, selection=selection, **changes), lambda event: None, SystemClock())
     assert len(asked) == 1
     geometry = asked[0].pop("geometry")
     assert isinstance(geometry, Geometry) and geometry.n_views == 20 and geometry.detector_shape == (2, 40)
@@ -123,7 +123,7 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
 
 def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
     selection = Selection(views="first:20", rows=(0, 2), binning=2, axis_col=20.7, seed=3)
-    run(_options(tmp_path, selection=selection, seed=3), lambda e: None, SystemClock())
+    reconstruct_file(_options(tmp_path, selection=selection, seed=3), lambda e: None, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
     said = {
         "method": "fbp",
@@ -152,7 +152,7 @@ def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
 def test_scale_unknown_means_pixels(tmp_path: Path) -> None:
     with h5py.File(write_exchange(tmp_path / "scan.h5", SCAN), "r+") as file:
         del file.attrs["pixel_size_mm"]
-    run(_options(tmp_path), lambda e: None, SystemClock())
+    reconstruct_file(_options(tmp_path), lambda e: None, SystemClock())
     record = read_reconstruction(tmp_path / "out.h5")
     assert record.length_unit == "px"
     assert record.volume.grid.voxel_size == 1.0
@@ -160,7 +160,7 @@ def test_scale_unknown_means_pixels(tmp_path: Path) -> None:
 
 
 def test_a_given_pixel_size_wins(tmp_path: Path) -> None:
-    run(_options(tmp_path, selection=Selection(pixel_size_mm=0.25)), lambda e: None, SystemClock())
+    reconstruct_file(_options(tmp_path, selection=Selection(pixel_size_mm=0.25)), lambda e: None, SystemClock())
     assert read_reconstruction(tmp_path / "out.h5").volume.grid.voxel_size == pytest.approx(0.25)
 
 
@@ -170,22 +170,22 @@ def test_a_given_pixel_size_wins(tmp_path: Path) -> None:
         ({"source": SourceOptions(Path("missing.h5"))}, DataError, "missing.h5"),
         ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
         ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
-        ({"target": Target(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
+        ({"target": OutputPaths(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
     ],
 )
 def test_failures_leave_nothing(tmp_path: Path, changes: dict[str, object], error: type[Exception], said: str) -> None:
     options = _options(tmp_path, **changes)
     with pytest.raises(error, match=said):
-        run(options, lambda e: None, SystemClock())
+        reconstruct_file(options, lambda e: None, SystemClock())
     assert _names(tmp_path) == {"scan.h5"}
 
 
 @pytest.mark.parametrize("existing", ["out.h5", "out.html"])
 def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> None:
     (tmp_path / existing).write_text("precious")
-    options = _options(tmp_path, target=Target(tmp_path / "out.h5", tmp_path / "out.html"))
+    options = _options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"))
     with pytest.raises(DataError, match="never overwritten"):
-        run(options, lambda e: None, SystemClock())
+        reconstruct_file(options, lambda e: None, SystemClock())
     assert (tmp_path / existing).read_text() == "precious"
     assert _names(tmp_path) == {"scan.h5", existing}
 
@@ -195,16 +195,16 @@ def test_a_report_that_fails_takes_the_volume_with_it(tmp_path: Path, monkeypatc
         raise DataError("no space left")
 
     monkeypatch.setattr(deliver, "write_report", full)
-    options = _options(tmp_path, target=Target(tmp_path / "out.h5", tmp_path / "out.html"))
+    options = _options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"))
     with pytest.raises(DataError, match="no space"):
-        run(options, lambda e: None, SystemClock())
+        reconstruct_file(options, lambda e: None, SystemClock())
     assert _names(tmp_path) == {"scan.h5"}
 
 
 def test_a_scan_still_being_written_is_not_taken_for_a_finished_one(tmp_path: Path) -> None:
     writer = NXtomoWriter(tmp_path / "scan.h5", ScanInfo(sample="s"), (4, 8), clock=SystemClock())
     with pytest.raises(DataError):
-        run(_options(tmp_path), lambda e: None, SystemClock())
+        reconstruct_file(_options(tmp_path), lambda e: None, SystemClock())
     writer.close()
     assert _names(tmp_path) == {"scan.h5"}
 
@@ -221,7 +221,7 @@ def test_what_a_dead_scan_left_is_reconstructed_when_asked_for(tmp_path: Path) -
     for frame in frames_of(SCAN)[:-5]:
         writer.append(frame, digest(frame.counts))
     options = _options(tmp_path, unfinished=True)
-    run(options, listen, SystemClock())
+    reconstruct_file(options, listen, SystemClock())
     writer.close("failed")
     record = read_reconstruction(options.target.output)
     assert record.parameters["n_views"] == SCAN.angles.size - 5
@@ -231,8 +231,10 @@ def test_what_a_dead_scan_left_is_reconstructed_when_asked_for(tmp_path: Path) -
 def test_the_same_seed_gives_the_same_volume(tmp_path: Path) -> None:
     volumes = []
     for name in ("a.h5", "b.h5"):
-        options = _options(tmp_path, method=R2(steps=20, gaussians=200), seed=5, target=Target(tmp_path / name, None))
-        run(options, lambda e: None, SystemClock())
+        options = _options(
+            tmp_path, method=R2(steps=20, gaussians=200), seed=5, target=OutputPaths(tmp_path / name, None)
+        )
+        reconstruct_file(options, lambda e: None, SystemClock())
         volumes.append(read_reconstruction(tmp_path / name).volume.data)
     np.testing.assert_allclose(volumes[0], volumes[1], atol=1e-4 * np.abs(volumes[0]).max())
 
@@ -249,7 +251,7 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     """Ended after some steps, begun again from its file: the same volume to the bit, with views held out as well."""
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
     whole = _options(tmp_path, **{**FIT, "selection": selection})
-    run(whole, lambda e: None, SystemClock())
+    reconstruct_file(whole, lambda e: None, SystemClock())
     asked: list[int] = []
 
     @contextmanager
@@ -257,12 +259,14 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
         yield lambda: len(asked) >= 30 or asked.append(0) is not None
 
     kept = tmp_path / "fit.checkpoint.h5"
-    part = replace(whole, target=Target(tmp_path / "part.h5", None), keeper=Keeper(kept))
-    run(part, lambda e: None, SystemClock(), after_30_steps)
+    part = replace(whole, target=OutputPaths(tmp_path / "part.h5", None), checkpoints=CheckpointOptions(kept))
+    reconstruct_file(part, lambda e: None, SystemClock(), after_30_steps)
     assert read_reconstruction(tmp_path / "part.h5").parameters["ended_early"]
     assert read_checkpoint(kept).state["counts"][1] == len(asked) + 1 < 80
-    rest = replace(whole, target=Target(tmp_path / "rest.h5", tmp_path / "rest.html"), keeper=Keeper(None, kept))
-    run(rest, lambda e: None, SystemClock())
+    rest = replace(
+        whole, target=OutputPaths(tmp_path / "rest.h5", tmp_path / "rest.html"), checkpoints=CheckpointOptions(None, kept)
+    )
+    reconstruct_file(rest, lambda e: None, SystemClock())
     np.testing.assert_array_equal(_volume(tmp_path / "rest.h5"), _volume(tmp_path / "out.h5"))
     assert np.abs(_volume(tmp_path / "part.h5") - _volume(tmp_path / "out.h5")).max() > 0
     parameters = read_reconstruction(tmp_path / "rest.h5").parameters
@@ -278,32 +282,34 @@ def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(clock, "now", lambda: float(next(looks)))
     steps: list[int] = []
     monkeypatch.setattr(checkpoints, "write_checkpoint", lambda _, kept: steps.append(int(kept.state["counts"][1])))
-    run(_options(tmp_path, **FIT, keeper=Keeper(tmp_path / "fit.h5")), lambda e: None, clock)
+    reconstruct_file(_options(tmp_path, **FIT, checkpoints=CheckpointOptions(tmp_path / "fit.h5")), lambda e: None, clock)
     assert len(steps) > 2 and steps == sorted(steps) and steps[-1] == 80
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     kept = tmp_path / "fit.checkpoint.h5"
-    run(_options(tmp_path, **FIT, keeper=Keeper(kept)), lambda e: None, SystemClock())
+    reconstruct_file(_options(tmp_path, **FIT, checkpoints=CheckpointOptions(kept)), lambda e: None, SystemClock())
     squares = replace(R2_FIT, fit=FitSettings(loss="l2"))
     other = _options(
         tmp_path,
         **{**FIT, "method": squares},
         seed=4,
-        keeper=Keeper(None, kept),
-        target=Target(tmp_path / "b.h5", None),
+        checkpoints=CheckpointOptions(None, kept),
+        target=OutputPaths(tmp_path / "b.h5", None),
     )
     with pytest.raises(DataError, match=r"loss \(l2, l1 in the checkpoint\); seed \(4, 0 in the checkpoint\)"):
-        run(other, lambda e: None, SystemClock())
+        reconstruct_file(other, lambda e: None, SystemClock())
     with pytest.raises(DataError, match="axis_col"):
-        run(replace(other, method=R2_FIT, seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock())
+        reconstruct_file(
+            replace(other, method=R2_FIT, seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock()
+        )
     assert _names(tmp_path) == {"scan.h5", "out.h5", "fit.checkpoint.h5"}
 
 
 def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> None:
     events: list[Event] = []
     options = _options(tmp_path, **{**FIT, "method": replace(R2_FIT, steps=120, early_stop=True)})
-    metrics = run(options, events.append, SystemClock())
+    metrics = reconstruct_file(options, events.append, SystemClock())
     said = [event.data["message"] for event in events if event.event == "state"]
     assert said == ["4 of 45 views are held out to say when to stop"]
     assert "residual_held_out" in metrics
@@ -315,7 +321,7 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
 @pytest.mark.parametrize("loss", ["l2", "poisson"])
 def test_every_loss_is_fitted_and_kept(tmp_path: Path, loss: Loss) -> None:
     method = replace(R2_FIT, start="tv", fit=FitSettings(loss=loss))
-    metrics = run(_options(tmp_path, **{**FIT, "method": method}), lambda e: None, SystemClock())
+    metrics = reconstruct_file(_options(tmp_path, **{**FIT, "method": method}), lambda e: None, SystemClock())
     parameters = read_reconstruction(tmp_path / "out.h5").parameters
     assert (parameters["loss"], parameters["start"], parameters["device"]) == (loss, "tv", "cpu")
     assert metrics["residual"] < 0.2
@@ -326,9 +332,9 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
     events: list[Event] = []
     options = _options(
         tmp_path, method=build(by_name(method), {"iterations": 8}), selection=Selection(axis_col=SCAN.axis_col),
-        target=Target(tmp_path / "out.h5", tmp_path / "out.html"),
+        target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
     )  # fmt: skip
-    metrics = run(options, events.append, SystemClock())
+    metrics = reconstruct_file(options, events.append, SystemClock())
     assert metrics["residual"] < 0.2
     progress = [event.data for event in events if event.event == "progress"]
     assert [p["step"] for p in progress] == list(range(1, 9))
@@ -341,7 +347,7 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
 
 def test_a_device_that_is_not_there_is_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--device abacus"):
-        run(_options(tmp_path, **FIT, device="abacus"), lambda e: None, SystemClock())
+        reconstruct_file(_options(tmp_path, **FIT, device="abacus"), lambda e: None, SystemClock())
     assert _names(tmp_path) == {"scan.h5"}
 
 
@@ -355,8 +361,8 @@ def test_walnut_from_60_views_is_better_than_fbp(tmp_path: Path, shared_data: Pa
         method=R2(seconds=40.0),
         selection=Selection(views="fixed:60"),
         truth=f"{shared_data / 'walnut_fdk_256.npz'}:70:166",
-        target=Target(tmp_path / "out.h5", tmp_path / "out.html"),
+        target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
     )
-    metrics = run(options, events.append, SystemClock())
+    metrics = reconstruct_file(options, events.append, SystemClock())
     assert metrics["psnr"] > events[-1].data["fbp"]["psnr"] + 1.0
     assert events[-1].data["axis_col"] == pytest.approx(127.5, abs=0.5)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,18 +15,25 @@ import pytest
 from beamline.core.errors import BeamlineError, ConfigError, DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct import growing as module
-from beamline.reconstruct.follow import Rhythm, follow
+from beamline.reconstruct.follow import FollowTiming, follow
 from beamline.reconstruct.options import ReconOptions, SourceOptions
-from beamline.reconstruct.result import Target
+from beamline.reconstruct.recon_report import ReconOutcome
+from beamline.reconstruct.result import OutputPaths
+from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
+from recon.base.method import Progress
 from recon.base.volume import Volume
 from recon.prep.align import AxisEstimate
+from recon.prep.correct import Correction, CorrectionSettings, Projections, Transmission
 from recon.splatting.r2 import R2
+from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, frames_of
 
@@ -65,7 +73,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
 INTERLACED = replace(SCAN, angles=np.concatenate([SCAN.angles[i::3] for i in (0, 2, 1)]))
-RHYTHM = Rhythm(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)
+RHYTHM = FollowTiming(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)
 
 
 def _schedule(
@@ -106,7 +114,7 @@ def _options(tmp_path: Path, **changes: object) -> ReconOptions:
     output = tmp_path / "recon.h5"
     options = ReconOptions(
         source=SourceOptions(tmp_path / "scan.h5"),
-        target=Target(output, None),
+        target=OutputPaths(output, None),
         selection=Selection(axis_col=SCAN.axis_col),
         method=FIT,
         command="beamline recon scan.h5 --follow",
@@ -122,7 +130,7 @@ def _close(clock: ScanClock) -> None:
 def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    target = Target(tmp_path / "recon.h5", tmp_path / "report.html")
+    target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
     metrics = follow(_options(tmp_path, target=target, method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM)
 
     names = [event.event for event in events]
@@ -177,12 +185,19 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
     """Also where flats at the end (of a brighter beam) change every view that the model has learnt from."""
     fits: list[StreamingFit] = []
     finish = StreamingFit.finish
-    monkeypatch.setattr(StreamingFit, "finish", lambda self, *rest: (fits.append(self), finish(self, *rest))[1])
     judged: list[PreparedProjections] = []
     write = follow_module.write_result
-    monkeypatch.setattr(
-        follow_module, "write_result", lambda made, prepared, *rest: (judged.append(prepared), write(made, prepared, *rest))[1]
-    )
+
+    def finish_and_keep(self: StreamingFit, *rest: Any) -> Progress:
+        fits.append(self)
+        return finish(self, *rest)
+
+    def write_and_keep(outcome: ReconOutcome, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
+        judged.append(prepared)
+        return write(outcome, prepared, *rest)
+
+    monkeypatch.setattr(StreamingFit, "finish", finish_and_keep)
+    monkeypatch.setattr(follow_module, "write_result", write_and_keep)
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
     _schedule(clock, tmp_path / "scan.h5", frames if gain is None else _late_flats(frames, gain))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import Prepared
+from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import fit_truth, measure, read_truth, regions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -66,13 +66,15 @@ def test_a_finer_truth_is_averaged_onto_the_grid() -> None:
         fit_truth(DATA, Grid((4, 6, 9)), 1)
 
 
-def _prepared(volume: Volume, held_out: bool = False) -> Prepared:
+def _prepared(volume: Volume, held_out: bool = False) -> PreparedProjections:
     rows, _, cols = volume.grid.shape
     geometry = Geometry.parallel(np.linspace(0, 3, 20), (rows, cols))
     data = project(volume, geometry)
     mask = np.zeros((rows, cols), bool)
     projections = Projections(data, np.arange(20), 0.0, np.ones(20, np.float32), mask)
-    return Prepared(projections, geometry, 0.0, None, (data, geometry) if held_out else None, 20, "mm", "counts")
+    return PreparedProjections(
+        projections, geometry, 0.0, None, (data, geometry) if held_out else None, 20, "mm", "counts"
+    )
 
 
 def _ball() -> Volume:

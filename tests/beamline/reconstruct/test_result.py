@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 import recon
 from beamline.core.events import Event
-from beamline.projections.prepare import Prepared, prepare
+from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import SourceOptions
-from beamline.reconstruct.recon_report import Context, Made, facts_of
-from beamline.reconstruct.result import Target, deliver
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.result import OutputPaths, write_result
 from beamline.report import figures
 from drivers.clock import SystemClock
 from recon.base.geometry import Geometry
@@ -28,29 +28,35 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
 
 
-def _scan(folder: Path, turn: float) -> tuple[Prepared, Context]:
+def _scan(folder: Path, turn: float) -> tuple[PreparedProjections, ReportContext]:
     """A file's context, with a cone's views of the same sample (magnified five times) in place of its own."""
     write_exchange(folder / "scan.h5", SCAN)
     with SourceOptions(folder / "scan.h5").open() as source:
         facts = facts_of(source)
         selection = Selection(axis_col=SCAN.axis_col)
-        prepared = prepare(source, selection, lambda said: None)
+        prepared = prepare_projections(source, selection, lambda said: None)
     angles = np.linspace(0, turn, 30, endpoint=False)
     cone = Geometry.cone(angles, SCAN.shape, 5.0, 400.0, 2000.0, SCAN.axis_col)
     grid = Grid.matching(cone)
     data = Projector(cone, grid).forward(SCAN.truth(grid))
     views = replace(prepared, projections=replace(prepared.projections, data=data), geometry=cone, held_out=None)
-    return views, Context(facts, selection, "beamline recon scan.h5", 0)
+    return views, ReportContext(facts, selection, "beamline recon scan.h5", 0)
 
 
 @pytest.mark.parametrize(("turn", "compared"), [(2 * np.pi, True), (3.6, False)])
 def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, turn: float, compared: bool) -> None:
     prepared, context = _scan(tmp_path, turn)
     result = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.OsSirtTv(iterations=3))
-    made = Made(result.volume, "os-sirt-tv", result.seconds, result.history, result.settings)
+    made = ReconOutcome(result.volume, "os-sirt-tv", result.seconds, result.history, result.settings)
     events: list[Event] = []
-    deliver(
-        made, prepared, None, Target(tmp_path / "out.h5", tmp_path / "out.html"), context, events.append, SystemClock()
+    write_result(
+        made,
+        prepared,
+        None,
+        OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
+        context,
+        events.append,
+        SystemClock(),
     )
     done = events[-1].data
     assert ("fbp" in done) is compared

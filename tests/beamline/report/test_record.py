@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beamline.reconstruct.recon_report import Made
+from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.report.figures import quality_against_time
 from beamline.report.record import history_arrays, history_from, residual_curve
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
@@ -28,9 +28,9 @@ def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
     return tuple(Progress(k + 1, n, t, r / 2, r, 100, views) for k, (t, r) in enumerate(pairs))
 
 
-def _made(history: tuple[Progress, ...], method: str = "sirt") -> Made:
+def _made(history: tuple[Progress, ...], method: str = "sirt") -> ReconOutcome:
     settings = {"pace": FitSettings().pace} if method == "r2" else {}
-    return Made(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, settings)
+    return ReconOutcome(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, settings)
 
 
 def test_there_and_back() -> None:

@@ -19,7 +19,7 @@ from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import connect
 from beamline.monitor.digest import FrameDigest
-from beamline.projections.prepare import prepare
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.scan import recorder as recorder_module
 from beamline.scan import run as module
@@ -373,7 +373,7 @@ def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_pa
     assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
     with open_scan(result.path) as source:
         selection = Selection(axis_col=19.5, correction=CorrectionSettings(air="none"))
-        prepared = prepare(source, selection, pytest.fail)
+        prepared = prepare_projections(source, selection, pytest.fail)
         assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
     u = (np.arange(40) - 19.5) * pitch
     expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))

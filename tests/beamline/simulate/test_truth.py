@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.core.events import Event
-from beamline.projections.prepare import prepare
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.simulate.truth import binning_of, truth_of
@@ -60,7 +60,7 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
     chosen = Selection(binning=binning, axis_col=24.0, correction=CorrectionSettings(air="none"))
     with open_scan(tmp_path / "scan.h5") as source:
         assert source.axis_col == 24.0
-        prepared = prepare(source, chosen, _silent)
+        prepared = prepare_projections(source, chosen, _silent)
     grid = Grid.matching(prepared.geometry)
     assert (grid.shape, grid.centre) == (truth.grid.shape, pytest.approx(truth.grid.centre))
     made = (fdk if overrides else fbp)(prepared.projections.data, prepared.geometry, grid, "hann")
