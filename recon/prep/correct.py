@@ -162,11 +162,11 @@ class Correction:
         positions: NDArray[np.float64],
         view_ids: NDArray[np.int64] | None = None,
     ) -> Transmission:
-        """(counts - dark) / (flat - dark), with every bad pixel filled from its neighbours.
+        """(counts - dark) / (flat - dark) with bad pixels filled from their neighbours.
 
         Args:
-            counts: [view, row, col], any real type.
-            positions: [view], frame of the scan, on the scale of the flats' positions.
+            counts: [view, row, col], any real type, in the order of acquisition.
+            positions: [view], number of the frame in the scan, as in the flats' positions.
             view_ids: int64 [view]; None: 0, 1, 2 ...
 
         Raises:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from beamline.cli.demo_run import run_demo
+from beamline.cli.demo import run_demo
 from beamline.cli.main import main
 from beamline.config.load import Config, config_folder, load
 from beamline.core.errors import ConfigError, DataError
@@ -89,7 +89,7 @@ def test_a_live_volume_that_fails_leaves_the_scan_and_says_where_to_look(
 
 
 def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from beamline.cli import demo_run as demo
+    from beamline.cli import demo
     from beamline.instrument.connect import connect
 
     def without_truth(config: Config) -> object:

@@ -264,7 +264,9 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     assert read_reconstruction(tmp_path / "part.h5").parameters["ended_early"]
     assert read_checkpoint(kept).state["counts"][1] == len(asked) + 1 < 80
     rest = replace(
-        whole, target=OutputPaths(tmp_path / "rest.h5", tmp_path / "rest.html"), checkpoints=CheckpointOptions(None, kept)
+        whole,
+        target=OutputPaths(tmp_path / "rest.h5", tmp_path / "rest.html"),
+        checkpoints=CheckpointOptions(None, kept),
     )
     reconstruct_file(rest, lambda e: None, SystemClock())
     np.testing.assert_array_equal(_volume(tmp_path / "rest.h5"), _volume(tmp_path / "out.h5"))
@@ -282,7 +284,9 @@ def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(clock, "now", lambda: float(next(looks)))
     steps: list[int] = []
     monkeypatch.setattr(checkpoints, "write_checkpoint", lambda _, kept: steps.append(int(kept.state["counts"][1])))
-    reconstruct_file(_options(tmp_path, **FIT, checkpoints=CheckpointOptions(tmp_path / "fit.h5")), lambda e: None, clock)
+    reconstruct_file(
+        _options(tmp_path, **FIT, checkpoints=CheckpointOptions(tmp_path / "fit.h5")), lambda e: None, clock
+    )
     assert len(steps) > 2 and steps == sorted(steps) and steps[-1] == 80
 
 
