@@ -24,7 +24,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.result import OutputPaths, axis_of, write_result
-from beamline.report.record import history_of
+from beamline.report.record import history_from
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 from beamline.scan.run_folder import RECON, RECON_LOG
@@ -107,7 +107,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         volume=Volume(record.volume.data, grid),
         method=config.recon.method,
         seconds=record.metrics["seconds"],
-        history=history_of(record.history),
+        history=history_from(record.history),
         settings=record.parameters,
         psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes],
     )
