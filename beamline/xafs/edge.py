@@ -112,8 +112,8 @@ def _white_line(energies: Reals, absorption: Reals, edge: int, noise: float) -> 
     # The far end as a + b E^-3: over a long range the top of a bare step is above the end, too.
     basis = _victoreen(energies)[:, :2]
     of_far = np.linalg.pinv(basis[far]).T @ basis[top]
-    stands = float(absorption[top] - of_far @ absorption[far])
-    if stands <= max(SURE * noise * math.sqrt(1 + float(of_far @ of_far)), 0.05 * rises):
+    height = float(absorption[top] - of_far @ absorption[far])
+    if height <= max(SURE * noise * math.sqrt(1 + float(of_far @ of_far)), 0.05 * rises):
         return None
     return _top(energies, absorption, top, 2)
 

@@ -63,11 +63,11 @@ class Afterglow:
         age, chance = np.polynomial.laguerre.laggauss(self.samples)  # of the exponential law with decay time 1
         ages = np.concatenate([decay * age for decay in self.decay_times])
         chances = np.concatenate([part / share * chance for part in self.shares])
-        seen, weights = gauss_rule(
+        past, weights = gauss_rule(
             np.subtract.outer(spread, ages).reshape(-1), np.outer(moments.weights, chances).reshape(-1), self.samples
         )
         return Moments(
-            np.concatenate([moments.times, middle + seen[:, None]]),
+            np.concatenate([moments.times, middle + past[:, None]]),
             np.concatenate([(1 - share) * moments.weights, share * weights]),
         )
 

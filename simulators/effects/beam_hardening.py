@@ -49,18 +49,18 @@ class BeamHardening:
         assert ratios is not None
         total = sum(self.weights)
         mean = sum(w * r for w, r in zip(self.weights, ratios, strict=True)) / total
-        seen = ((r / mean, w / total) for w, r in zip(self.weights, ratios, strict=True) if w > 0)
-        return tuple((w, r) for r, w in sorted(seen))
+        terms = ((r / mean, w / total) for w, r in zip(self.weights, ratios, strict=True) if w > 0)
+        return tuple((w, r) for r, w in sorted(terms))
 
     def apply(self, image: Image, shot: Shot) -> Image:
         # The most penetrating energy's exponential is factored out of the sum, so that large depths do not underflow.
         (weight, least), *others = self.terms()
-        seen = np.full_like(image, weight)
+        light = np.full_like(image, weight)
         term = np.empty_like(image)
         for w, ratio in others:
             np.exp(np.multiply(image, least - ratio, out=term), out=term)
             term *= w
-            seen += term
+            light += term
         image *= least
-        image -= np.log(seen, out=seen)
+        image -= np.log(light, out=light)
         return image

@@ -99,7 +99,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
             Domain.ELECTRONS,
             "a few pixels do not respond to light",
             _CHARGE,
-            "dead pixels hold the same charge whatever is added",
+            "dead pixels hold a constant charge",
         ),
         "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
         "offset": Entry(Domain.COUNTS, "the digital bias"),

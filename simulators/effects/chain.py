@@ -56,7 +56,7 @@ class ImageEffect(Effect, Protocol):
 @runtime_checkable
 class Anomaly(Effect, Protocol):
     def labels(self, shot: Shot) -> Sequence[Label]:
-        """Where the anomaly changes this frame, whatever other effects do; empty where it does not."""
+        """Where the anomaly changes this frame, regardless of other effects; empty where it does not."""
         ...
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.frame.domain import Domain
 from simulators.frame.sensor import DARK_CURRENT
-from simulators.frame.shot import Image, Shot, draws
+from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
 
 FEW = 1.0
@@ -37,7 +37,7 @@ class DarkCurrent:
             raise ValueError(f"rate must be >= 0 electrons/s, got {self.rate}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        rng = draws(self.name, shot)
+        rng = frame_rng(self.name, shot)
         mean = self.rate * shot.exposure * shot.binning**2
         if mean < FEW:
             falls = rng.integers(image.size, size=rng.poisson(mean * image.size))

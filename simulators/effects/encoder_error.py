@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from simulators.effects.turn_waves import Wave, check, series
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
-from simulators.frame.shot import Shot, draws
+from simulators.frame.shot import Shot, frame_rng
 
 
 @dataclass(frozen=True)
@@ -37,5 +37,5 @@ class EncoderError:
             raise ValueError(f"random_mdeg must be >= 0 millidegrees, got {self.random_mdeg}")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
-        error = series(pose.angle, self.harmonics).real + self.random_mdeg * draws(self.name, shot).normal()
+        error = series(pose.angle, self.harmonics).real + self.random_mdeg * frame_rng(self.name, shot).normal()
         return pose.turned_by(np.radians(1e-3 * error))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
 from simulators.frame.domain import Domain
-from simulators.frame.shot import Image, Shot, lasting
+from simulators.frame.shot import Image, Shot, fixed_rng
 
 Reals = NDArray[np.float64]
 REACH = 4.0
@@ -70,7 +70,7 @@ class FlatStructure:
         pixel_um = shot.detector.pitch / shot.binning * 1e3
         row0, col0, rows, cols = shot.roi
         left = np.ones((rows, cols))
-        rng = lasting(self.name, self.seed)
+        rng = fixed_rng(self.name, self.seed)
         for row, col, radius, depth in self._specks(rng, pixel_um):
             _draw_speck(left, row - row0, col - col0, radius, depth)
         for row, col, angle, length, depth in self._scratches(rng, pixel_um):

@@ -11,7 +11,7 @@ import numpy as np
 
 from simulators.effects.anomaly import VISIBLE, Label, Views, check_views, within
 from simulators.frame.domain import Domain
-from simulators.frame.shot import Image, Shot, lasting
+from simulators.frame.shot import Image, Shot, fixed_rng
 
 MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
 """Largest number of crumbs, length in mm and optical depth: above, a frame takes seconds or overflows."""
@@ -122,7 +122,7 @@ class Floaters:
         loose = self.motion == "loose"
         if not (loose or within(self.views, shot)):
             return
-        rng = lasting(self.name, self.seed)
+        rng = fixed_rng(self.name, self.seed)
         detector = shot.detector
         for which in range(self.count):
             distance, size, height = (rng.uniform(*ends) for ends in (self.distance, self.size, self.heights))

@@ -54,10 +54,10 @@ class Ghost:
 
     def labels(self, shot: Shot) -> Sequence[Label]:
         first, change = self._change(shot)
-        seen = np.flatnonzero(np.abs(change) >= VISIBLE)
-        if not shot.beam or not seen.size:
+        visible = np.flatnonzero(np.abs(change) >= VISIBLE)
+        if not shot.beam or not visible.size:
             return []
-        return [Label(self.name, (0, shot.detector.shape[0], first + int(seen[0]), first + int(seen[-1]) + 1))]
+        return [Label(self.name, (0, shot.detector.shape[0], first + int(visible[0]), first + int(visible[-1]) + 1))]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
         """The first column that it covers, and the relative change of the light there and further right."""

@@ -42,9 +42,9 @@ class Harmonics:
         if self.share == 0:
             return image
         # The harmonic's exponential is factored out of the sum, so that large depths do not underflow.
-        seen = np.exp((self.ratio - 1) * image)
-        seen *= 1 - self.share
-        seen += self.share
+        light = np.exp((self.ratio - 1) * image)
+        light *= 1 - self.share
+        light += self.share
         image *= self.ratio
-        image -= np.log(seen, out=seen)
+        image -= np.log(light, out=light)
         return image

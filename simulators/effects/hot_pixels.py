@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from simulators.frame.domain import Domain
-from simulators.frame.shot import Image, Shot, draws
+from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.pattern import places
 
 
@@ -39,5 +39,5 @@ class HotPixels:
     def apply(self, image: Image, shot: Shot) -> Image:
         at, even = places(self.name, self.seed, self.fraction, shot)
         rates = -self.rate * np.log1p(-even)
-        np.add.at(image, at, draws(self.name, shot).poisson(rates * shot.exposure))
+        np.add.at(image, at, frame_rng(self.name, shot).poisson(rates * shot.exposure))
         return image

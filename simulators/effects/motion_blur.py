@@ -54,7 +54,7 @@ class MotionBlur:
         return Moments(times, np.tile(moments.weights / n, n))
 
     def samples(self, shot: Shot) -> int:
-        """How many moments a frame is the mean of; 0 where the stage stands while the first row is exposed."""
+        """Number of moments; 0 where the stage stands while the first row is exposed."""
         angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
         turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
         return math.ceil(min(turned * _rim(shot) / self.tolerance_px, self.max_samples))

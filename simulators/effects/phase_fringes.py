@@ -126,8 +126,8 @@ class PhaseFringes:
             )
 
     def _check_wave(self, depth: Image, area: float) -> None:
-        seen = depth.astype(np.float32)
-        step = max(float(np.abs(np.diff(seen, axis=axis)).max(initial=0.0)) for axis in (0, 1))
+        single = depth.astype(np.float32)
+        step = max(float(np.abs(np.diff(single, axis=axis)).max(initial=0.0)) for axis in (0, 1))
         turn = step * self.delta_beta / 2
         if turn > STEEPEST * self.oversampling:
             wanted = math.ceil(turn / STEEPEST)
@@ -155,8 +155,8 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
     wave *= cols
     intensity = np.zeros(depth.shape, np.float32)
     for part in (wave.real, wave.imag):
-        seen = fft.idctn(np.ascontiguousarray(part), norm="ortho", overwrite_x=True, workers=threads)
-        intensity += np.square(seen, out=seen)
+        field = fft.idctn(np.ascontiguousarray(part), norm="ortho", overwrite_x=True, workers=threads)
+        intensity += np.square(field, out=field)
     return intensity
 
 

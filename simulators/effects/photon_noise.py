@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from simulators.frame.domain import Domain
-from simulators.frame.shot import Image, Shot, draws
+from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
 
 
@@ -25,4 +25,4 @@ class PhotonNoise:
     final: ClassVar[bool] = True
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        return poisson(image, draws(self.name, shot))
+        return poisson(image, frame_rng(self.name, shot))

@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.frame.domain import Domain
 from simulators.frame.sensor import READ_NOISE
-from simulators.frame.shot import Image, Shot, draws
+from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import add_normal
 from simulators.pixels.pattern import binned, normals
 
@@ -40,7 +40,7 @@ class ReadNoise:
 
     def apply(self, image: Image, shot: Shot) -> Image:
         rms = READ_NOISE[shot.readout] if self.rms is None else self.rms
-        add_normal(image, rms * self._spreads(shot), draws(self.name, shot))
+        add_normal(image, rms * self._spreads(shot), frame_rng(self.name, shot))
         return image
 
     def _spreads(self, shot: Shot) -> Image | float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from simulators.effects.turn_waves import Wave, check, series
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
-from simulators.frame.shot import Shot, draws
+from simulators.frame.shot import Shot, frame_rng
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Runout:
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         radial, axial = series(pose.angle, self.radial), series(pose.angle, self.axial)
         shift = np.stack([radial.real, -radial.imag, axial.real], axis=1)
-        shift += draws(self.name, shot).normal(0.0, 1.0, 3) * (
+        shift += frame_rng(self.name, shot).normal(0.0, 1.0, 3) * (
             self.radial_random_um,
             self.radial_random_um,
             self.axial_random_um,

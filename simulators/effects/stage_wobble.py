@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from simulators.effects.turn_waves import Wave, check, series
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
-from simulators.frame.shot import Shot, draws
+from simulators.frame.shot import Shot, frame_rng
 
 
 @dataclass(frozen=True)
@@ -40,5 +40,5 @@ class StageWobble:
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         wave = series(pose.angle, self.harmonics)
         tilt = np.stack([wave.real, -wave.imag], axis=1)
-        tilt += self.random_urad * draws(self.name, shot).normal(size=2)
+        tilt += self.random_urad * frame_rng(self.name, shot).normal(size=2)
         return pose.tilted_by(1e-6 * tilt)

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from simulators.frame.domain import Domain
-from simulators.frame.shot import CannotExposeError, Image, Shot, draws
+from simulators.frame.shot import CannotExposeError, Image, Shot, frame_rng
 
 DROPS = 200
 """Number of parts into which a spread charge is split."""
@@ -46,7 +46,7 @@ class Zingers:
 
     def apply(self, image: Image, shot: Shot) -> Image:
         """Raises CannotExposeError where a frame has more than MOST: wrong units, probably."""
-        rng = draws(self.name, shot)
+        rng = frame_rng(self.name, shot)
         expected = self.rate * shot.exposure
         if expected > MOST:
             raise CannotExposeError(

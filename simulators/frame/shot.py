@@ -86,13 +86,13 @@ class Moments:
         return cls(np.zeros((1, rows)), np.ones(1))
 
 
-def draws(effect: str, shot: Shot) -> np.random.Generator:
+def frame_rng(effect: str, shot: Shot) -> np.random.Generator:
     """The generator of (seed, effect, frame): any frame can be computed alone, and an added effect does not change the
     others' numbers."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
 
 
-def lasting(effect: str, seed: int) -> np.random.Generator:
+def fixed_rng(effect: str, seed: int) -> np.random.Generator:
     """The generator of (effect, its own seed), for all that is the same in every frame.
 
     It has a spawn key: without one, numpy makes (seed, effect) equal to (seed, effect, frame 0), since it ignores

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
-from simulators.frame.shot import Image, Shot, lasting
+from simulators.frame.shot import Image, Shot, fixed_rng
 from simulators.pixels.bands import share_rows
 from simulators.pixels.streams import STEP, begin, mix, normal
 
@@ -26,7 +26,7 @@ def _normal_rows(key, first, end, row0, col0, out):  # type: ignore[no-untyped-d
 def normals(effect: str, seed: int, shot: Shot) -> Image:
     """A normal number (mean 0, variance 1) of each sensor pixel of the ROI, float64 [row, col], unbinned."""
     row0, col0, rows, cols = shot.roi
-    key, out = lasting(effect, seed).integers(2**64, dtype=np.uint64), np.empty((rows, cols))
+    key, out = fixed_rng(effect, seed).integers(2**64, dtype=np.uint64), np.empty((rows, cols))
     share_rows(lambda first, end: _normal_rows(key, first, end, row0, col0, out), out.shape)
     return out
 
@@ -48,11 +48,11 @@ def places(
         Their (rows, columns) in the frame, and a number of each that is even in 0 ... 1. A binned pixel comes as often
         as there are such pixels in it.
     """
-    rng = lasting(effect, seed)
+    rng = fixed_rng(effect, seed)
     n = round(fraction * SENSOR_SHAPE[0] * SENSOR_SHAPE[1])
     drawn, first = np.unique(rng.integers(SENSOR_SHAPE[0] * SENSOR_SHAPE[1], size=n), return_index=True)
     value = rng.random(n)[first]
     rows, cols = np.divmod(drawn, SENSOR_SHAPE[1])
     row0, col0, height, width = shot.roi
-    seen = (rows >= row0) & (rows < row0 + height) & (cols >= col0) & (cols < col0 + width)
-    return ((rows[seen] - row0) // shot.binning, (cols[seen] - col0) // shot.binning), value[seen]
+    inside = (rows >= row0) & (rows < row0 + height) & (cols >= col0) & (cols < col0 + width)
+    return ((rows[inside] - row0) // shot.binning, (cols[inside] - col0) // shot.binning), value[inside]

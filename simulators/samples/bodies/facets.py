@@ -30,7 +30,7 @@ def polyhedron(
         elif facets[f, 3] < 0:
             lines[2, low], lines[3, low] = a, slope
             low += 1
-        else:  # n · (u, v) <= distance, whatever t
+        else:  # n · (u, v) <= distance, for any t
             left, right = _bounded(left, right, slope, a)
     first, stop = _opened(u, per_mm, place[0], lines, high, low, left, right)
     if max(high, low) > 8:

@@ -76,7 +76,7 @@ def _pieces(cls: str) -> _Builder:
 
 
 def _grey(pieces: Sequence[Piece], attenuation: Mapping[str, float]) -> Sample:
-    """The pieces with an attenuation (1/mm) for each role, whatever the beam."""
+    """The pieces with an attenuation (1/mm) for each role, for any beam."""
     solids = [
         replace(piece.solid, attenuation=attenuation[piece.role] - attenuation.get(piece.instead_of or "", 0.0))
         for piece in pieces

@@ -30,7 +30,7 @@ VIEWS = 8
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A volume as it is in a file.
+    """A volume as stored in a file.
 
     Attributes:
         values: [z, y, x] or in another order that the scene gives, real numbers in the file's own units.

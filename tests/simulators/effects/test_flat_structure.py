@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from simulators.effects.flat_structure import FlatStructure
 from simulators.frame import sensor
 from simulators.frame.detector import Detector
-from simulators.frame.shot import Shot, lasting
+from simulators.frame.shot import Shot, fixed_rng
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]
@@ -55,7 +55,7 @@ def test_specks_take_the_light_of_their_gaussians() -> None:
 
 
 def test_a_speck_is_round_and_a_gaussian() -> None:
-    rng = lasting("flat_structure", 11)
+    rng = fixed_rng("flat_structure", 11)
     row, col, size, deep = rng.random(4) * (2304, 4096, 6.0, 0.4) + (0, 0, 3.0, 0)
     row0, col0 = 4 * (int(row) // 4 - 15), 4 * (int(col) // 4 - 15)
     seen = FlatStructure(1, 60.0, 0.2, scratches=0, seed=11).transmission(_roi(row0, col0, 120, 120))
@@ -69,7 +69,7 @@ def test_scratches_take_the_light_of_lines() -> None:
     inside = 0
     for seed in range(8):
         scratch = FlatStructure(0, scratches=1, scratch_length_um=800.0, scratch_width_um=20.0, seed=seed)
-        rng = lasting("flat_structure", seed)
+        rng = fixed_rng("flat_structure", seed)
         row, col, angle, chance, deep = rng.random(5) * (2304, 4096, math.pi, 1, 0.1)
         length = -math.log1p(-chance) * 80
         reach = length / 2 + 10
@@ -90,7 +90,7 @@ def test_scratches_take_the_light_of_lines() -> None:
 @pytest.mark.parametrize("width_um", [1e3, 1e6, 1e9])
 def test_a_scratch_wider_than_the_frame_costs_no_more_than_the_frame(width_um: float) -> None:
     """Across and at its ends it is a Gaussian at every pixel."""
-    rng = lasting("flat_structure", 3)
+    rng = fixed_rng("flat_structure", 3)
     row, col, angle, chance, deep = rng.random(5) * (2304, 4096, math.pi, 1, 0.1)
     scratch = FlatStructure(0, scratches=1, scratch_length_um=800.0, scratch_width_um=width_um, seed=3)
     seen = scratch.transmission(_roi(1000, 2000, 120, 200))

@@ -18,7 +18,7 @@ import pytest
 
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.frame.domain import Domain
-from simulators.frame.shot import Shot, draws, lasting
+from simulators.frame.shot import Shot, fixed_rng, frame_rng
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import PARAMETERS
 
@@ -56,14 +56,14 @@ def test_an_effect_draws_the_same_numbers_whatever_else_is_named(monkeypatch: py
 
     def noted(name: str, effect: str, shot: Shot) -> np.random.Generator:
         assert effect == name
-        rng = draws(effect, shot)
+        rng = frame_rng(effect, shot)
         states[name][shot.frame] = str(rng.bit_generator.state)
         return rng
 
     for name in CATALOGUE:
         module = sys.modules[load_effect(name).__module__]
-        if "draws" in vars(module):
-            monkeypatch.setattr(module, "draws", partial(noted, name))
+        if "frame_rng" in vars(module):
+            monkeypatch.setattr(module, "frame_rng", partial(noted, name))
     on_demand.frames(on_demand.scene(list(CATALOGUE)), range(4))
     among = dict(states)
     assert {"photon_noise", "runout", "read_noise"} <= set(among)
@@ -80,8 +80,8 @@ def test_no_two_of_effects_seeds_and_frames_share_random_numbers() -> None:
     shots_of = [replace(on_demand.shot(0), seed=seed, frame=frame) for seed in seeds for frame in range(4)]
     generators = [np.random.default_rng(seed) for seed in seeds]
     for name in CATALOGUE:
-        generators += [draws(name, shot) for shot in shots_of]
-        generators += [lasting(name, seed) for seed in seeds]
+        generators += [frame_rng(name, shot) for shot in shots_of]
+        generators += [fixed_rng(name, seed) for seed in seeds]
     first = [int(rng.integers(2**64, dtype=np.uint64)) for rng in generators]
     assert len(set(first)) == len(first) == 5 + 25 * len(CATALOGUE)
 
