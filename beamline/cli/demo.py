@@ -1,4 +1,4 @@
-"""`beamline demo`: a simulated scan from trigger to volume, with a report, in about a minute."""
+"""`beamline demo`: a simulated scan from trigger to volume and report, in about a minute."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE
+from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan import stop_signals
 from beamline.cli.terminal import Terminal, results
 from beamline.config.load import Config, config_folder, load
@@ -36,13 +36,18 @@ from recon.base.volume import Grid, Volume
 
 
 @click.command()
-@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), help="Where runs get their folders.")
-@click.option("--seconds", type=POSITIVE, help="Of fitting after the scan; more is better.")
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the folders of runs. Default: storage.folder of configs/demo.yaml.",
+)
+@click.option("--seconds", type=POSITIVE, help="Time of the fit after the scan; a longer fit gives a better volume.")
+@json_option
 def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
-    """Scan a simulated battery, grow its volume while it turns, and judge the volume against the truth.
+    """Scan a simulated battery, reconstruct it during the scan, and compare the volume with the truth.
 
-    What runs is configs/demo.yaml; everything is kept in a folder of its own (UTC time and sample).
+    The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
     """
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
     with json_events(as_json) as sinks:

@@ -1,4 +1,4 @@
-"""`beamline info`, `validate`, `ingest`: what a file holds, whether readers can rely on it, a TIFF made a scan."""
+"""`beamline info`, `validate`, `ingest`: describes a scan file, checks its format, converts a TIFF to a scan."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
-from beamline.cli.options import POSITIVE
+from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError
@@ -29,9 +29,9 @@ _SAY_EVERY = 0.2  # s between words on how far an ingest is
 @click.command()
 @click.argument("file", type=_PATH)
 @scan_options
-@click.option("--json", "as_json", is_flag=True, help="One event on stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
 def info(file: Path, as_json: bool, **said: Any) -> None:
-    """Say what the scan in FILE holds; nothing is guessed."""
+    """Describe the scan in FILE: frames, angles, geometry, and problems of its format."""
     with json_events(as_json) as sinks:
         facts = dict(describe(file, **said))
         for sink in sinks:
@@ -64,9 +64,9 @@ def _text(value: Any) -> str:
 @click.command()
 @click.argument("file", type=_PATH)
 @scan_options
-@click.option("--json", "as_json", is_flag=True, help="One event a finding on stdout, then the verdict.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
 def validate(file: Path, as_json: bool, **said: Any) -> None:
-    """Check the scan in FILE against the rules that readers rely on. Errors give exit code 5, warnings do not."""
+    """Check the scan in FILE against the rules of its format. Exit code: 0 no error (warnings may be), 5 errors."""
     now = SystemClock().now()
     with json_events(as_json) as sinks:
         findings = findings_of(file, **said)
@@ -92,11 +92,11 @@ def _count(n: int, word: str) -> str:
 @click.argument("source", type=_PATH, metavar="IN")
 @click.argument("output", type=_PATH, metavar="OUT.h5")
 @scan_options
-@click.option("--pixel-size-um", type=POSITIVE, help="At the sample.")
-@click.option("--energy-kev", type=POSITIVE)
-@click.option("--sample", help="Its name, for the record.")
-@click.option("--no-data", type=float, help="A pixel value that means: not measured.")
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@click.option("--pixel-size-um", type=POSITIVE, help="Pixel size at the sample.")
+@click.option("--energy-kev", type=POSITIVE, help="Photon energy.")
+@click.option("--sample", help="Name of the sample, for the record.")
+@click.option("--no-data", type=float, help="Pixel value that marks pixels without a measurement.")
+@json_option
 def ingest(
     source: Path,
     output: Path,
@@ -109,7 +109,7 @@ def ingest(
 ) -> None:
     """Copy the scan IN (multi-page TIFF, folder or .zip of TIFFs, HDF5) into the new HDF5 scan OUT.h5.
 
-    One frame is in memory at a time; each gets its statistics and a preview. Nothing is overwritten.
+    Frames are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
     """
     clock = SystemClock()
     began = clock.now()

@@ -92,13 +92,13 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
     """
     given = [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     if {"steps", "seconds"} <= set(given):
-        raise click.UsageError("--steps and --seconds exclude each other: say how long the fit may take in one way.")
+        raise click.UsageError("--steps and --seconds exclude each other. Give one of them.")
     for plan in _PLANS:
         others = [name for name in given if name in _CHOSEN[plan]]
         if plan in given and others:
             raise click.UsageError(
-                f"{_option(plan)} and {_option(others[0])} exclude each other: {_option(plan)} chooses what the other "
-                "says, or leaves no room for it."
+                f"{_option(plan)} and {_option(others[0])} exclude each other: {_option(plan)} determines "
+                f"what {_option(others[0])} would set."
             )
         if plan in given and follow:
             raise click.UsageError(f"{_option(plan)} is for a finished scan; with --follow give --seconds.")
@@ -121,42 +121,44 @@ _OPTIONS = (
     click.option(
         "--seconds",
         type=POSITIVE,
-        help=f"Time for the fit ({_of('seconds')}), instead of --steps; with --follow, after the scan has ended.",
+        help=f"Time of the fit ({_of('seconds')}), instead of --steps. With --follow: after the end of the scan.",
     ),
     click.option(
         "--budget",
         callback=time_given,
         metavar="30s|2m|1h",
-        help="Time from line integrals to volume; chooses method, Gaussians, steps and binning, and ends in time.",
+        help="Time from line integrals to volume: chooses method, Gaussians, steps and binning to end in time.",
     ),
     click.option(
         "--quality",
         type=click.Choice(list(PRESETS)),
-        help="A preset of steps and Gaussians, instead of naming them.",
+        help="Preset of steps and Gaussians.",
     ),
-    click.option("--gaussians", type=click.IntRange(min=1), help=f"How many to start from ({_of('gaussians')})."),
+    click.option(
+        "--gaussians", type=click.IntRange(min=1), help=f"Number of Gaussians at the start ({_of('gaussians')})."
+    ),
     click.option(
         "--start",
         type=click.Choice(get_args(Start)),
         default="fbp",
         show_default=True,
-        help=f"Volume that Gaussians are first drawn from ({_of('start')}); tv: slower, without streaks of few views.",
+        help=f"Volume that the first Gaussians are drawn from ({_of('start')}); tv: slower, no streaks of few views.",
     ),
     click.option(
         "--loss",
         type=click.Choice(get_args(Loss)),
         default="l1",
         show_default=True,
-        help=f"Misfit of the fit ({_of('loss')}), beside SSIM: absolute, squared, or squares weighed by photon noise.",
+        help=f"Loss of the fit ({_of('loss')}), beside SSIM: absolute, squared, or squares weighted by photon noise.",
     ),
     click.option(
-        "--device", default="cpu", show_default=True, metavar="cpu|cuda", help=f"Of the fit ({_of('device')})."
+        "--device", default="cpu", show_default=True, metavar="cpu|cuda", help=f"Device of the fit ({_of('device')})."
     ),
     click.option(
         "--early-stop",
         is_flag=True,
-        help=f"End the fit ({_of('early_stop')}) when views held out no longer gain; every tenth is held out where "
-        "--views leaves none.",
+        help=f"End the fit ({_of('early_stop')}) when views held out stop improving; holds out every tenth if --views "
+        "leaves none.",
     ),
     click.option(
         "--polish",
@@ -169,19 +171,21 @@ _OPTIONS = (
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
         callback=checkpoint_output,
-        help=f"Keep the fit's state here ({_of('checkpoint')}): every minute, when it ends, and at Ctrl-C.",
+        help=f"Write the state of the fit ({_of('checkpoint')}) to this file: every minute, at the end, and at Ctrl-C.",
     ),
     click.option(
         "--resume",
         type=click.Path(path_type=Path, dir_okay=False),
-        help=f"Go on from a checkpoint of the same data and options ({_of('resume')}).",
+        help=f"Continue the fit ({_of('resume')}) from this checkpoint of the same data and options.",
     ),
     click.option(
-        "--iterations", type=click.IntRange(min=1), help="Of an iterative method. Default: each method's own."
+        "--iterations",
+        type=click.IntRange(min=1),
+        help="Iterations of an iterative method. Default: depends on the method.",
     ),
     click.option(
         "--tv-weight",
         type=POSITIVE,
-        help=f"Of the total variation ({_of('tv_weight')}), in units of the sample's density.",
+        help=f"Weight of the total variation ({_of('tv_weight')}), relative to the density of the sample.",
     ),
 )

@@ -1,4 +1,4 @@
-"""`beamline recon`: a scan file in, a volume and its report out."""
+"""`beamline recon`: reconstructs a scan file; writes a volume and its report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 
 from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
 from beamline.cli.method_options import SETTINGS, method_options, method_with, refuse_contradictions
-from beamline.cli.options import NOT_NEGATIVE, SEED
+from beamline.cli.options import NOT_NEGATIVE, SEED, json_option
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import QualityError, ScanStopped
@@ -31,7 +31,7 @@ from recon.voxels.fbp import Filter
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
-    """A file that can be told from its report."""
+    """An output file; its name must differ from that of the report, which ends in .html."""
     if value is not None and (not value.name or value.suffix.lower() in (".html", ".htm")):
         raise click.BadParameter(f"{str(value)!r} cannot hold a volume; name an HDF5 file, such as volume.h5")
     return value
@@ -45,7 +45,7 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     type=click.Choice(names()),
     default=DEFAULT,
     show_default=True,
-    help="r2: Gaussians fitted to the views; fbp: filtered back-projection; the others work on voxels, iteratively.",
+    help="r2: Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels.",
 )
 @selection_options
 @method_options
@@ -55,27 +55,31 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     type=click.Choice(["ram-lak", "shepp-logan", "hann"]),
     default="hann",
     show_default=True,
-    help="Of the fbp, also of the one that r2 is compared with. hann is best for few or noisy views.",
+    help="Filter of fbp, also of the fbp for comparison with r2. hann is best for few or noisy views.",
 )
 @click.option(
     "--max-residual",
     type=NOT_NEGATIVE,
     metavar="X",
-    help="Exit with code 6 where the data residual (of views held out, if there are any) is larger.",
+    help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Of everything random.")
-@click.option("--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5), slices A to B.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@click.option(
+    "--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use."
+)
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
     callback=whole_output,
-    help="Default: FILE's stem + _METHOD.h5, here.",
+    help="Output file. Default: FILE's stem + _METHOD.h5, in this folder.",
 )
-@click.option("--report/--no-report", default=True, show_default=True, help="An HTML page beside the output.")
-@click.option("--follow", is_flag=True, help="The scan is still running: reconstruct while its file grows.")
-@click.option("--unfinished", is_flag=True, help="Take the frames there are, of a scan that died or still runs.")
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
+@click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
+@click.option(
+    "--unfinished", is_flag=True, help="Accept an unfinished scan, one that failed or still runs, and use its frames."
+)
+@json_option
 def recon(
     file: Path,
     method: str,
@@ -97,9 +101,9 @@ def recon(
 ) -> None:
     """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
 
-    Writes a volume [z, y, x] in 1/mm (1/px where the pixel size is unknown) as NXtomoproc, with everything that it was
-    made with, and a report. Nothing is overwritten, and a failure leaves nothing behind. Ctrl-C during a fit or
-    iterations ends them with the volume as it is (exit code 4), a second one without.
+    Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown) as NXtomoproc, with all settings, and a
+    report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or iterations
+    stops with the volume reached so far (exit code 4), the second discards it.
     """
     settings = {name: said.pop(name) for name in SETTINGS}
     refuse_contradictions(click.get_current_context(), method, follow)
@@ -130,35 +134,35 @@ def recon(
     if not as_json:
         click.echo(results(last[-1].data))
     if last[-1].data.get("ended_early"):
-        raise ScanStopped(f"The reconstruction was ended early; {output} holds the volume that there was by then.")
+        raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:
         require(metrics, max_residual)
 
 
 def refuse_shared(files: Mapping[str, Path | None]) -> None:
-    """Raises UsageError where two of `files`, by option, are the same one: the second would be written over the first.
+    """Raises UsageError if two of `files`, by option, are the same file, which would then be overwritten.
 
-    Only a checkpoint may take the place of the one that a fit begins from.
+    Only --checkpoint may replace the file of --resume.
     """
     named = {option: os.path.normcase(path.resolve()) for option, path in files.items() if path is not None}
     for one, other in itertools.combinations(named, 2):
         if named[one] == named[other] and {one, other} != {"--checkpoint", "--resume"}:
-            raise click.UsageError(f"{one} and {other} are the same file, {files[other]}: name two.")
+            raise click.UsageError(f"{one} and {other} are the same file, {files[other]}. Give two different files.")
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
-    """Raises QualityError where a finished volume explains the data less well than asked for."""
+    """Raises QualityError if the data residual of a finished volume exceeds the limit."""
     name = "residual_held_out" if "residual_held_out" in metrics else "residual"
     if not metrics[name] <= max_residual:
         views = "held out" if name == "residual_held_out" else "used"
         raise QualityError(
             f"The data residual of views {views} is {metrics[name]:.4g}, more than --max-residual {max_residual:g}. "
-            "The volume and its report were written; look at them, at the axis, and at the flags of the scan."
+            "The volume and its report were written. Check them, the rotation axis and the flags of the scan."
         )
 
 
 def report_beside(output: Path) -> Path:
-    """A run's recon.h5 has report.html; any other output a page of its own name: several fit in a folder."""
+    """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
     return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
 
 

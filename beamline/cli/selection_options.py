@@ -98,9 +98,19 @@ _BEFORE = (
         metavar="SPEC",
         help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N",
     ),
-    click.option("--rows", callback=span, metavar="FIRST:END", help="Detector rows; the volume has one slice a row."),
     click.option(
-        "--bin", "binning", type=click.IntRange(min=1), default=1, show_default=True, help="Pixels averaged a side."
+        "--rows",
+        callback=span,
+        metavar="FIRST:END",
+        help="Detector rows to use; the volume has one slice per row. Default: all.",
+    ),
+    click.option(
+        "--bin",
+        "binning",
+        type=click.IntRange(min=1),
+        default=1,
+        show_default=True,
+        help="Average blocks of N x N pixels.",
     ),
     click.option(
         "--axis",
@@ -108,16 +118,20 @@ _BEFORE = (
         metavar="PX|auto",
         default="auto",
         show_default=True,
-        help="Rotation axis: column of the unbinned detector (0 is the centre of the first), or auto to find it.",
+        help="Rotation axis: column of the unbinned detector (0: centre of the first column), or auto to find it.",
     ),
 )
 _AFTER = (
-    click.option("--pixel-size-um", type=POSITIVE, help="At the sample (of a cone: on the detector); else the file's."),
+    click.option(
+        "--pixel-size-um",
+        type=POSITIVE,
+        help="Pixel size at the sample (cone beam: on the detector). Default: as in the file.",
+    ),
     click.option(
         "--cone",
         callback=distances,
         metavar="SOD:SDD",
-        help="Cone beam: mm from the source to the rotation axis and to the detector; else the file's.",
+        help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
     ),
     click.option(
         "--air",
@@ -125,6 +139,6 @@ _AFTER = (
         metavar="auto|none|LEFT,RIGHT",
         default="auto",
         show_default=True,
-        help="Edge columns that show air in every view.",
+        help="Number of columns at the left and right edge that show air in every view.",
     ),
 )

@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
+from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, Sink, fan_out
@@ -36,7 +37,7 @@ from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
 from beamline.simulate.write import Simulated, check_output, write_scan
 from drivers.clock import Clock, SystemClock
 
-_OVERRIDE_HELP = "Override a value, such as detector.shape=[2048,2048]; may be repeated."
+_OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
 _VIEWS = click.IntRange(1, MOST_FRAMES)
 _SEED = click.IntRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -44,25 +45,27 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 @click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")
 @click.argument("scene", metavar="SCENE")
-@click.option("--explain", "explains", is_flag=True, help="What a frame computes, in order, and what each step costs.")
+@click.option(
+    "--explain", "explains", is_flag=True, help="Print the steps of computing a frame, in order, with the time of each."
+)
 @click.option(
     "--frames",
     "views",
     type=_VIEWS,
     metavar="N",
-    help="Views over the scene's range, its own number unless given; the stage turns no faster for fewer.",
+    help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
 )
-@click.option("--out", type=_FILE, help="Write the scan to this HDF5 file, and its labels beside it.")
+@click.option("--out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it.")
 @click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")
 @click.option(
     "--truth-bin",
     type=click.IntRange(min=1),
-    help="Pixels a voxel's side, the --bin of a reconstruction to compare; by default as many as leave 256 across.",
+    help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 voxels.",
 )
-@click.option("--picture", type=_FILE, help="Write a PNG with some of the frames; beside --out unless given.")
-@click.option("--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Of all random numbers.")
+@click.option("--picture", type=_FILE, help="Write some frames to this PNG file. Default: beside --out.")
+@click.option("--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Seed of all random numbers.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@json_option
 def simulate(
     scene: str,
     explains: bool,
@@ -77,17 +80,18 @@ def simulate(
 ) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
-    Only the effects that it names are computed. The file is like one of the instrument: `beamline recon` reads it.
-    The first Ctrl-C ends the scan after its frame, with a readable file and its labels; the second at once.
+    Only the effects that the scene names are computed. The file has the format of the instrument, which
+    `beamline recon` reads. The first Ctrl-C stops after the current frame, with a readable file and its labels; the
+    second stops at once.
 
-    Exit code: 0 done, 2 a wrong scene, 4 stopped, 5 disk, 130 interrupted.
+    Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
     clock = SystemClock()
     with terminated_like_interrupted(), json_events(as_json) as sinks, exposure_errors(scene):
         if not (explains or out or truth or picture):
-            raise ConfigError("Nothing to do: ask for --explain, --out FILE, --truth FILE or --picture FILE.")
+            raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
         if truth_bin and not truth:
-            raise ConfigError("--truth-bin is of --truth's voxels: give --truth FILE too. Nothing was simulated.")
+            raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
         picture = out.with_suffix(".png") if out and not picture else picture
         _refuse_outputs(out, truth, picture)
         opened = open_scene(scene, overrides)
@@ -111,13 +115,13 @@ def simulate(
             tell("picture", str(picture))
         if written and written.stopped:
             raise ScanStopped(
-                f"Stopped after {written.n_frames} of {len(scan)} frames; {out} is complete as far as it goes."
+                f"Stopped after {written.n_frames} of {len(scan)} frames; {out} holds them and is readable."
             )
         tell.event("done", made)
 
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
-    """All files, before any is begun. Raises ConfigError: two are the same; DataError: one is in the way."""
+    """Refuse output files that exist. Raises ConfigError: two outputs are the same file; DataError: one exists."""
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
     seen: dict[Path, str] = {}
     for what, path in named.items():
@@ -130,7 +134,7 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
 
 
 class _Teller:
-    """Tells people in lines, programs in events."""
+    """Prints results as lines for people, and sends them as events to programs."""
 
     def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
         self._sink, self._clock, self._plain = sink, clock, plain
@@ -172,7 +176,7 @@ def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[s
 
 
 def _scan(scene: SceneFile, scan: Scan, out: Path, tell: _Teller, sink: Sink) -> Simulated:
-    ending = StopOnSignal("Ending after this frame; once more ends at once.")
+    ending = StopOnSignal("Stopping after this frame. Ctrl-C again stops at once.")
     with ending() as stopped, Terminal(sys.stderr) as terminal:
         written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
     tell("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")

@@ -1,4 +1,4 @@
-"""`beamline tradeoff`: which method and which settings give how much for how many seconds on this scan."""
+"""`beamline tradeoff`: compares methods and settings on a scan by quality, time and memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
-from beamline.cli.options import POSITIVE, SEED
+from beamline.cli.options import POSITIVE, SEED, json_option
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
@@ -22,7 +22,7 @@ from recon.methods import names
 
 
 def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    """Names of methods, separated by commas; all where none are given."""
+    """Names of methods, separated by commas; all if none are given."""
     if value is None:
         return names()
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
@@ -37,26 +37,26 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 @click.option(
     "--truth",
     metavar="FILE[:A:B]",
-    help="Volume to compare with (.npz, .npy, HDF5), slices A to B; else held-out views.",
+    help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views held out.",
 )
 @selection_options
 @click.option(
-    "--methods", callback=listed, metavar="A,B,...", help=f"Of {', '.join(names())}; all of them without this."
+    "--methods", callback=listed, metavar="A,B,...", help=f"Methods to compare, of {', '.join(names())}. Default: all."
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
 @click.option(
     "--max-seconds",
     type=POSITIVE,
-    help="Wall time for all trials; the table is finished with those done until then.",
+    help="Longest wall time of all trials together; the table then has the trials done by that time.",
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Of everything random.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
-    help="New folder. Default: FILE's stem + _tradeoff.",
+    help="New folder for the results. Default: FILE's stem + _tradeoff, in this folder.",
 )
-@click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
+@json_option
 def tradeoff(
     file: Path,
     truth: str | None,
@@ -68,11 +68,11 @@ def tradeoff(
     as_json: bool,
     **said: Any,
 ) -> None:
-    """Reconstruct the scan in FILE in many ways, and show what quality costs in time and memory.
+    """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
-    Quality is PSNR and SSIM against --truth, or else how well views that no trial has seen are explained, and to which
-    detail two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and a page. Ctrl-C
-    ends it with the trials done so far (exit code 4; 130 and no folder where there are none).
+    Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
+    resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
+    HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
     source, selection = chosen(file, seed, said)
     options = TradeoffOptions(
@@ -92,4 +92,4 @@ def tradeoff(
         click.echo(text(table))
     if table.stopped:
         counts = f"{table.n_done} of {len(table.outcomes)}"
-        raise ScanStopped(f"The trade-off was ended after {counts} trials; {options.folder} holds them.")
+        raise ScanStopped(f"The trade-off was stopped after {counts} trials; {options.folder} holds them.")

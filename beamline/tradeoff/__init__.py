@@ -1,1 +1,1 @@
-"""Trade-off: many reconstructions of one scan, and what quality costs in time and memory."""
+"""Trade-off: many reconstructions of one scan, compared by quality, time and memory."""

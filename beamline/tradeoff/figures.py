@@ -1,4 +1,4 @@
-"""Pictures of a trade-off: every trial as a point of quality against cost, and the front of those worth their cost."""
+"""Pictures of a trade-off: quality against cost of every trial with the Pareto front, and residuals against time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beamline.tradeoff.trials import Outcome, Trial
 from recon.methods import by_name
 
 _SIZE, _DPI = (8.6, 5.2), 110
-_SHOWN_DB = 12.0  # below the best: what is worse is counted, not drawn
+_SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "cut-off": "P",
     "loss": "X", "start": "*",
@@ -25,10 +25,10 @@ _MARKERS = {
 def pareto_plot(
     points: Sequence[tuple[Trial, float, float]], front: Sequence[int], cost_label: str, quality_label: str
 ) -> bytes:
-    """Quality against cost; the line is the best that can be had for so much or less.
+    """Quality against cost; the line is the best quality at each cost.
 
     Args:
-        points: (trial, cost, dB); those that are not finite are left out.
+        points: (trial, cost, dB); points that are not finite are left out.
         front: positions of the points on the front, by rising cost.
         cost_label, quality_label: with units.
     """
@@ -64,7 +64,7 @@ def pareto_plot(
 
 
 def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
-    """The residual of each while it ran, dB against s; dashed where it is of the views used."""
+    """The residual of each trial during its run, dB against s: solid for views held out, dashed for views used."""
     figure = Figure(figsize=(_SIZE[0], 4.0), dpi=_DPI, layout="constrained")
     axes: Axes = figure.subplots()
     for outcome in outcomes:
@@ -82,12 +82,12 @@ def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
 
 
 def _size(group: str) -> float:
-    """Of a marker: a star looks smaller than it is."""
+    """Area of a marker, points²: a star looks smaller than other markers."""
     return 90 if _MARKERS.get(group) == "*" else 46
 
 
 def _scale(axes: Axes, costs: Sequence[float]) -> None:
-    """Logarithmic where costs differ by more than a factor of four, with plain numbers at its ticks."""
+    """Make the axis of costs logarithmic if they differ by more than a factor of four."""
     if not costs or min(costs) <= 0 or max(costs) < 4 * min(costs):
         return
     axes.set_xscale("log")
@@ -108,7 +108,7 @@ def _legend(figure: Figure, axes: Axes, shown: Sequence[tuple[Trial, float, floa
         )
         for g in groups
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside right upper", fontsize=8, frameon=False, title="method, what varies")
+    figure.legend(handles=handles, loc="outside right upper", fontsize=8, frameon=False, title="method, varied setting")
 
 
 _WORDS = {

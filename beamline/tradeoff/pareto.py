@@ -1,4 +1,4 @@
-"""What is worth its cost: the Pareto front of (cost, quality) and what each further decibel along it takes."""
+"""The Pareto front of (cost, quality), and the cost of each further decibel along it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 def rounded(cost: float) -> float:
-    """The cost to about 1 % (half a step of 1 % to either side): what differs by less costs the same."""
+    """The cost rounded to steps of 1 %, so that smaller differences count as equal."""
     if not cost > 0 or math.isinf(cost):
         return cost
     step = math.log(1.01)
@@ -19,8 +19,8 @@ def rounded(cost: float) -> float:
 def front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
     """Positions of the points that no other point beats, by rising cost (and so by rising quality).
 
-    A point is beaten by one that costs no more and is no worse, and better in one of the two; of equal points the
-    first stays. Points with a value that is not finite take no part.
+    A point is beaten by one with at most its cost and at least its quality, and better in one of the two; of equal
+    points the first stays. Points with a value that is not finite are left out.
     """
     known = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
     kept: list[int] = []
@@ -36,8 +36,8 @@ class Step:
 
     Attributes:
         start, end: positions of the points.
-        cost: what the second costs more.
-        gain: dB.
+        cost: extra cost of the second point.
+        gain: its extra quality, dB.
     """
 
     start: int
@@ -47,11 +47,11 @@ class Step:
 
     @property
     def per_decibel(self) -> float:
-        """What a dB costs on this stretch."""
+        """The cost of a dB on this step."""
         return self.cost / self.gain
 
 
 def steps(kept: Sequence[int], costs: Sequence[float], qualities: Sequence[float]) -> list[Step]:
-    """The stretches of a front, cheapest point first; none where it has fewer than two points."""
+    """The steps along a front, by rising cost; none if it has fewer than two points."""
     pairs = itertools.pairwise(kept)
     return [Step(a, b, costs[b] - costs[a], qualities[b] - qualities[a]) for a, b in pairs]

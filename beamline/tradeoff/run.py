@@ -1,4 +1,4 @@
-"""What accuracy costs in time: many reconstructions of one scan, each in its own process, measured alike."""
+"""Runs a trade-off: many reconstructions of one scan, each in its own process, all measured in the same way."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from recon.base.method import Depth
 from recon.base.volume import Grid
 from recon.splatting.initialise import default_count
 
-_HELD_OUT_SHARE = 8  # one of so many views is kept back where there is nothing else to judge by
-_HELD_OUT_VIEWS = 16
+_HELD_OUT_SHARE = 8  # one of so many views is held out if there is no truth
+_HELD_OUT_VIEWS = 16  # at most
 
 
 @dataclass(frozen=True)
 class TradeoffOptions:
-    """What to compare.
+    """The scan and the trials to compare.
 
     Attributes:
         source, selection: the scan and the part of it to use.
@@ -46,7 +46,7 @@ class TradeoffOptions:
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
         truth: FILE or FILE:first:end to compare with.
         seed: of everything random.
-        command: that repeats this, for the record.
+        command: the command line that repeats the trade-off, for the record.
     """
 
     source: SourceOptions
@@ -63,14 +63,14 @@ class TradeoffOptions:
 def run_tradeoff(
     options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic
 ) -> TrialTable:
-    """Make all trials, and leave table, pictures and page in the folder. The event `done` says where.
+    """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
-    The table in the folder is complete after every trial, so that whatever ends this leaves what was measured. Where
-    Ctrl-C did, the table is `stopped`; the folder goes where there is nothing in it to keep.
+    The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
+    `stopped`. A folder without results is removed.
 
     Raises:
-        ConfigError, DataError: with nothing written, or with the table of the trials that could be written.
-        KeyboardInterrupt: before the first trial was done, with nothing written.
+        ConfigError, DataError: nothing was written, or the table of the trials that were done.
+        KeyboardInterrupt: before the first trial was done; nothing was written.
     """
     folder, started = options.folder, clock.now()
     if folder.exists():
@@ -106,10 +106,10 @@ def run_tradeoff(
     try:
         with named_on_failure(work / "data.npz"):
             data.save(work / "data.npz")
-        said = {"state": "compiling", "message": "Compiling what is not in the cache yet"}
-        sink(Event("state", clock.now(), said))
+        state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
+        sink(Event("state", clock.now(), state))
         compile_kernels(trials, work)
-        for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each is the one before and a trial more
+        for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each has one more trial than the last
             write_table(folder, table)
     except KeyboardInterrupt:
         if table.n_done == 0:
@@ -118,7 +118,7 @@ def run_tradeoff(
         table = replace(table, stopped=True)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):  # it would be in the way of the next try
+        if folder.is_dir() and not any(folder.iterdir()):  # an empty folder would refuse the next run
             folder.rmdir()
     write_table(folder, table)
     write_figures(folder, table)
@@ -128,20 +128,20 @@ def run_tradeoff(
 
 
 def split(prepared: PreparedProjections, truth: Any) -> Data:
-    """The views that trials may use, and those that none may: judging by data needs views that no trial has seen.
+    """The views that trials use, and the views held out that judge all trials if there is no truth.
 
     Raises:
-        ConfigError: too few views to keep some back.
+        ConfigError: too few views to hold some out.
     """
     projections, geometry = prepared.projections.data, prepared.geometry
     if truth is not None or prepared.held_out is not None:
         return Data(projections, geometry, prepared.held_out, truth)
     n = geometry.n_views
-    kept_back = min(_HELD_OUT_VIEWS, max(1, n // _HELD_OUT_SHARE))
-    if n - kept_back < 2:
-        raise ConfigError(f"{n} views leave none to judge by; choose more with --views, or give --truth.")
-    # Not the first and last: a view next to nothing is no fair question.
-    held = np.unique((np.arange(kept_back) + 0.5) * n // kept_back).astype(np.int64)
+    n_held_out = min(_HELD_OUT_VIEWS, max(1, n // _HELD_OUT_SHARE))
+    if n - n_held_out < 2:
+        raise ConfigError(f"{n} views are too few to hold some out. Choose more with --views, or give --truth.")
+    # Neither the first nor the last: they have a neighbour on one side only.
+    held = np.unique((np.arange(n_held_out) + 0.5) * n // n_held_out).astype(np.int64)
     used = np.setdiff1d(np.arange(n), held)
     return Data(projections[used], geometry.select(used), (projections[held], geometry.select(held)), None)
 
@@ -149,7 +149,7 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
 def _each(
     table: TrialTable, work: Path, options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float]
 ) -> Iterator[TrialTable]:
-    """The table after each trial, and after one that Ctrl-C cut off."""
+    """The table after each trial, and after one that Ctrl-C interrupted."""
     begin = now()
     timed: list[Timed] = []
     for index, outcome in enumerate(table.outcomes):

@@ -65,7 +65,7 @@ def test_a_fit_that_is_interrupted_delivers_what_it_has(
     steps = _signal_at_step(monkeypatch, number, {20})
     result = beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
     assert result.exit_code == 4, result.output
-    assert "The reconstruction was ended early" in result.stderr
+    assert "The reconstruction was stopped early" in result.stderr
     assert steps[-1] == 20
     parameters = read_reconstruction(folder / "scan_r2.h5").parameters
     assert parameters["ended_early"] and parameters["steps"] == 20
@@ -94,7 +94,7 @@ def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, mo
     monkeypatch.setattr(offline, "progress_events", watched)
     result = beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "100000", "--no-report")
     assert result.exit_code == 4, result.output
-    assert "The reconstruction was ended early" in result.stderr
+    assert "The reconstruction was stopped early" in result.stderr
     record = read_reconstruction(folder / "scan_sirt.h5")
     assert record.parameters["ended_early"] and record.history["step"][-1] == 5
 
@@ -112,7 +112,7 @@ def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
     monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1))
     result = beamline("recon", "scan.h5", *options, "-o", "out.h5", "--no-report")
     assert result.exit_code == 0, result.output
-    assert "as soon as there is a volume" in result.stderr and "ended early" not in result.output
+    assert "as soon as there is a volume" in result.stderr and "stopped early" not in result.output
     parameters = read_reconstruction(folder / "out.h5").parameters
     assert parameters["method"] == "fbp" and "ended_early" not in parameters
 

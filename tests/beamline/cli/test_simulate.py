@@ -120,8 +120,8 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
     monkeypatch.setattr(write, "expose", stopping)
     result = _beamline("simulate", "scene.yaml", "--out", "scan.h5")
     assert result.exit_code == 4
-    assert "Ending after this frame; once more ends at once." in result.stderr
-    assert "Stopped after 7 of 16 frames; scan.h5 is complete as far as it goes." in result.stderr
+    assert "Stopping after this frame. Ctrl-C again stops at once." in result.stderr
+    assert "Stopped after 7 of 16 frames; scan.h5 holds them and is readable." in result.stderr
     with open_scan("scan.h5") as source:
         assert source.image_key.size == 7
         assert source.attributes["status"] == "stopped"
@@ -229,7 +229,7 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
     ("arguments", "code", "words"),
     [
         (("nowhere", "--explain"), 2, "There is no scene nowhere: neither a file, nor one of battery"),
-        (("scene.yaml",), 2, "Nothing to do: ask for --explain"),
+        (("scene.yaml",), 2, "Nothing to do. Give --explain"),
         (("broken.yaml", "--explain"), 2, "scene.beam: key 'photons' is unknown"),
         (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
         (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
@@ -238,7 +238,7 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
         (("scene.yaml", "--out", "new.png"), 2, "new.png would be both the scan and the picture"),
         (("scene.yaml", "--out", "new.h5", "--truth", "./new.h5"), 2, "new.h5 would be both the scan and the truth"),
         (("scene.yaml", "--out", "nowhere/new.h5"), 5, "new.h5 cannot be written there. Create it first"),
-        (("scene.yaml", "--explain", "--truth-bin", "2"), 2, "--truth-bin is of --truth's voxels"),
+        (("scene.yaml", "--explain", "--truth-bin", "2"), 2, "--truth-bin needs --truth FILE"),
         (("scene.yaml", "--out", "new.h5", "--seed", str(2**64)), 2, "--seed"),
         (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),
     ],
