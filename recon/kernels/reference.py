@@ -52,10 +52,10 @@ def project_view(
     geometry: Geometry,
     view: int,
     *,
-    exact: Tensor | None = None,  # bool [n]: a cone's true ray integral; None: of none
-    length: float = 0.0,  # mm, stands in for μ where it is not 0: the uncorrected factor
+    exact: Tensor | None = None,  # bool [n]: Gaussians integrated along the true rays of a cone; None: none
+    length: float = 0.0,  # mm, replaces μ if not 0: the uncorrected factor
 ) -> Tensor:
-    """Line integrals [row, col] of one view; every Gaussian on every pixel, no cut-off."""
+    """Line integrals [row, col] of one view: every Gaussian on every pixel, not truncated."""
     in_view = means @ means.new_tensor(geometry.axes(view)).T  # along columns, rows and beam
     seen = in_front(means, geometry, view)
     rays = torch.zeros_like(seen) if exact is None or not geometry.is_cone else exact & seen
@@ -65,14 +65,14 @@ def project_view(
 
 
 def in_front(means: Tensor, geometry: Geometry, view: int) -> Tensor:
-    """Which Gaussians [n] lie clear of the source plane (0.01 of its distance to the axis), all for a parallel beam."""
+    """Mask [n] of the Gaussians at least 0.01 sod in front of the source plane; all for a parallel beam."""
     if not geometry.is_cone:
         return torch.ones(means.shape[0], dtype=torch.bool)
     return geometry.sod + means.detach() @ means.new_tensor(geometry.axes(view)[2]) > 0.01 * geometry.sod
 
 
 def affine_error(means: Tensor, scales: Tensor, quaternions: Tensor, geometry: Geometry, view: int) -> Tensor:
-    """ε [n], the estimate of `footprints_cpu` for the relative L2 error of a cone's affine footprints; no gradient."""
+    """ε [n], the estimate of `cpu.footprints` for the relative L2 error of a cone's affine footprints; no gradient."""
     means, scales, quaternions = means.detach(), scales.detach(), quaternions.detach()
     axes = means.new_tensor(geometry.axes(view))
     in_view, focal = means @ axes.T, geometry.sdd / geometry.pixel_pitch
@@ -82,7 +82,7 @@ def affine_error(means: Tensor, scales: Tensor, quaternions: Tensor, geometry: G
     whiten = rotation_matrices(quaternions).transpose(1, 2) / scales[:, :, None]
     source = (whiten @ (means + geometry.sod * axes[2])[:, :, None])[..., 0]
     eta = 1 / (source * source).sum(1)
-    step = whiten @ axes[:2].T * ((in_view[:, 2] + geometry.sod) / focal)[:, None, None]  # H moved by one pixel
+    step = whiten @ axes[:2].T * ((in_view[:, 2] + geometry.sod) / focal)[:, None, None]  # H for a step of one pixel
     alpha = eta[:, None] * torch.einsum("nk,nku->nu", source, step)
     beta = centre / (focal**2 + (centre * centre).sum(1, keepdim=True))
 
@@ -94,7 +94,7 @@ def affine_error(means: Tensor, scales: Tensor, quaternions: Tensor, geometry: G
 
 
 def pixels(geometry: Geometry, view: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Columns [col] and rows [row] counted from where the middle of the object's frame falls."""
+    """Columns [col] and rows [row] relative to the pixel of the object's origin."""
     rows, cols = geometry.detector_shape
     col, row = geometry.origin(view)
     return torch.arange(cols, dtype=like.dtype) - col, torch.arange(rows, dtype=like.dtype) - row
@@ -166,7 +166,7 @@ def voxelize(
     densities: Tensor,
     axes: tuple[Tensor, Tensor, Tensor],  # z [nz], y [ny], x [nx] in mm
 ) -> Tensor:
-    """Density [z, y, x] at voxel centres; every Gaussian in every voxel, no cut-off."""
+    """Density [z, y, x] at voxel centres: every Gaussian in every voxel, not truncated."""
     z, y, x = axes
     grid = torch.stack(torch.broadcast_tensors(x[None, None, :], y[None, :, None], z[:, None, None]), -1)
     offset = grid[None] - means[:, None, None, None, :]
@@ -201,7 +201,7 @@ def ssim_map(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.0
 
 
 def data_term(image: Tensor, target: Tensor, term: DataTerm) -> Tensor:
-    """What each pixel costs [row, col]: see `DataTerm`."""
+    """Data term of each pixel [row, col], see `DataTerm`."""
     difference = image - target
     if term.kind == L1:
         return difference.abs()
@@ -214,8 +214,8 @@ def projection_loss(
 ) -> Tensor:
     """mean w (D(image, target) + ssim_weight (1 - SSIM)), weights w [row, col] >= 0; None: all 1.
 
-    Zha et al. 2024 take D = |image - target|. Pixels of no weight are left out: SSIM's windows take them for zeros in
-    both images, as they do what lies outside.
+    Zha et al. 2024 take D = |image - target|. Pixels of weight 0 count as zeros in both images in SSIM's windows, like
+    pixels outside the image.
     """
     if weights is None:
         return data_term(image, target, term).mean() + ssim_weight * (1 - ssim(image, target))

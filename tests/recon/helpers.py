@@ -8,7 +8,7 @@ from recon.splatting.gaussians import Gaussians
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians as float64 leaves, so that the readable twin runs and collects gradients."""
+    """The same Gaussians as float64 leaves, so that the reference implementation runs and collects gradients."""
     leaves = [
         tensor.detach().double().requires_grad_()
         for tensor in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.raw_densities)

@@ -50,20 +50,20 @@ def _gradient(settings: FitSettings) -> tuple[fit.FitState, NDArray[np.float64]]
 
 
 def _along_voxels(state: fit.FitState) -> NDArray[np.float64]:
-    """Central differences [n, 3] of the twin's total variation, per voxel by which a centre moves; float64."""
-    twin = in_double(fit.gaussians_of(state))
+    """Central differences [n, 3] of the reference's total variation, per voxel by which a centre moves; float64."""
+    double = in_double(fit.gaussians_of(state))
     half_field = 12 * VOXEL
 
     def smoothness(means: torch.Tensor) -> float:
-        moved = replace(twin, means=means)
+        moved = replace(double, means=means)
         return float(total_variation(voxelize(moved, GRID) * half_field))
 
-    out, h = np.empty((twin.n, 3)), 1e-5
+    out, h = np.empty((double.n, 3)), 1e-5
     with torch.no_grad():
         for at in np.ndindex(out.shape):
-            step = torch.zeros_like(twin.means)
+            step = torch.zeros_like(double.means)
             step[at] = h * VOXEL
-            out[at] = (smoothness(twin.means + step) - smoothness(twin.means - step)) / (2 * h)
+            out[at] = (smoothness(double.means + step) - smoothness(double.means - step)) / (2 * h)
     return out
 
 

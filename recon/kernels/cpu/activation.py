@@ -1,9 +1,9 @@
-"""Raw parameters to physical ones and gradients back, once a step, fused over Gaussians (numba, threaded).
+"""activate: raw parameters to physical ones, and the gradients back, in one pass over Gaussians (numba, threaded).
 
     scale = exp(log_scale)        density = unit * softplus(raw)        R = R(quaternion / |quaternion|)
 
-Everything downstream works on means, scales, rotations (row-major 3x3) and densities; its gradients come back through
-`activation_backward`.
+The other kernels work on means, scales, rotations (row-major 3x3) and densities; `activation_backward` takes their
+gradients back to the raw parameters.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from recon.kernels.cpu import lanes
 F32 = NDArray[np.float32]
 OPTIONS = {"parallel": True, "fastmath": True, "boundscheck": False, "error_model": "numpy", "cache": True}
 _f = np.float32
-# A quaternion shorter than this (squared) has no direction worth a gradient; it acts as the identity.
+# A quaternion shorter than this (squared length) counts as the identity and gets no gradient.
 _SHORTEST = np.float32(1e-24)
 _LONGEST = np.float32(1e30)  # squared
 _TASK = 1024  # Gaussians
@@ -25,9 +25,9 @@ _TASK = 1024  # Gaussians
 
 @njit(inline="always", fastmath=True)
 def _softplus(r):  # type: ignore[no-untyped-def]
-    """log(1 + e^r) a lane, without overflow on one side or lost digits on the other.
+    """log(1 + e^r) a lane, without overflow for large r and without cancellation for small r.
 
-    log(1 + t) = 2 artanh(t / (2 + t)) for t = e^-|r|; the artanh's series ends where it has 1e-8 of itself left.
+    log(1 + t) = 2 artanh(t / (2 + t)) for t = e^-|r|; the series of artanh is cut at a relative error of 1e-8.
     """
     size = r * lanes.sign(r)
     t = lanes.exp(lanes.zero() - size)
@@ -40,14 +40,14 @@ def _softplus(r):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=True)
 def _sigmoid(r):  # type: ignore[no-untyped-def]
-    """Its slope, 1 / (1 + e^-r) = e^min(r, 0) / (1 + e^-|r|), with all its digits far down too."""
+    """Derivative of softplus, 1 / (1 + e^-r) = e^min(r, 0) / (1 + e^-|r|), accurate also for very negative r."""
     size = r * lanes.sign(r)
     return lanes.exp((r - size) * _f(0.5)) / (lanes.exp(lanes.zero() - size) + _f(1))
 
 
 @njit(inline="always", fastmath=True)
-def _tamed(quaternions, i):  # type: ignore[no-untyped-def]
-    """Quaternion i times a factor that keeps its square in float32's range, the square, the factor; 0 if too short."""
+def _rescaled(quaternions, i):  # type: ignore[no-untyped-def]
+    """Quaternion i scaled to float32's range, its squared length then, and the factor (0 if it is too short)."""
     w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
     length2, factor = w * w + x * x + y * y + z * z, _f(1)
     if not length2 < _LONGEST:
@@ -61,7 +61,7 @@ def _tamed(quaternions, i):  # type: ignore[no-untyped-def]
 def activate(
     log_scales: F32, quaternions: F32, raw: F32, unit: float, scales: F32, rotations: F32, densities: F32
 ) -> None:
-    """Fill scales [n, 3], rotations [n, 9] and densities [n], to a few float32 steps (logarithms are taken in +-87)."""
+    """Fill scales [n, 3], rotations [n, 9] and densities [n], to a few float32 steps; logs are clamped to +-87."""
     n, one, two = raw.shape[0], _f(1), _f(2)
     logs, widths = log_scales.reshape(1, 3 * n), scales.reshape(1, 3 * n)
     raws, dense = raw.reshape(1, n), densities.reshape(1, n)
@@ -75,7 +75,7 @@ def activate(
             density = _softplus(lanes.load_first(raws, 0, j, count)) * _f(unit)
             lanes.store_first(dense, 0, j, density, count)
         for i in range(begin, end):
-            w, x, y, z, length2, factor = _tamed(quaternions, i)
+            w, x, y, z, length2, factor = _rescaled(quaternions, i)
             scale = two / length2 if factor > 0 else _f(0)
             xs, ys, zs = x * scale, y * scale, z * scale
             rotations[i, 0] = one - (y * ys + z * zs)
@@ -93,7 +93,7 @@ def activate(
 def activation_backward(
     quaternions: F32, raw: F32, unit: float, d_rotations: F32, d_densities: F32, d_quaternions: F32, d_raw: F32
 ) -> None:
-    """From gradients on rotations [n, 9] and densities [n] to gradients on quaternions [n, 4] and raw densities [n]."""
+    """Gradients on quaternions [n, 4] and raw densities [n] from those on rotations [n, 9] and densities [n]."""
     n, two, four = raw.shape[0], _f(2), _f(4)
     raws, d_dense, out = raw.reshape(1, n), d_densities.reshape(1, n), d_raw.reshape(1, n)
     for task in prange((n + _TASK - 1) // _TASK):
@@ -103,7 +103,7 @@ def activation_backward(
             slope = _sigmoid(lanes.load_first(raws, 0, j, count)) * _f(unit)
             lanes.store_first(out, 0, j, lanes.load_first(d_dense, 0, j, count) * slope, count)
         for i in range(begin, end):
-            w, x, y, z, length2, factor = _tamed(quaternions, i)
+            w, x, y, z, length2, factor = _rescaled(quaternions, i)
             inverse = _f(1) / np.sqrt(length2) if factor > 0 else _f(0)
             w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
             inverse *= factor
@@ -112,7 +112,7 @@ def activation_backward(
             gx = two * (y * g[1] + z * g[2] + y * g[3] - w * g[5] + z * g[6] + w * g[7]) - four * x * (g[4] + g[8])
             gy = two * (x * g[1] + w * g[2] + x * g[3] + z * g[5] - w * g[6] + z * g[7]) - four * y * (g[0] + g[8])
             gz = two * (-w * g[1] + x * g[2] + w * g[3] + y * g[5] + x * g[6] + y * g[7]) - four * z * (g[0] + g[4])
-            # Only the part across the unit quaternion turns anything; the rest would change its length.
+            # Only the part orthogonal to the unit quaternion rotates; the part along it would change its length.
             along = gw * w + gx * x + gy * y + gz * z
             d_quaternions[i, 0] = (gw - along * w) * inverse
             d_quaternions[i, 1] = (gx - along * x) * inverse

@@ -1,7 +1,4 @@
-"""What a step changes in a model: Adam over all parameter arrays in one threaded pass, and the record of pulls.
-
-Adam is that of Kingma & Ba 2015, algorithm 1.
-"""
+"""Adam over all parameter arrays in one threaded pass (Kingma & Ba 2015, algorithm 1), and sums of vector lengths."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ def _adam(
     eps: float,
     tasks: NDArray[np.int64],
 ) -> None:
-    """One pass over flat arrays [1, size]; tasks [k, 2] name an array and where a piece of it begins."""
+    """One pass over flat arrays [1, size]; tasks [k, 2] hold the number of an array and the start of a piece of it."""
     b1, b2 = _f(BETA1), _f(BETA2)
     s2, e, one = _f(scale2), _f(eps), _f(1)
     for task in prange(tasks.shape[0]):
@@ -65,17 +62,19 @@ def adam_all(
     """Update C-contiguous arrays of any shape and their moments in place; `step` counts from 1.
 
     Args:
-        rates: of each array.
-        bounds: of each array's values, kept after the update; None where there are none.
+        rates: learning rate of each array.
+        bounds: (lowest, highest) value of each array, enforced after the update; None: unbounded.
 
     Raises:
-        ValueError: an array is not contiguous, or shapes disagree: a copy would be updated in its place.
+        ValueError: shapes disagree, or an array is not contiguous (then only a copy would be updated).
     """
     lists = (parameters, gradients, first, second)
     for arrays in zip(*lists, strict=True):
         if any(a.shape != arrays[0].shape or not a.flags.c_contiguous for a in arrays):
-            shapes = [(a.shape, "C" if a.flags.c_contiguous else "in pieces") for a in arrays]
-            raise ValueError(f"a parameter, its gradient and its moments must be C-contiguous and alike: {shapes}")
+            shapes = [(a.shape, "C" if a.flags.c_contiguous else "not contiguous") for a in arrays]
+            raise ValueError(
+                f"a parameter, its gradient and its moments must be C-contiguous and of one shape: {shapes}"
+            )
     limits = [(-_WIDEST, _WIDEST) if b is None else b for b in bounds or [None] * len(parameters)]
     tasks = [(k, begin) for k, p in enumerate(parameters) for begin in range(0, p.size, _TASK)]
     scale1, scale2 = 1 / (1 - BETA1**step), 1 / (1 - BETA2**step)
@@ -93,7 +92,7 @@ def adam(parameter: F32, gradient: F32, first: F32, second: F32, rate: float, st
 
 @njit(**OPTIONS)
 def add_lengths(vectors: F32, factor: float, sums: F32) -> None:
-    """sums [n] += factor * |vectors [n, 2]|: how hard each footprint's centre has been pulled, for density control."""
+    """sums [n] += factor * |vectors [n, 2]|: accumulates gradients on footprints' centres for density control."""
     for i in prange(sums.shape[0]):
         x, y = vectors[i, 0], vectors[i, 1]
         sums[i] += _f(factor) * _f(math.sqrt(x * x + y * y))

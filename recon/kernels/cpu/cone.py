@@ -1,9 +1,9 @@
-"""Rays of a cone through voxels and back: Joseph's interpolation, the detector's rows fastest (numba, threaded).
+"""Cone-beam projector and its adjoint: Joseph's interpolation, the detector's rows fastest (numba, threaded).
 
-All rays to one column of the detector lie in one plane that holds the rotation axis' direction, so they share their
-course in x and y; in every plane of voxels that they cross, rows stand on a line of slices at even steps. A ray is
+All rays to one column of the detector lie in one plane parallel to the rotation axis, so they share their path in x and
+y; in every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is
 sampled once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row]; the table of rays is that
-of `joseph_cpu`. The transpose reads the same weights and runs plane by plane: no two threads write to one voxel.
+of `cpu.joseph`. The transpose reads the same weights and runs plane by plane: no two threads write to one voxel.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _PAD = 2  # zeros at both ends of a line of slices
 
 @njit(inline="always", fastmath=True)
 def _rows(height, climb, middle, n, rows):  # type: ignore[no-untyped-def]
-    """Rows first..end (excluded) that stand less than a slice off the line of n slices.
+    """Rows first..end (excluded) that are less than one slice outside the line of n slices.
 
-    `climb` slices a row, `height` the slice at z = 0, `middle` the row at z = 0.
+    `climb`: slices a row; `height`: the slice at z = 0; `middle`: the row at z = 0.
     """
     first = max(0.0, middle + (-1.0 - height) / climb)
     end = min(rows * 1.0, middle + (n - height) / climb + 1.0)
@@ -85,7 +85,7 @@ def _forward(
 
 @njit(inline="always", fastmath=True)
 def _lengthen(source, out, path, reach, middle, pitch):  # type: ignore[no-untyped-def]
-    """Times the ray's path from plane to plane: longer where it runs up or down."""
+    """out = source times the ray's path from plane to plane, which is longer for rays inclined to the mid-plane."""
     for row in range(out.size):
         slope = (row - middle) * pitch / reach
         out[row] = source[row] * _f(path * math.sqrt(1.0 + slope * slope))
@@ -153,10 +153,10 @@ def forward(
     """Line integrals of volume [y, x, z] into out [view, col, row], mm times the volume's unit.
 
     Args:
-        rays, steep: of `joseph_cpu.ray_table`.
-        middles: [view], the row on which the height z = 0 falls.
-        height: the slice at z = 0.
-        pitch: of the detector, mm.
+        rays, steep: see `cpu.joseph.ray_table`.
+        middles: [view], row at the height z = 0.
+        height: slice at z = 0.
+        pitch: detector pixel, mm.
     """
     group, _ = shares(out.shape[0], 1)
     lines = volume.reshape(-1, volume.shape[2])
@@ -168,7 +168,7 @@ def adjoint(
 ) -> None:
     """The transpose of `forward`: projections [view, col, row] into out [y, x, z] (overwritten).
 
-    Costs one copy of the projections.
+    Needs memory for one copy of the projections.
     """
     weighed = np.empty_like(projections)
     _weigh(projections, rays, middles, pitch, weighed)

@@ -1,7 +1,7 @@
-"""Gaussians to footprints on the detector and gradients back: exact for a parallel beam, affine for a cone (numba).
+"""Footprints of Gaussians on the detector, and gradients back: exact for a parallel beam, affine for a cone (numba).
 
 A ray through the centre t = (tx, ty, tz) of a Gaussian, in the axes (u, v, d) of the view with the source at the
-origin, meets the detector at (ax, ay) = (tx / tz, ty / tz) times the focal length f = sdd / pitch. There the picture
+origin, meets the detector at (ax, ay) = (tx / tz, ty / tz) times the focal length f = sdd / pitch. There the image
 moves by the local axes (px per mm, in the object's frame)
 
     Ju = g (u - ax d)        Jv = g (v - ay d)        g = f / tz        ray = ax u + ay v + d
@@ -10,31 +10,31 @@ and a parallel beam is the same with ax = ay = 0, g = 1 / pitch. With a = S Rᵀ
 
     Σ₂ = [[a·a, a·b], [a·b, b·b]]        det Σ₂ = |a x b|² = (s₁ s₂ s₃ g² |h|)²        μ = sqrt(2π) |ray| / |h|
 
-μ is the central ray's integral sqrt(2π / r̂ᵀΣ⁻¹r̂), equal to the Schur complement's sqrt(2π (f - vᵀΣ₂⁻¹v)) but free of
-any subtraction (3DGS's projection, Zwicker et al. 2001, with the factor of Zha et al. 2024). Backward, with the
-moments M of the image gradient under a footprint, in its own directions τ and v (see `project_cpu`):
+μ is the central ray's integral sqrt(2π / r̂ᵀΣ⁻¹r̂), equal to the Schur complement's sqrt(2π (f - vᵀΣ₂⁻¹v)) but without
+a subtraction (3DGS's projection, Zwicker et al. 2001, with the factor of Zha et al. 2024). Backward, with the
+moments M of the image gradient under a footprint, in its own directions τ and v (see `cpu.project`):
 
     ∂W = M₀,   ∂m = W (k M_τ, l M_v - k r M_τ),   ∂T = W (Σ g G yyᵀ + M₀ hhᵀ / h·h)      W = ρμ
     y = τ A + δv B,   A = (b x h) / (g s₁ s₂ s₃ h·h),   B = l b
 
 y is the offset in the Gaussian's own axes, in standard deviations: y·y = δᵀKδ, A·A = k, B·B = l, A·B = 0. T's diagonal
 is the gradient on log scales; off it, (s_k / s_j - s_j / s_k) T_jk turns axis j towards k. The gradient on rotations is
-that turn alone: what else flows to a matrix, and leaves the rotations, cancels in the quaternion, and of a needle it is
-aspect² times as large. Gradients on Σ₂ = K⁻¹, as 3DGS has them, lose aspect² as well.
+that rotation alone: all other components of a gradient on the matrix cancel in the quaternion, and for a needle they
+are aspect² times as large. Gradients on Σ₂ = K⁻¹, as in 3DGS, lose aspect² in accuracy as well.
 
-A cone adds what flows to the centre through g, ax and ay. These are not clamped, as 3DGS does to keep far off-screen
-Gaussians small: the clamp breaks det Σ₂ and the gradient, and moves mass where a cone is wide. A Gaussian at or behind
+A cone adds the gradient on the centre through g, ax and ay. These are not clamped: 3DGS clamps them to keep Gaussians
+far off the screen small, which breaks det Σ₂ and the gradient, and moves mass in a wide cone. A Gaussian at or behind
 the source plane has no footprint.
 
 The quadratic form is kept factored, δᵀKδ = k (δu - r δv)² + δv² / Σvv with k = Σvv / det Σ₂ and r = Σuv / Σvv: sums
-of squares keep their digits where the expanded form of a long thin footprint would cancel.
+of squares stay accurate where the expanded form of a long thin footprint would cancel.
 
-The affine picture's own error is known to first order. The true ray integral differs from it by the factor
-exp((β - α)·δ + δᵀKδ α·δ), with α, β as in `rays_cpu`; over the footprint that is a relative L2 error of
+The error of the affine approximation is known to first order. The true ray integral differs from it by the factor
+exp((β - α)·δ + δᵀKδ α·δ), with α, β as in `cpu.rays`; over the footprint that is a relative L2 error of
 
     ε² = 1/2 βᵀΣ₂β + αᵀΣ₂β + 3/2 αᵀΣ₂α + 6 η²
 
-where η = 1 / |S⁻¹Rᵀt|² gives the leading term of second order, all there is on the axis.
+where η = 1 / |S⁻¹Rᵀt|² gives the leading term of second order, the only one on the optical axis.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ _f, _d = np.float32, np.float64
 _ROOT_TWO_PI = np.float32(math.sqrt(2 * math.pi))
 # Columns of the footprint table.
 U, V, K, SHEAR, KV, W, HU, HV = range(8)
-HIDDEN, INEXACT = -1.0, -2.0  # in HU and HV: nothing to be seen; to be done ray by ray
-NEAREST = 0.01  # of sod: what lies nearer to the source plane is not seen
+HIDDEN, INEXACT = -1.0, -2.0  # in HU and HV: not visible; to be integrated ray by ray
+NEAREST = 0.01  # of sod: Gaussians nearer to the source plane are hidden
 _NEVER = 1e30  # an error that no affine footprint reaches (the kernels' arithmetic has no infinities)
 
 
 class Camera(NamedTuple):
-    """One view as the kernels take it.
+    """One view, in the form that the kernels need.
 
     Attributes:
         axes: float32 [3, 3], unit vectors along columns, rows and beam.
         focal: a cone: sdd / pitch in px; a parallel beam: 1 / pitch in px/mm.
-        sod: mm from the source to the rotation axis; 0 stands for a parallel beam.
+        sod: mm from the source to the rotation axis; 0: parallel beam.
         col, row: pixel of the object's origin.
-        straight: a parallel beam with columns along z, which saves a third of the work.
+        straight: parallel beam without roll and tilt, which saves a third of the work.
     """
 
     axes: F32
@@ -84,7 +84,7 @@ def _turned(x, y, z, r):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=True)
 def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations):  # type: ignore[no-untyped-def]
-    """Add what follows from T, the gradient on a deformation along the Gaussian's own axes, see above."""
+    """Add the gradients that follow from T, the gradient on a deformation in the Gaussian's own axes (see above)."""
     d_log_scales[i, 0] += t00
     d_log_scales[i, 1] += t11
     d_log_scales[i, 2] += t22
@@ -98,7 +98,7 @@ def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, 
         d_rotations[i, j + 2] += r[j] * y + r[j + 1] * z
 
 
-# What is fixed when a kernel is compiled (here: straight) folds into its loop; an argument of a threaded loop does not.
+# `straight` is a constant of the compiled kernel, so its branches fold; those on an argument of a threaded loop do not.
 def _forward(straight: bool) -> Any:
     @njit(**OPTIONS)
     def kernel(
@@ -151,7 +151,7 @@ def _forward(straight: bool) -> Any:
             # g / sqrt(det Σ₂); in float64, since a product of three scales of 1e-13 mm would leave float32's range.
             scale = _f(_d(within) / (_d(g) * (_d(scales[i, 0]) * _d(scales[i, 1]) * _d(scales[i, 2]))))
             table[i, U], table[i, V] = _f(col) + f * tu, _f(row) + f * tv
-            # Squares of square roots: those of a Gaussian of 1e-12 px would leave float32's range on the way.
+            # Squares of square roots: products for a Gaussian of 1e-12 px would leave float32's range.
             wide, high = np.sqrt(uu), np.sqrt(vv)
             steep, level = high * scale, _f(1) / (high * g)
             table[i, K], table[i, SHEAR], table[i, KV] = steep * steep, uv / vv, level * level
@@ -284,9 +284,9 @@ def footprints(
 ) -> None:
     """Fill table [n, 8]: centre (col, row), k (1/px²), r, 1 / Σvv (1/px²), weight W = ρμ, half widths in px (two).
 
-    A footprint ends where it falls below `faint` (in units of the image) and at the latest after `cut` standard
-    deviations; half widths are HIDDEN where nothing of it is above `faint`, and INEXACT where a cone's ε is above
-    `exact_above`. A `length` (mm) other than 0 stands in for μ: the uncorrected factor.
+    Footprints are cut off where they fall below `faint` (in units of the image), and at `cut` standard deviations. Half
+    widths are HIDDEN for a footprint nowhere above `faint`, and INEXACT where a cone's ε is above `exact_above`. A
+    `length` (mm) other than 0 replaces μ: the uncorrected factor.
     """
     kernel = _straight_footprints if camera.straight else _footprints
     kernel(
@@ -311,7 +311,7 @@ def footprints_backward(
     *,
     length: float = 0.0,
 ) -> None:
-    """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
+    """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
     kernel = _straight_footprints_backward if camera.straight else _footprints_backward
     kernel(
         table, moments, means, scales, rotations, densities, camera.axes, camera.focal, camera.sod, length,
@@ -320,5 +320,5 @@ def footprints_backward(
 
 
 def footprint_table(n: int) -> NDArray[np.float32]:
-    """Room for n footprints."""
+    """An uninitialised table of n footprints, float32 [n, 8]."""
     return np.empty((n, 8), np.float32)

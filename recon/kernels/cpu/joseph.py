@@ -1,8 +1,8 @@
-"""Parallel rays through voxels and back: Joseph's interpolation, the slices of a volume fastest (numba, threaded).
+"""Parallel-beam projector and its adjoint: Joseph's interpolation, the slices of a volume fastest (numba, threaded).
 
-A ray is sampled once in every plane of voxels across the axis that it follows most closely, by linear interpolation
-between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are [y, x, z] and
-projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions read their
+A ray is sampled once in every plane of voxels across the axis that is closest to its direction, by linear
+interpolation between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are [y, x, z]
+and projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions read their
 weights from one table of rays, so each is the exact transpose of the other; the transpose runs plane by plane, and no
 two threads write to one voxel.
 """
@@ -32,10 +32,10 @@ _GROUP = 16  # views that share one pass over the volume
 
 
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
-    """The in-plane course of the ray to every column: float64 [view, col, 6], and bool [view, col].
+    """The in-plane path of the ray to every column: float64 [view, col, 6] (columns above), and flags bool [view, col].
 
-    The flag says that the ray crosses planes of constant y (it runs closer to y than to x), so that lines count along
-    x; else it is the other way round.
+    A flag is set if the ray is closer to y than to x: it then crosses planes of constant y, and lines are counted along
+    x; otherwise x and y change places.
     """
     _, cy, cx = grid.centre
     _, ny, nx = grid.shape
@@ -53,7 +53,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
     steep = np.abs(run_y) >= np.abs(run_x)
     first_x, first_y = cx - (nx - 1) / 2 * h, cy - (ny - 1) / 2 * h
     reach = np.hypot(run_x, run_y)
-    # Along the followed axis (a) planes are counted, along the other one (b) lines.
+    # Planes are counted along the axis closest to the ray (a), lines along the other one (b).
     run_a, run_b = np.where(steep, run_y, run_x), np.where(steep, run_x, run_y)
     from_a = np.where(steep, first_y - origin_y, first_x - origin_x)
     from_b = np.where(steep, origin_x - first_x, origin_y - first_y)
@@ -124,7 +124,7 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, shape: tuple[int, int], 
             if axis == 0:
                 lines[j * plane_stride : j * plane_stride + n, z0:z1] = _f(0)
             for v in range(views):
-                if steep[v, 0] == axis:  # parallel rays all follow the same axis
+                if steep[v, 0] == axis:  # parallel rays are all closest to the same axis
                     continue
                 path = _f(rays[v, 0, 4])
                 start = rays[v, 0, 0] + rays[v, 0, 1] * j
@@ -146,7 +146,7 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, shape: tuple[int, int], 
 
 
 def shares(views: int, nz: int) -> tuple[int, int]:
-    """Views and slices of one job, so that every thread has work and a pass over the volume serves many views."""
+    """Views and slices of one job, so that all threads have work and one pass over the volume serves many views."""
     threads = get_num_threads()
     rounds = -(-views // (_GROUP * threads))
     group = -(-views // (rounds * threads))
@@ -155,7 +155,7 @@ def shares(views: int, nz: int) -> tuple[int, int]:
 
 
 def forward(volume: F32, rays: F64, steep: Flags, out: F32) -> None:
-    """Line integrals of volume [y, x, z] into out [view, col, z], mm times the volume's unit."""
+    """Line integrals of volume [y, x, z] into out [view, col, z], in mm times the unit of the volume."""
     group, block = shares(out.shape[0], out.shape[2])
     _forward(volume.reshape(-1, volume.shape[2]), volume.shape[:2], rays, steep, group, block, out)
 

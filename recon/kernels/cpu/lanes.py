@@ -1,7 +1,7 @@
-"""Sixteen float32 lanes as one numba value: numba's own exp is scalar, so the splat kernels carry their vector along.
+"""Lanes: sixteen float32 numbers as one numba value, with a vectorised exp (numba's own exp is scalar).
 
-`Lanes` is LLVM's <16 x float>; LLVM lowers it to AVX-512, AVX2, SSE or NEON, whatever the machine has. `+ - * /` work
-between Lanes and with scalars (which are broadcast). No compiler is needed at run time.
+`Lanes` is LLVM's <16 x float>, which LLVM compiles to AVX-512, AVX2, SSE or NEON instructions, as the machine has them.
+`+ - * /` work between Lanes and with scalars (which are broadcast). No compiler is needed at run time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _F32, _I32 = ir.FloatType(), ir.IntType(32)
 _VF, _VI = ir.VectorType(_F32, WIDTH), ir.VectorType(_I32, WIDTH)
 _FAST = ("fast",)
 
-# 2^f on [-1/2, 1/2]: the polynomial of least relative error (Remez exchange), 2e-9: rounding is all.
+# 2^f on [-1/2, 1/2]: polynomial of least relative error (Remez exchange), 2e-9, below float32's rounding.
 _EXP2 = (1.53458120e-4, 1.33999312e-3, 9.61848896e-3, 5.55032878e-2, 2.40226469e-1, 6.93147206e-1, 1.0)
 
 
@@ -210,7 +210,7 @@ def total(typing_context, lanes):  # type: ignore[no-untyped-def]
 def _halve(builder: Any, x: tuple[Any, list[int]], y: tuple[Any, list[int]], width: int) -> tuple[Any, list[int]]:
     """Add the two halves of each group of 2 width lanes: x's sums go to the lower half, y's to the upper one.
 
-    Beside each vector stands whose sum a lane holds, which says in the end where each total came to lie.
+    With each vector goes a list that names, for each lane, the vector whose sum it holds; it gives the final positions.
     """
     low, high, owners = [], [], []
     for base in range(0, WIDTH, 2 * width):
@@ -224,7 +224,7 @@ def _halve(builder: Any, x: tuple[Any, list[int]], y: tuple[Any, list[int]], wid
 
 @intrinsic
 def totals(typing_context, vectors):  # type: ignore[no-untyped-def]
-    """The sums of up to sixteen Lanes at once, lane j that of vectors[j]: about half the shuffles of one by one."""
+    """Sums of up to sixteen Lanes at once, lane j for vectors[j], with about half the shuffles of single sums."""
     count = len(vectors)
 
     def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -247,7 +247,7 @@ def _first(builder: Any, count: Any) -> Any:
 
 @intrinsic
 def load_first(typing_context, array, row, col, count):  # type: ignore[no-untyped-def]
-    """array[row, col:col + count] and zeros; no memory past that is touched."""
+    """array[row, col:col + count], then zeros; memory beyond is not read."""
 
     def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
         mask, pointer = _first(builder, args[3]), _VF.as_pointer()

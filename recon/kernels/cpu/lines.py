@@ -1,4 +1,4 @@
-"""Lines along z: the memory layout of the voxel projectors, and slices that lie between the detector's rows."""
+"""Lines along z, the memory layout of the voxel projectors: transposition, and interpolation of rows between slices."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def swap_last(source: F32, out: F32) -> None:
 
 @njit(**OPTIONS)
 def rows_from_slices(slices: F32, first: F64, step: float, out: F32) -> None:
-    """out [view, col, row]: slices [view, col, z] at level first[view] + step * row by linear interpolation.
+    """out [view, col, row]: slices [view, col, z] interpolated at level first[view] + step * row.
 
-    Beyond the last slice the value falls to zero within one slice, as it does beyond the last voxel in the plane.
+    Beyond the last slice the value falls linearly to zero within one slice, as beyond the last voxel in the plane.
     """
     views, cols, nz = slices.shape
     rows = out.shape[2]

@@ -1,4 +1,4 @@
-"""Fused losses on the CPU: L1, D-SSIM and total variation with their gradients in a few passes (numba, threaded)."""
+"""Fused losses on the CPU: data term, D-SSIM and total variation with their gradients (numba, threaded)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ L1, L2, POISSON = range(3)
 
 
 class DataTerm(NamedTuple):
-    """What a pixel x that should be y costs; δ makes the three alike in size where |x - y| is about δ.
+    """Data term of a pixel x with target y; with the scale δ all three have a similar size where |x - y| is about δ.
 
     L1: |x - y|.   L2: (x - y)² / 2δ.   POISSON: e^(-depth y) (x - y)² / 2δ, the second-order expansion of the
-    likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534). No
-    matter transmits more than all, so a y below 0 weighs as one of 0: a few such pixels would outweigh all others.
+    likelihood of counts that fall with e^(-depth y) (Sauer & Bouman 1993, IEEE Trans. Signal Process. 41, 534). A y
+    below 0 (transmission above 1) gets the weight of y = 0: otherwise a few such pixels would outweigh all others.
     """
 
     kind: int
@@ -43,14 +43,14 @@ def gaussian_window(sigma: float = 1.5) -> F32:
 
 @njit(inline="always", fastmath=True)
 def _columns(start, cols, width):  # type: ignore[no-untyped-def]
-    """Sixteen columns for the block at `start`: the first, and which lanes of them the block before did not have."""
+    """Sixteen columns for the block at `start`: the first, and the lanes (low, high) not in the block before."""
     first = min(start, width - lanes.WIDTH)
     return first, start - first, cols - first
 
 
 @njit(inline="always", fastmath=True)
 def _down(plane, row, first, window):  # type: ignore[no-untyped-def]
-    """The window down the columns of plane [row, col], zeros outside, for sixteen columns."""
+    """The window applied down the columns of plane [row, col], zeros outside, for sixteen columns."""
     amount = lanes.zero()
     for other in range(max(0, row - RADIUS), min(plane.shape[0], row + RADIUS + 1)):
         amount = amount + lanes.load(plane, other, first) * window[other - row + RADIUS]
@@ -59,7 +59,7 @@ def _down(plane, row, first, window):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=True)
 def _across(half, k, first, window):  # type: ignore[no-untyped-def]
-    """The window along line k of half, whose column 0 stands at MARGIN between zeros, for sixteen columns."""
+    """The window applied along line k of half (column 0 at index MARGIN, zeros on both sides), for sixteen columns."""
     amount = lanes.zero()
     for tap in range(2 * RADIUS + 1):
         amount = amount + lanes.load(half, k, first + (MARGIN - RADIUS) + tap) * window[tap]
@@ -88,7 +88,7 @@ def _ssim_terms(
 ) -> None:  # fmt: skip
     """Partial derivatives of the SSIM map with respect to the blurred x, x², xy; sums [row] of the map itself.
 
-    With weights (None is settled when the kernel is compiled: that loop has no trace of them) the map is w SSIM.
+    With weights the map is w SSIM; for None the kernel is compiled without them.
     """
     one, two, k1, k2 = _f(1), _f(2), _f(c1), _f(c2)
     rows, width = image.shape
@@ -110,7 +110,7 @@ def _ssim_terms(
             for start in range(0, width, lanes.WIDTH):
                 first, fresh, high = _columns(start, cols, width)
                 mx, my = _across(half, 0, first, window), lanes.load(target_blurred[0], row, first)
-                # Differences of squares: what rounding makes of them must neither be negative nor break Cauchy-Schwarz.
+                # Clamp differences of squares: rounding must not make them negative or break Cauchy-Schwarz.
                 vx = lanes.clamp(_across(half, 1, first, window) - mx * mx, _f(0), _LARGEST)
                 vy = lanes.clamp(lanes.load(target_blurred[1], row, first) - my * my, _f(0), _LARGEST)
                 vxy = _across(half, 2, first, window) - mx * my
@@ -125,7 +125,7 @@ def _ssim_terms(
                 d_vxy = two * luminance * heavy
                 d_mx = two * low1 * (my * structure - mx * value)
                 amount = amount + lanes.between(value, fresh, high)
-                # Columns that only fill up sixteen lanes are no part of the mean.
+                # Columns that only fill the sixteen lanes are left out of the mean.
                 d_x = d_mx - two * mx * d_vx - my * d_vxy
                 lanes.store(partials[0], row, first, lanes.between(d_x, 0, high))
                 lanes.store(partials[1], row, first, lanes.between(d_vx, 0, high))
@@ -180,8 +180,8 @@ class ProjectionLoss:
     target's blurred maps do not change during a fit, so they are computed once per view.
 
     With weights w [row, col] >= 0 it is mean w (D(x, y) + λ (1 - SSIM(m x, m y))), m = 1 where w > 0 and 0 elsewhere:
-    a pixel of no weight is for SSIM's windows what lies outside the image, and its gradient is exactly 0. The mean
-    counts all pixels, so that a ray pulls alike in whole views and in masked ones.
+    for SSIM's windows a pixel of weight 0 counts as outside the image, and its gradient is exactly 0. The mean is over
+    all pixels, so that a ray has the same influence in a masked view as in a complete one.
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class ProjectionLoss:
         rows, self._cols = shape
         self.ssim_weight, self.c1, self.c2, self.term = ssim_weight, c1, c2, term
         self.window = gaussian_window()
-        # Narrow images get columns of zeros to the right: the kernels take sixteen at a time.
+        # The kernels take sixteen columns at a time: narrower images get columns of zeros to the right.
         self._width = max(self._cols, lanes.WIDTH)
         self._halves = np.zeros((-(-rows // TASK_ROWS), 3, self._width + 2 * MARGIN), np.float32)
         self._partials = np.empty((3, rows, self._width), np.float32)
@@ -209,7 +209,7 @@ class ProjectionLoss:
         return wide
 
     def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
-        """Blurred m y and m y² [2, row, col] of a target image; at least sixteen columns."""
+        """Blurred m y and m y² of a target image, [2, row, col] with at least sixteen columns."""
         wide = self._wide(target if weights is None else target * (weights > 0))
         out = np.empty((2, *wide.shape), np.float32)
         for plane, blurred in zip((wide, wide * wide), out, strict=True):
@@ -221,7 +221,7 @@ class ProjectionLoss:
     ) -> float:  # fmt: skip
         """The loss; `gradient` [row, col] receives its derivative with respect to `image`.
 
-        `target_maps` are those of the same weights. Image and target must be finite also where the weight is 0.
+        `target_maps` must have the same weights. Image and target must be finite also where the weight is 0.
         """
         pixels = image.size
         x, y, cols = self._wide(image), self._wide(target), self._cols

@@ -1,11 +1,11 @@
-"""Footprints to an image and an image's gradient to six moments a footprint, sixteen lanes wide (numba, threaded).
+"""render and moments: footprints to an image, and an image gradient to six moments a footprint (numba, threaded).
 
     pixel = Σ_i W_i G_i,   G = exp(E),   E = -1/2 δᵀ K δ = k τ² + l δv²,   τ = δu - r δv
     M₀ = Σ g G,   M₁ = Σ g G ε,   M₂ = Σ g G εεᵀ,   ε = (τ, δv)
 
-with δ the offset in pixels and g the gradient of the image: every Gaussian gathers its own gradient, no atomics. τ runs
-across a slanted footprint along a row; in moments of δ itself the thin side of a needle would be a small difference of
-large sums.
+with δ the offset in pixels and g the gradient of the image: every Gaussian gathers its own gradient, without atomics. τ
+is the offset along a row from the axis of a slanted footprint; in moments of δ itself the thin side of a needle would
+be a small difference of large sums.
 
 E is a parabola along a column, so G follows from the row above by two products, with factors that are the exponentials
 of E's first and second difference:
@@ -13,13 +13,13 @@ of E's first and second difference:
     G(δv + 1) = G(δv) Q(δv),   ln Q = k r (r - 2 (δu - r δv)) + l (2 δv + 1)
     Q(δv + 1) = Q(δv) q,       ln q = 2 (k r² + l)
 
-Errors grow with the rows: after `ANCHOR` of them G is computed afresh. A long footprint at a slant starts so far down
-its flank that float32 has no digits left: where the first row reaches below exp(-DEEPEST), each pixel has its own
-exponential instead, in the few columns of each row that lie within the footprint.
+Errors grow with the rows, so G is computed directly after every `ANCHOR` rows. A long slanted footprint may start so
+far down its flank that float32 underflows: where the first row would begin below exp(-DEEPEST), every pixel gets an
+exponential of its own, in the few columns of each row that lie within the footprint.
 
-Images are summed over threads in a fixed order: the same bits come again with the same number of threads, the same but
-for rounding with another. Each thread sums in two levels, `MANY` footprints and then these sums: equal float32
-numbers added one by one lose a part that grows with their number (half a percent of a million).
+Images are summed over threads in a fixed order: the result is equal to the bit for the same number of threads, and
+equal up to rounding for another. Each thread sums in two levels, `MANY` footprints and then these sums: adding equal
+float32 numbers one by one loses a part that grows with their number (half a percent for a million).
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
 
 _f = np.float32
-GROUP = 4  # rows are taken four at a time: branches on the exact count cost more than the rows do
-ANCHOR = 16  # rows that one start serves; the error by then is below 1e-5 of the footprint's weight
+GROUP = 4  # rows are processed four at a time: branches on the exact count cost more than the extra rows
+ANCHOR = 16  # rows of one recurrence; its error stays below 1e-5 of the footprint's weight
 MANY = 512  # footprints in one sum
-DEEPEST = 60.0  # the largest exponent, downwards, that the recurrence may start from
+DEEPEST = 60.0  # largest -E at which the recurrence may start
 
 
 @njit(inline="always", fastmath=True)
 def _box(table, i, rows, cols, height):  # type: ignore[no-untyped-def]
-    """Pixel box of footprint i, clipped to the image: (row0, row1, col0, col1), ends excluded; empty if it misses.
+    """Pixel box of footprint i, clipped to the image: (row0, row1, col0, col1), ends excluded; empty if outside.
 
-    Its rows are a multiple of `GROUP` and stay within `height`, itself one and not less than `rows`.
+    The number of rows is a multiple of `GROUP`; they stay within `height`, which is such a multiple and >= `rows`.
     """
     hu, hv = table[i, HU], table[i, HV]
     u, v = table[i, U], table[i, V]
     last_row, last_col = _f(rows - 1), _f(cols - 1)
     if not (hu >= 0 and u + hu >= 0 and u - hu <= last_col and v + hv >= 0 and v - hv <= last_row):
         return 0, 0, 0, 0
-    # Clipped as floats, rounded by conversion: math.ceil and floor are calls here, and as slow as all the rest.
+    # Clip as floats and round by conversion: math.ceil and floor are calls here, as slow as everything else together.
     top, left = max(v - hv, _f(0)), max(u - hu, _f(0))
     row0, col0 = int(top), int(left)
     row0, col0 = row0 + (_f(row0) < top), col0 + (_f(col0) < left)
@@ -63,7 +63,7 @@ def _box(table, i, rows, cols, height):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=True)
 def _is_smooth(table, i, row0):  # type: ignore[no-untyped-def]
-    """Whether the recurrence over rows keeps its digits: no pixel of the box starts or ends too far down."""
+    """Whether the recurrence over rows is accurate: -E stays below DEEPEST at all pixels of the box."""
     down = max(table[i, V] - _f(row0), table[i, HV])
     across = table[i, HU] + abs(table[i, SHEAR]) * down
     return table[i, K] * across * across + table[i, KV] * down * down < _f(2 * DEEPEST)
@@ -99,7 +99,7 @@ def _at(table, i, first, dy):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=True, error_model="numpy")
 def _add_by_pixels(table, i, row0, row1, col0, col1, image):  # type: ignore[no-untyped-def]
-    """Add footprint i to the image with an exponential a pixel."""
+    """Add footprint i to the image, with an exponential for each pixel."""
     for row in range(row0, row1):
         dy = _f(row) - table[i, V]
         low, high = _span(table, i, dy, col0, col1)
@@ -112,7 +112,7 @@ def _add_by_pixels(table, i, row0, row1, col0, col1, image):  # type: ignore[no-
 
 @njit(fastmath=True, error_model="numpy")
 def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments):  # type: ignore[no-untyped-def]
-    """Moments of the gradient under footprint i with an exponential a pixel."""
+    """Moments of the gradient under footprint i, with an exponential for each pixel."""
     m0, mt, mv = lanes.zero(), lanes.zero(), lanes.zero()
     mtt, mtv, mvv = lanes.zero(), lanes.zero(), lanes.zero()
     for row in range(row0, row1):
@@ -177,7 +177,7 @@ def gather_footprint(table, i, rows, cols, gradient, moments):  # type: ignore[n
                         s0, s1, s2 = s0 + here, s1 + rise, s2 + rise * (dy + _f(step))
                         value = value * factor
                         factor = factor * change
-            # What the gate lets through is slanted so little that these differences cost three digits at most.
+            # `_is_smooth` limits the slant, so that these differences lose three digits at most.
             t0, t1 = dx * s0 - shear * s1, dx * s1 - shear * s2
             m0, mt, mv = m0 + s0, mt + t0, mv + s1
             mtt, mtv, mvv = mtt + (dx * t0 - shear * t1), mtv + t1, mvv + s2
@@ -188,7 +188,7 @@ def gather_footprint(table, i, rows, cols, gradient, moments):  # type: ignore[n
 
 @njit(inline="always", fastmath=True)
 def _join(fresh, image, row0, row1):  # type: ignore[no-untyped-def]
-    """Add rows of `fresh` to the image and leave zeros behind."""
+    """Add rows of `fresh` to the image and set them to zero."""
     for row in range(row0, row1):
         for col in range(image.shape[1]):
             image[row, col] += fresh[row, col]
@@ -224,32 +224,32 @@ def _sum_layers(layers: F32, image: F32) -> None:
 
 
 def padded_shape(rows: int, cols: int) -> tuple[int, int]:
-    """The least shape that holds an image and lets whole groups of rows and whole lanes be taken within it."""
+    """The smallest shape >= (rows, cols) of whole groups of rows and at least sixteen columns."""
     return -(-rows // GROUP) * GROUP, max(cols, lanes.WIDTH)
 
 
 def padded(images: F32) -> F32:
-    """Images [..., row, col] with zeros up to their `padded_shape`; what is C-contiguous and has it is not copied."""
+    """Images [..., row, col] padded with zeros to their `padded_shape`; copied only if necessary."""
     rows, cols = images.shape[-2:]
     shape = padded_shape(rows, cols)
     if shape == (rows, cols):
         return np.ascontiguousarray(images)
-    room = np.zeros((*images.shape[:-2], *shape), np.float32)
-    room[..., :rows, :cols] = images
-    return room
+    result = np.zeros((*images.shape[:-2], *shape), np.float32)
+    result[..., :rows, :cols] = images
+    return result
 
 
 def render_layers(rows: int, cols: int) -> F32:
-    """Room for two private images a thread, [2 thread, row, col]; one serves any number of renderings."""
+    """Scratch of two images a thread, [2 thread, row, col]; it can be reused for any number of renderings."""
     return np.empty((2 * get_num_threads(), *padded_shape(rows, cols)), np.float32)
 
 
 def render(table: F32, image: F32, layers: F32 | None = None) -> None:
-    """Sum the footprints of `table` into image [row, col] (overwritten), through `layers` of `render_layers`."""
+    """Sum the footprints of `table` into image [row, col] (overwritten); `layers`: scratch, see `render_layers`."""
     rows, cols = image.shape
-    room = render_layers(rows, cols) if layers is None else layers
-    _render(table, rows, cols, room)
-    _sum_layers(room, image)
+    scratch = render_layers(rows, cols) if layers is None else layers
+    _render(table, rows, cols, scratch)
+    _sum_layers(scratch, image)
 
 
 @njit(**OPTIONS)
@@ -261,7 +261,7 @@ def _moments(table: F32, gradient: F32, rows: int, cols: int, moments: F32) -> N
 def moments(table: F32, gradient: F32, result: F32 | None = None) -> F32:
     """Moments [n, 6] (1, τ, v, ττ, τv, vv) of the image gradient [row, col] under each footprint, in `result` if given.
 
-    A C-contiguous gradient whose shape is its own `padded_shape` is read where it lies, any other is copied.
+    The gradient is copied unless it is C-contiguous and has its `padded_shape`.
     """
     rows, cols = gradient.shape
     found = np.empty((table.shape[0], 6), np.float32) if result is None else result

@@ -1,4 +1,4 @@
-"""The exact integral along each ray of a cone, for the few Gaussians whose affine footprint is not good enough (numba).
+"""Rays: exact line integrals in a cone, for Gaussians whose affine footprint is not accurate enough (numba).
 
 With H = S⁻¹Rᵀ, t from the source to the centre and D along the ray of a pixel, a Gaussian's integral along a line is
 
@@ -10,12 +10,12 @@ quadratic form N = δᵀKδ measures, its part along e is α·δ. So
 
     V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   η = 1 / |e|²,   α = η (e·Hu, e·Hv) tz / f
 
-with W, K from `footprints_cpu`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All are sums of
-squares: no digits are lost where Gaussians are thin. The rays with N / Q <= c² pass within c standard deviations; they
-fill an ellipse, and each row of pixels is cut where it leaves it; whole rows are drawn where the Gaussian reaches the
-plane of the source.
+with W, K from `cpu.footprints`, D₀ the ray through the centre, and β·δ the first order of |D| / |D₀|. All are sums of
+squares, which are accurate also for thin Gaussians. Rays with N / Q <= c² pass within c standard deviations; they fill
+an ellipse, which limits the columns of each row. Where the Gaussian reaches the plane of the source, whole rows are
+computed.
 
-The integral runs over the whole line, also behind the source: a Gaussian that reaches the source is out of bounds.
+The integral is over the whole line, also behind the source: a Gaussian must not reach the source.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from recon.kernels.cpu.footprints import (
 
 F64 = NDArray[np.float64]
 _f = np.float32
-_BAND = 8  # rows a task: each owns its pixels, so nothing is shared
+_BAND = 8  # rows a task: no two tasks write to one pixel
 # Columns of the terms: α, η, W |f / D₀|, the truncation c² and the box that it fills.
 AU, AV, ETA, WEIGHT, CUT, ROW0, ROW1, COL0, COL1 = range(9)
 # Columns of the sums, with a = g V, b = ∂ ln V / ∂N, q = ∂ ln V / ∂Q, l = 1 + α·δ; b goes with τ = δu - r δv and δv.
@@ -52,7 +52,7 @@ A, BT, BV, BTT, BTV, BVV, L, LU, LV, N = range(10)
 
 @njit(inline="always", fastmath=True)
 def _decay(x):  # type: ignore[no-untyped-def]
-    """e^x for x <= 0, to 4e-6: e^(x / 32) by its series, squared five times. np.exp would keep the loop scalar."""
+    """e^x for x <= 0, to 4e-6: e^(x / 32) by its series, squared five times. np.exp would prevent vectorisation."""
     t = max(x, _f(-40)) * _f(1 / 32)
     p = _f(1 / 120) + t * _f(1 / 720)
     p = _f(1) + t * (_f(1) + t * (_f(0.5) + t * (_f(1 / 6) + t * (_f(1 / 24) + t * p))))
@@ -216,7 +216,7 @@ def _sums(table: F32, terms: F64, focal: float, col: float, row: float, gradient
 
 @njit(**OPTIONS)
 def _as_moments(table: F32, terms: F64, sums: F32, moments: F32) -> None:
-    """The moments with which an affine footprint would have the same gradient through W, K and the centre."""
+    """Moments that give an affine footprint the same gradient through W, K and the centre."""
     for i in prange(table.shape[0]):
         for m in range(6):
             moments[i, m] = _f(0)
@@ -224,7 +224,7 @@ def _as_moments(table: F32, terms: F64, sums: F32, moments: F32) -> None:
             continue
         per_w = -2.0 / table[i, W]
         moments[i, 0] = -0.5 * per_w * sums[i, A]
-        # Σ₂α along τ and v, without Σ₂'s large parts that would cancel in τ.
+        # Σ₂α along τ and v, without the large terms of Σ₂ that cancel in τ.
         along_t = terms[i, AU] / table[i, K]
         along_v = (table[i, SHEAR] * terms[i, AU] + terms[i, AV]) / table[i, KV]
         moments[i, 1] = per_w * (sums[i, BT] + sums[i, L] * along_t)
@@ -247,7 +247,7 @@ def _bend(
     d_log_scales: F32,
     d_rotations: F32,
 ) -> None:
-    """Add what flows through α, η and |D₀|, which an affine footprint has not."""
+    """Add the gradient through α, η and |D₀|, which an affine footprint does not have."""
     for i in prange(means.shape[0]):
         if terms[i, ROW0] >= terms[i, ROW1]:
             continue
@@ -282,7 +282,7 @@ def _bend(
 
 
 class Rays:
-    """Some Gaussians in one view of a cone, ray by ray; shared by the forward and the backward pass."""
+    """Gaussians in one view of a cone, integrated ray by ray, with forward and backward pass."""
 
     def __init__(
         self,
@@ -295,7 +295,7 @@ class Rays:
         faint: float,
         cut: float,
     ) -> None:
-        """A Gaussian ends `cut` standard deviations from its centre, or where no ray has more than `faint` of it."""
+        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them."""
         self.parameters, self.camera = (means, scales, rotations, densities), camera
         self.table = footprint_table(densities.shape[0])
         footprints(*self.parameters, camera, faint, cut, self.table)
@@ -313,7 +313,7 @@ class Rays:
     def backward(
         self, gradient: F32, d_means: F32, d_log_scales: F32, d_rotations: F32, d_densities: F32, d_centres: F32
     ) -> None:
-        """Add to the gradients; d_centres [n, 2] gets ∂/∂(col, row) of the footprint's centre in 1/px."""
+        """Add to the gradients; d_centres [n, 2] receives ∂/∂(col, row) of the footprint's centre in 1/px."""
         means, scales, rotations, _ = self.parameters
         c = self.camera
         sums = np.empty((means.shape[0], 10), np.float32)

@@ -1,9 +1,9 @@
-"""Total variation on the CPU: a step of the dual problem of denoising, and the gradient of TV itself (numba, threaded).
+"""Total variation on the CPU: a step of the dual denoising problem, and the gradient of smoothed TV (numba, threaded).
 
-    TV(x) = Σ |D x|,   (D x)_a = w_a (x[i + 1] - x[i]) along axis a, zero at the end;   w: voxels that are no cubes
+    TV(x) = Σ |D x|,   (D x)_a = w_a (x[i + 1] - x[i]) along axis a, zero at the end;   w: for voxels that are not cubes
 
-Volumes are [a, b, c], dual fields [3, a, b, c]. Each thread takes a run of planes and keeps the two that it needs in
-its cache, so a step reads and writes every array once.
+Volumes are [a, b, c], dual fields [3, a, b, c]. Each thread takes a run of planes and keeps two of them in its cache,
+so a step reads and writes every array once.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Weights = tuple[float, float, float]
 
 @njit(fastmath=True, error_model="numpy", cache=True)
 def _primal_plane(x, p, i, threshold, w0, w1, w2, floor, zero, out):  # type: ignore[no-untyped-def]
-    """Plane i of max(x - threshold Dᵀ p, floor) into out [b, c + 1]; the last column comes twice."""
+    """Plane i of max(x - threshold Dᵀ p, floor) into out [b, c + 1]; the last column is repeated."""
     nb, nc = x.shape[1], x.shape[2]
     for j in range(nb):
         here, row = x[i, j], out[j]
@@ -45,7 +45,7 @@ def _dual_step(
     runs = edges.shape[0]
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
     zero = np.zeros(nc, np.float32)
-    # The first plane of each run, before a neighbour changes what it depends on.
+    # The first plane of each run, before another thread changes the dual fields that it depends on.
     for run in prange(runs):
         _primal_plane(x, p, run * na // runs, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):
@@ -84,13 +84,13 @@ def _primal(x: F32, p: F32, threshold: float, weights: Weights, floor: float, pl
 
 
 def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: F32) -> None:
-    """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or nothing.
+    """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or none.
 
     Projected gradient ascent of the dual of min ½|y - x|² + threshold TV(y) (Chambolle 2004; with P: Beck & Teboulle
-    2009, eq. 4.6), at a pace of 0.95 of the longest that converges.
+    2009, eq. 4.6), at 0.95 of the longest step that converges.
 
     Args:
-        scratch: of `dual_scratch`.
+        scratch: see `dual_scratch`.
     """
     pace = 1.9 / (4 * sum(w * w for w in weights)) / threshold
     floor = 0.0 if nonnegative else _NO_FLOOR
@@ -103,7 +103,7 @@ def primal(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool
 
 
 def dual_scratch(shape: tuple[int, int, int]) -> F32:
-    """Planes for `dual_step` and `primal`: three for each run of planes."""
+    """Scratch for `dual_step` and `primal`: three planes for each run of planes."""
     return np.empty((_runs(shape), 3, shape[1], shape[2] + 1), np.float32)
 
 
@@ -156,7 +156,7 @@ def gradient(x: F32, smoothing: float, weights: Weights, out: F32) -> float:
 
     Args:
         x: [a, b, c].
-        smoothing: in the unit of x, positive: the gradient of TV itself has no value where x is flat.
+        smoothing: positive, in the unit of x; without it the gradient is not defined where x is constant.
     """
     fields = np.empty((_runs(x.shape), 2, 3, *x.shape[1:]), np.float32)
     sums = np.empty(fields.shape[0], np.float64)

@@ -1,4 +1,4 @@
-"""Sums and products of whole volumes and projections in one pass, summed in float64 (numba, threaded)."""
+"""Scalar products and linear combinations of whole volumes or projections, summed in float64 (numba, threaded)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _combine(alpha: float, a: F32, beta: float, b: F32, floor: float, out: F32) 
 
 
 def combine(alpha: float, a: F32, beta: float, b: F32, out: F32, nonnegative: bool = False) -> None:
-    """out = alpha a + beta b, negative values clipped if wanted; `out` may be `a` or `b`."""
+    """out = alpha a + beta b, negative values clipped with `nonnegative`; `out` may be `a` or `b`."""
     floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
     _combine(alpha, a.reshape(-1), beta, b.reshape(-1), floor, out.reshape(-1))
 
@@ -55,7 +55,7 @@ def _add_product(x: F32, factor: float, a: F32, b: F32, floor: float) -> None:
 
 
 def add_product(x: F32, factor: float, a: F32, b: F32, nonnegative: bool) -> None:
-    """x += factor a b, negative values clipped if wanted."""
+    """x += factor a b, negative values clipped with `nonnegative`."""
     floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
     _add_product(x.reshape(-1), factor, a.reshape(-1), b.reshape(-1), floor)
 
@@ -78,7 +78,7 @@ def _misfit(data: F32, model: F32, weight: F32, scale: F32, sums: NDArray[np.flo
 
 
 def misfit(data: F32, model: F32, weight: F32 | None = None, scale: F32 | None = None) -> float:
-    """Replace `model` by scale (data - model); returns Σ weight (data - model)². None is one everywhere."""
+    """Replace `model` by scale (data - model); returns Σ weight (data - model)². None: all 1."""
     empty = np.empty(0, np.float32)
     sums = np.empty(get_num_threads())
     weights, scales = (empty if array is None else array.reshape(-1) for array in (weight, scale))

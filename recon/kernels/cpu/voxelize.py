@@ -1,18 +1,19 @@
-"""Voxelisation of Gaussians on the CPU: any box, each slice of a Gaussian drawn as a footprint (numba, threaded).
+"""Voxelisation of Gaussians on the CPU, slice by slice: a slice of a Gaussian is a footprint (numba, threaded).
 
 With the rows a, b, c (x, y, z) of R S in voxels, the exponent is a sum of squares without any subtraction of them:
 
     -2 E = k (δx - s δy - t δz)² + l (δy - r δz)² + δz² / Σzz
     Σzz = |c|²    l = Σzz / |b x c|²    k = |b x c|² / (s₁ s₂ s₃)²    r = b·c / Σzz    s = (a x c)·(b x c) / |b x c|²
 
-At one δz this is a footprint in (x, y) whose centre has moved by δz (a·c, b·c) / Σzz, as `project_cpu` draws it.
+At one δz this is a footprint in (x, y) whose centre has moved by δz (a·c, b·c) / Σzz, as in `cpu.project`.
 
-The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G ε and N₂ = Σ g G εεᵀ with ε = (τ, δy', δz): δz from the
-Gaussian's centre, the others in the slice from its own, as they come. In the Gaussian's axes and standard deviations
+The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G ε and N₂ = Σ g G εεᵀ with ε = (τ, δy', δz): δz is
+measured from the Gaussian's centre, τ and δy' from the centre of its footprint in the slice. In the Gaussian's axes and
+standard deviations
 
     y = τ A + δy' B + δz C,   A = H e_x,   B = (c x A) sqrt(l) / |c x A|,   C = c / Σzz,   H = S⁻¹ Rᵀ per voxel
 
-and with T = ρ Σ g G yyᵀ (see `footprints_cpu`)
+and with T = ρ Σ g G yyᵀ (see `cpu.footprints`)
 
     ∂ρ = N₀,   ∂p = ρ R S⁻¹ Σ g G y,   ∂ log scales and ∂R from T
 """
@@ -31,10 +32,10 @@ from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W, add_shap
 from recon.kernels.cpu.project import add_footprint, gather_footprint, padded, padded_shape
 
 _f = np.float32
-_SLAB = 4  # slices a task: small enough to share out a 32-voxel cube, large enough to keep the rows in cache
+_SLAB = 4  # slices a task: few enough to give all threads work on a 32-voxel cube, enough to keep rows in the cache
 _TASK = 1024  # Gaussians a task of the search
 _SHARE = 16  # Gaussians a task of the backward pass
-# Columns of the table, beside K, SHEAR and KV of the footprints: centre, drift of the centre per slice, 1 / Σzz, half
+# Columns of the table, besides K, SHEAR and KV of the footprints: centre, shift of the centre per slice, 1 / Σzz, half
 # widths of the middle slice over the reach, reach in standard deviations.
 _X, _Y, _Z, _DRIFT_X, _DRIFT_Y, _KZ, _WIDE_X, _WIDE_Y, _REACH = 0, 1, 5, 6, 7, 8, 9, 10, 11
 _FARTHEST = 1e30  # keeps float32 from infinity
@@ -45,7 +46,7 @@ def _near(
     means: F32, scales: F32, low: NDArray[np.float64], high: NDArray[np.float64], cut: float, found: NDArray[np.int64],
     counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Gaussians whose sphere of the largest reach meets the box low..high; each task fills its piece of `found`."""
+    """Gaussians whose bounding sphere meets the box low..high; each task fills its piece of `found`."""
     n = means.shape[0]
     x0, y0, z0 = _f(low[0]), _f(low[1]), _f(low[2])
     x1, y1, z1 = _f(high[0]), _f(high[1]), _f(high[2])
@@ -56,7 +57,7 @@ def _near(
             reach = _f(cut) * max(scales[i, 0], scales[i, 1], scales[i, 2])
             x, y, z = means[i, 0], means[i, 1], means[i, 2]
             across = (x + reach >= x0) & (x - reach <= x1) & (y + reach >= y0) & (y - reach <= y1)
-            found[k] = i  # overwritten by the next where this one is out: no branch
+            found[k] = i  # overwritten by the next Gaussian if this one is outside: no branch
             k += across & (z + reach >= z0) & (z - reach <= z1)
         counts[task] = k - begin
 
@@ -76,7 +77,7 @@ def _place(
     table: F32,
     slices: NDArray[np.int32],
 ) -> None:
-    """Fill table [k, 12] and slices [k, 2] (first, last + 1) of Gaussians `near`; none where one misses the grid."""
+    """Fill table [k, 12] and slices [k, 2] (first, last + 1; 0, 0 outside the grid) of the Gaussians `near`."""
     nz, ny, nx = shape
     for j in prange(near.shape[0]):
         i = near[j]
@@ -128,7 +129,7 @@ def _cut(table, j, z, weight, piece):  # type: ignore[no-untyped-def]
     piece[0, V] = table[j, _Y] + table[j, _DRIFT_Y] * dz
     piece[0, K], piece[0, SHEAR], piece[0, KV] = table[j, K], table[j, SHEAR], table[j, KV]
     piece[0, HU], piece[0, HV] = reach * table[j, _WIDE_X], reach * table[j, _WIDE_Y]
-    # numba's own exp is a call that empties the vector registers.
+    # numba's own exp is a call that clears the vector registers.
     piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * down))
     return dz
 
@@ -136,7 +137,7 @@ def _cut(table, j, z, weight, piece):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def _fill(table: F32, slices: NDArray[np.int32], hits: NDArray[np.int64], densities: F32, volume: F32,
           ny: int, nx: int, pieces: F32) -> None:  # fmt: skip
-    """volume [z, y, x] of padded slices: each task owns `_SLAB` of them, so nothing is shared."""
+    """volume [z, y, x] of padded slices: each task fills `_SLAB` of them, so no two write to one voxel."""
     for task in prange(pieces.shape[0]):
         low, high = task * _SLAB, min(volume.shape[0], (task + 1) * _SLAB)
         piece = pieces[task]
@@ -184,7 +185,7 @@ def _gather(
             d_densities[i] += n0
             a0, a1, a2 = ex * r[0] / s0, ex * r[1] / s1, ex * r[2] / s2
             c0, c1, c2 = r[6] * s0 / ez, r[7] * s1 / ez, r[8] * s2 / ez
-            # B has the length sqrt(l), whatever the digits of its factors.
+            # Scale B to its length sqrt(l), which removes the rounding errors of its factors.
             b0, b1, b2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
             size = np.sqrt(table[j, KV] / max(b0 * b0 + b1 * b1 + b2 * b2, _f(1 / _FARTHEST)))
             b0, b1, b2 = size * b0, size * b1, size * b2
@@ -210,7 +211,7 @@ def _gather(
 
 
 class Layout:
-    """Where a set of Gaussians falls on one grid; shared by the forward and the backward pass."""
+    """Gaussians placed on one grid, with the forward and the backward pass."""
 
     def __init__(
         self,
@@ -226,7 +227,7 @@ class Layout:
     ) -> None:
         """`origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm, `spacing` the voxels' edge or edges (z, y, x).
 
-        A Gaussian ends where it falls below `faint` (a density) and at the latest after `cut` standard deviations.
+        Gaussians are cut off where they fall below `faint` (a density), and at `cut` standard deviations.
         """
         n = densities.shape[0]
         self.parameters, self.shape = (means, scales, rotations, densities), shape
@@ -234,7 +235,7 @@ class Layout:
         corner = np.asarray(origin, np.float64)
         edge = self._spacing[::-1]
         found, counts = np.empty(n, np.int64), np.empty(-(-n // _TASK), np.int64)
-        # Half a voxel more on all sides: the search rounds to float32.
+        # Half a voxel more on all sides, since the search rounds to float32.
         _near(means, scales, corner - edge / 2, corner + (np.asarray(shape[::-1]) - 0.5) * edge, cut, found, counts)
         pieces = [found[k * _TASK : k * _TASK + count] for k, count in enumerate(counts)]
         near = np.concatenate(pieces) if pieces else found
@@ -261,7 +262,7 @@ class Layout:
         *,
         means_too: bool = True,
     ) -> None:
-        """Add the gradients that follow from `gradient` [z, y, x]; `means_too=False` leaves positions alone."""
+        """Back-propagate `gradient` [z, y, x], adding to the others; `means_too=False` leaves positions out."""
         _, ny, nx = self.shape
         _, scales, rotations, densities = self.parameters
         pieces = np.empty((-(-self.hits.size // _SHARE), 2, 16), np.float32)

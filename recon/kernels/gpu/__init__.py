@@ -1,4 +1,4 @@
-"""Triton kernels for CUDA devices, the same operations as the CPU's; imported only where a GPU is asked for.
+"""Triton kernels for CUDA devices: the same operations as the CPU kernels; imported only if a GPU is used.
 
 They work on contiguous float32 torch tensors. Sums are gathered, never scattered: an image tile or a brick of voxels
 sums the Gaussians on its list, a Gaussian sums the gradient under it, so there are no atomics and the same input gives
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 
-# Triton 3.9 warns that the default changes unless one is chosen; fused multiply-adds are what the kernels want.
+# Triton 3.9 warns unless this is set, since its default will change; the kernels use fused multiply-adds.
 os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")
 
 try:
@@ -32,8 +32,8 @@ def require(device: str | torch.device) -> torch.device:
     """The device to run on.
 
     Raises:
-        ValueError: where the device is not CUDA (and Triton not interpreted), or not the one that Triton launches on.
-        RuntimeError: where torch sees no CUDA device.
+        ValueError: the device is not a CUDA device (and Triton is not interpreted), or not the current one.
+        RuntimeError: torch sees no CUDA device.
     """
     wanted = torch.device(device)
     if interpreted():

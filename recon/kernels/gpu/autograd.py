@@ -1,4 +1,4 @@
-"""Projection and voxelisation of raw parameters on a GPU as autograd functions (gradients as the readable twin's)."""
+"""project and voxelize on a GPU: autograd functions of the raw parameters."""
 
 from __future__ import annotations
 

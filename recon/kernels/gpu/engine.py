@@ -1,4 +1,4 @@
-"""A fit's operations on a GPU: the same as the CPU's in `recon.splatting.backend`, on torch tensors."""
+"""Gpu: the operations of a fit on a GPU, the Backend of `recon.splatting.backend` on torch tensors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _zeros(like: Parameters) -> Parameters:
 
 
 class GpuPass:
-    """Physical parameters of raw ones, and the gradients that views and boxes of voxels have added so far."""
+    """One pass over a model: physical parameters, and the gradients added by its views and boxes of voxels."""
 
     def __init__(self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> None:
         self._raw, self._unit = (quaternions, raw), unit
@@ -59,14 +59,14 @@ class GpuPass:
 
 
 class GpuView:
-    """One rendered view: its image [row, col], and the way back."""
+    """One rendered view: its image [row, col] and its backward pass."""
 
     def __init__(self, run: GpuPass, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> None:
         self._run, self._geometry, self._view, self._length = run, geometry, view, model.length(geometry)
         self.footprints = footprints(*run.active, geometry, view, faint, cut, self._length, model.exact_above)
         self.image = render(self.footprints, geometry.detector_shape)
         self._rays: tuple[Tensor, Rays] | None = None
-        if geometry.is_cone and model.exact_above < math.inf:  # their number is known only once the device tells it
+        if geometry.is_cone and model.exact_above < math.inf:  # their number is only known after waiting for the device
             exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
             if exact.numel() > 0:
                 means, scales, rotations, densities = (array[exact] for array in run.active)
@@ -75,7 +75,7 @@ class GpuView:
                 self._rays = (exact, rays)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Add what follows from an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
+        """Back-propagate an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
         run, found = self._run, self.footprints
         centres = found.table.new_empty((found.table.shape[0], 2))
         footprints_backward(
@@ -87,19 +87,19 @@ class GpuView:
             rays.backward(gradient, *some, moved)
             centres[exact] = moved
             for total, part in zip(run.into, some, strict=True):
-                total[exact] += part  # each is there once: no order of adding, the same bits
+                total[exact] += part  # no index is repeated, so the sum does not depend on an order
         return centres
 
 
 class GpuBox:
-    """One box of voxels: its density [z, y, x], and the way back."""
+    """One box of voxels: its density [z, y, x] and its backward pass."""
 
     def __init__(self, run: GpuPass, grid: Grid, faint: float, cut: float) -> None:
         self._run, self.placed = run, place(*run.active, grid, faint, cut)
         self.density = fill(self.placed)
 
     def backward(self, gradient: Tensor, *, means_too: bool = True) -> None:
-        """Add what follows from a gradient [z, y, x]; `means_too=False` leaves positions alone."""
+        """Back-propagate a gradient [z, y, x]; `means_too=False` leaves positions out."""
         fill_backward(self.placed, gradient, *self._run.active[1:], *self._run.into, means_too=means_too)
 
 
@@ -115,7 +115,7 @@ class Gpu:
         return torch.from_numpy(np.array(values, np.float32)).to(self.device)
 
     def numpy(self, array: Tensor) -> F32:
-        """A copy for the host."""
+        """A copy as a numpy array."""
         return array.detach().cpu().numpy().copy()
 
     def begin(self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> GpuPass:
@@ -129,7 +129,7 @@ class Gpu:
         return losses.ProjectionLoss(shape, ssim_weight, self.device, term)
 
     def misfit(self, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
-        """||w (image - target)|| / ||w target|| (float64, no dimensions, on the device); 0 for a target of zeros."""
+        """||w (image - target)|| / ||w target|| (float64 scalar on the device); 0 for a target of zeros."""
         off, seen = image - target, target
         if weights is not None:
             off, seen = weights * off, weights * seen

@@ -1,8 +1,8 @@
-"""Gaussians to footprints on the detector and gradients back, parallel beam and affine cone (Triton).
+"""Footprints of Gaussians on the detector, and gradients back: parallel beam and affine cone (Triton).
 
-The formulas, and the letters for what is in them, are those of `footprints_cpu`: products of a, b and h in place of
-determinants, a gradient on stretch and turn in the Gaussian's own axes, from moments in a footprint's own directions.
-A Gaussian with a number that is not finite is not seen.
+Formulas and symbols are those of `cpu.footprints`: products of a, b and h instead of determinants, and a gradient on
+deformations in the Gaussian's own axes, from moments along a footprint's own directions. Gaussians with a parameter
+that is not finite are hidden.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _BLOCK = 128
 _ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
 _HUGE = tl.constexpr(3.0e38)
 _HIDDEN, _INEXACT = tl.constexpr(HIDDEN), tl.constexpr(INEXACT)
-# Columns of the footprint table, as in footprints_cpu.
+# Columns of the footprint table, as in `cpu.footprints`.
 U, V, K, SHEAR, KV, W, HU, HV = (tl.constexpr(column) for column in range(8))
 
 
@@ -43,13 +43,13 @@ class Footprints:
 def along_ray(  # type: ignore[no-untyped-def]
     means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr
 ):
-    """Where a Gaussian lies in the view and how the view sees it: (across, up, per, a, b, depth, norm)."""
+    """Position of a Gaussian in the view and the ray through it: (across, up, px/mm, a, b, depth, length of ray)."""
     x, y = tl.load(means + 3 * i, live, 0.0), tl.load(means + 3 * i + 1, live, 0.0)
     z = tl.load(means + 3 * i + 2, live, 0.0)
     across, up = ux * x + uy * y + uz * z, vx * x + vy * y + vz * z
     if CONE:
         depth = sod + (dx * x + dy * y + dz * z)
-        ahead = tl.where(depth > 0.0, depth, 1.0)  # what lies behind the source is left out by the caller
+        ahead = tl.where(depth > 0.0, depth, 1.0)  # the caller leaves out Gaussians behind the source
         a, b, per = across / ahead, up / ahead, focal / ahead
         norm = tl.sqrt(1.0 + a * a + b * b)
     else:
@@ -66,7 +66,7 @@ def turned(x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8):  # type: ignore[no-unty
 
 @triton.jit
 def shape_of(scales, rotations, i, live):  # type: ignore[no-untyped-def]
-    """The three scales and nine numbers of the rotation; a ball of radius 1 without any turn where not `live`."""
+    """The three scales and nine numbers of the rotation; unit scales and rotation where not `live`."""
     s, r = scales + 3 * i, rotations + 9 * i
     return (
         tl.load(s, live, 1.0), tl.load(s + 1, live, 1.0), tl.load(s + 2, live, 1.0),
@@ -79,7 +79,7 @@ def shape_of(scales, rotations, i, live):  # type: ignore[no-untyped-def]
 @triton.jit
 def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):  # type: ignore[no-untyped-def]
     """The pixels within hu, hv of (u, v): the whole image where not `bounded`, an empty box where not `hit`."""
-    # Clipped as floats: a box far outside is no int32.
+    # Clip as floats: a box far outside exceeds int32.
     row_low, row_high = tl.maximum(tl.ceil(v - hv), 0.0), tl.minimum(tl.floor(v + hv) + 1.0, rows * 1.0)
     col_low, col_high = tl.maximum(tl.ceil(u - hu), 0.0), tl.minimum(tl.floor(u + hu) + 1.0, cols * 1.0)
     row_low, row_high = tl.where(bounded, row_low, 0.0), tl.where(bounded, row_high, rows * 1.0)
@@ -94,7 +94,7 @@ def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):  # type: 
 
 @triton.jit
 def add_to(at, value, live):  # type: ignore[no-untyped-def]
-    """*at += value, by the lanes that live."""
+    """*at += value, for lanes that are `live`."""
     tl.store(at, tl.load(at, live, 0.0) + value, live)
 
 
@@ -102,11 +102,11 @@ def add_to(at, value, live):  # type: ignore[no-untyped-def]
 def add_shape(  # type: ignore[no-untyped-def]
     i, live, s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations
 ):
-    """Add what follows from T, the gradient on a deformation along the Gaussian's own axes, see `footprints_cpu`."""
+    """Add the gradients that follow from T, the gradient on a deformation in the Gaussian's axes (`cpu.footprints`)."""
     add_to(d_log_scales + 3 * i, t00, live)
     add_to(d_log_scales + 3 * i + 1, t11, live)
     add_to(d_log_scales + 3 * i + 2, t22, live)
-    # Quotients of equal scales are equal to the bit: a ball feels no torque.
+    # Quotients of equal scales are equal to the bit: a sphere gets no gradient on its rotation.
     x, y = 0.5 * t01 * (s1 / s0 - s0 / s1), 0.5 * t02 * (s2 / s0 - s0 / s2)
     z = 0.5 * t12 * (s2 / s1 - s1 / s2)
     g = d_rotations + 9 * i
@@ -128,7 +128,7 @@ def _footprints(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
-    i = tl.minimum(i, n - 1)  # lanes past the end compute the last one again and store nothing
+    i = tl.minimum(i, n - 1)  # lanes past the end repeat the last Gaussian and store nothing
     across, up, per, a, b, depth, norm = along_ray(
         means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE
     )  # fmt: skip
@@ -145,20 +145,20 @@ def _footprints(  # type: ignore[no-untyped-def]
             along_u += h / s * pu
             along_v += h / s * pv
     within = 1.0 / tl.sqrt(hh)  # mm of the ray in one standard deviation
-    # g / sqrt(det Σ₂), by quotients one after the other: a product of three small scales would leave float32's range.
+    # g / sqrt(det Σ₂), by successive quotients: a product of three small scales would leave float32's range.
     scale = within / per / tl.load(scales + 3 * i) / tl.load(scales + 3 * i + 1) / tl.load(scales + 3 * i + 2)
     wide, high = tl.sqrt(uu), tl.sqrt(vv)
     steep, level = high * scale, 1.0 / (high * per)
     ka, kv = steep * steep, level * level
     weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI * norm * within)
     u, v = col0 + per * across, row0 + per * up
-    # Comparisons with a NaN are false: what is not finite is not seen.
+    # Comparisons with NaN are false, so Gaussians that are not finite are hidden.
     seen = live & (weight > faint) & (weight < _HUGE) & (ka < _HUGE) & (kv < _HUGE) & (depth > near)
     reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, weight, 1.0) / faint), 0.0))) * per
     hu, hv = reach * wide, reach * high
     hit = seen & (u + hu >= 0.0) & (u - hu <= cols - 1.0) & (v + hv >= 0.0) & (v - hv <= rows - 1.0)
     if CONE:
-        # ε² of `footprints_cpu`: with α and β in px of the rotation axis' scale, Σ₂ / f² and η.
+        # ε² of `cpu.footprints`: with α and β in px of the rotation axis' scale, Σ₂ / f² and η.
         au, av, bu, bv = along_u / hh, along_v / hh, a / (norm * norm), b / (norm * norm)
         eta = 1.0 / (depth * depth * hh)
         error = uu * (0.5 * bu * bu + au * bu + 1.5 * au * au)
@@ -208,7 +208,7 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
         (ax * pu2 + ay * pv2 + pd2) / s2,
     )
     hh = h0 * h0 + h1 * h1 + h2 * h2
-    # A = (b x h) / (g s₁ s₂ s₃ h·h), the other way round since the views' axes are left-handed; B = b / Σvv in px.
+    # A = (b x h) / (g s₁ s₂ s₃ h·h), with opposite sign since the views' axes are left-handed; B = b / Σvv in px.
     size, level = 1.0 / (g * s0 * s1) / (s2 * hh), kv * g
     a0, a1, a2 = size * (b2 * h1 - b1 * h2), size * (b0 * h2 - b2 * h0), size * (b1 * h0 - b0 * h1)
     b0, b1, b2 = level * b0, level * b1, level * b2
@@ -244,7 +244,7 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
 
 
 def beam_of(geometry: Geometry, view: int) -> tuple[list[float], float, float]:
-    """The view's axes (nine numbers), the detector's distance in pixels (pixels a mm, if parallel), source distance."""
+    """The view's axes (nine numbers), sdd in pixels (parallel beam: pixels per mm), and sod (parallel beam: 0)."""
     focal = (geometry.sdd if geometry.is_cone else 1.0) / geometry.pixel_pitch
     return geometry.axes(view).ravel().tolist(), focal, geometry.sod if geometry.is_cone else 0.0
 
@@ -253,10 +253,10 @@ def footprints(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, geometry: Geometry, view: int,
     faint: float, cut: float, length: float = 0.0, exact_above: float = math.inf,
 ) -> Footprints:  # fmt: skip
-    """Footprints of Gaussians, ending below `faint` (units of the image) and at the latest after `cut` σ.
+    """Footprints of Gaussians, cut off below `faint` (units of the image) and at `cut` σ.
 
-    A `length` (mm) other than 0 stands in for μ: the uncorrected factor. Half widths are INEXACT, and boxes empty,
-    where a cone's ε is above `exact_above` (see `footprints_cpu`).
+    A `length` (mm) other than 0 replaces μ: the uncorrected factor. Half widths are INEXACT, and boxes empty,
+    where a cone's ε is above `exact_above` (see `cpu.footprints`).
     """
     n = densities.shape[0]
     found = Footprints(means.new_empty((n, 8)), torch.empty((n, 4), dtype=torch.int32, device=means.device))
@@ -277,7 +277,7 @@ def footprints_backward(
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, d_centres: Tensor,
     length: float = 0.0,
 ) -> None:  # fmt: skip
-    """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2] gets ∂/∂(col, row) in 1/px."""
+    """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
     n = densities.shape[0]
     axes, focal, sod = beam_of(geometry, view)
     if n > 0:

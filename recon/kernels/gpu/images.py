@@ -1,10 +1,10 @@
-"""Footprints to an image and an image's gradient to six moments a footprint (Triton).
+"""render and moments: footprints to an image, and an image gradient to six moments a footprint (Triton).
 
     pixel = Σ_i W_i G_i,   G = exp(-1/2 (k τ² + δv² / Σvv)),   τ = δu - r δv
     moments of the gradient g:  Σ g G (1, τ, δv, τ², τ δv, δv²)
 
-The moments are taken in the sheared offset τ, in which the quadratic form is diagonal: those of a long thin footprint
-keep their digits. A footprint ends at its box, whatever the tiles.
+The moments use the sheared offset τ, in which the quadratic form is diagonal: they are accurate for long thin
+footprints. A footprint is cut off at its box, independent of tiles.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from torch import Tensor
 from recon.kernels.gpu.footprints import HU, HV, KV, SHEAR, Footprints, K, U, V, W
 from recon.kernels.gpu.tiles import tile_lists
 
-_EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, larger tiles would evaluate more beside them
-_GROUP = 8  # Gaussians that a tile takes up at once
-_MANY = 64  # footprints in one sum: numbers added one by one to a large sum lose a part that grows with their number
+_EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, and larger tiles would evaluate more pixels outside them
+_GROUP = 8  # Gaussians that a tile processes at once
+_MANY = 64  # footprints in one partial sum: adding many small numbers one by one to a large sum loses accuracy
 _BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
 _HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))  # exp(-q / 2) = 2^(q * this)
 
@@ -37,7 +37,7 @@ def _render(  # type: ignore[no-untyped-def]
     member = tl.arange(0, GROUP)
     sums = tl.zeros((EDGE * EDGE,), tl.float32)
     for outer in range(first + share * GROUP, last, shares * GROUP * MANY):
-        # Each member of a group sums by itself, so that the inner loop holds no reduction.
+        # Each member of a group has its own sum, so that the inner loop has no reduction.
         part = tl.zeros((GROUP, EDGE * EDGE), tl.float32)
         for start in range(outer, tl.minimum(last, outer + shares * GROUP * MANY), shares * GROUP):
             held = start + member < last

@@ -1,4 +1,4 @@
-"""Data terms with D-SSIM, and total variation, with their gradients, in a few passes over the pixels (Triton)."""
+"""Fused losses on a GPU: data term, D-SSIM and total variation with their gradients (Triton)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: 
 def _products_across(  # type: ignore[no-untyped-def]
     image, target, weights, out, window, cols, pixels, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """x, x² and xy blurred along the rows, out [3, row, col]; a pixel of no weight is 0."""
+    """x, x² and xy blurred along the rows, out [3, row, col]; pixels of weight 0 count as 0."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
     col = i % cols
@@ -60,7 +60,7 @@ def _ssim_terms(  # type: ignore[no-untyped-def]
     half, target_maps, weights, partials, sums, window, rows, cols, pixels, c1, c2, WEIGHTED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Finish the blur down the columns; the sum of w (1 - SSIM) a block; w SSIM's slopes by the blurred x, x², xy."""
+    """Finish the blur down the columns; sum w (1 - SSIM) of a block, and derivatives of w SSIM by blurred x, x², xy."""
     block = tl.program_id(0)
     i = block * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -73,7 +73,7 @@ def _ssim_terms(  # type: ignore[no-untyped-def]
         mxx += weight * tl.load(at + pixels, ok, 0.0)
         mxy += weight * tl.load(at + 2 * pixels, ok, 0.0)
     my, myy = tl.load(target_maps + i, live, 0.0), tl.load(target_maps + pixels + i, live, 0.0)
-    # Differences of squares: what rounding makes of them must neither be negative nor break Cauchy-Schwarz.
+    # Clamp differences of squares: rounding must not make them negative or break Cauchy-Schwarz.
     vx = tl.minimum(tl.maximum(mxx - mx * mx, 0.0), _LARGEST)
     vy, vxy = tl.minimum(tl.maximum(myy - my * my, 0.0), _LARGEST), mxy - mx * my
     low1, low2 = 1.0 / (mx * mx + my * my + c1), 1.0 / (vx + vy + c2)
@@ -96,7 +96,7 @@ def _combine(  # type: ignore[no-untyped-def]
     image, target, half, weights, gradient, sums, window, rows, cols, pixels, soft, depth, share, ssim,
     KIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Finish the derivatives' blur and join them with the data term's; the sum of w times that term a block."""
+    """Finish the blur of the derivatives and add those of the data term; sum w times that term of a block."""
     block = tl.program_id(0)
     i = block * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -121,7 +121,7 @@ def _combine(  # type: ignore[no-untyped-def]
     slope = px + 2.0 * x * pxx + y * pxy
     if WEIGHTED:
         weight = tl.load(weights + i, live, 0.0)
-        seen = weight > 0.0  # what stands in a pixel of no weight may be infinite when squared
+        seen = weight > 0.0  # values in a pixel of weight 0 may overflow when squared
         pull, cost = tl.where(seen, pull * weight, 0.0), tl.where(seen, cost * weight, 0.0)
         slope = tl.where(seen, slope, 0.0)
     tl.store(gradient + i, share * pull - ssim * slope, live)
@@ -129,7 +129,7 @@ def _combine(  # type: ignore[no-untyped-def]
 
 
 class ProjectionLoss:
-    """mean w (D(x, y) + λ (1 - SSIM(x, y))) and its gradient, see `losses_cpu.ProjectionLoss`."""
+    """mean w (D(x, y) + λ (1 - SSIM(x, y))) and its gradient, see `cpu.losses.ProjectionLoss`."""
 
     def __init__(
         self, shape: tuple[int, int], ssim_weight: float, device: torch.device, term: DataTerm = ABSOLUTE,
@@ -159,15 +159,15 @@ class ProjectionLoss:
     def __call__(
         self, image: Tensor, target: Tensor, target_maps: Tensor, weights: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """The loss (float64, no dimensions, on the device: reading it waits for the device) and its gradient.
+        """The loss (float64 scalar on the device; reading it waits for the device) and its gradient.
 
-        `target_maps` are those of the same weights. Image and target must be finite also where the weight is 0.
+        `target_maps` must have the same weights. Image and target must be finite also where the weight is 0.
         """
         (rows, cols), pixels, grid = self.shape, self.pixels, (self._blocks,)
         gradient = torch.empty_like(image)
         unlike, data = self._sums
         weighted = weights is not None
-        w = image if weights is None else weights  # without weights it is not read
+        w = image if weights is None else weights  # not read without weights
         _products_across[grid](
             image, target, w, self._half, self.window, cols, pixels, WEIGHTED=weighted, BLOCK=_BLOCK
         )  # fmt: skip
@@ -187,7 +187,7 @@ class ProjectionLoss:
 
 @triton.jit
 def _slope(here, other, ok):  # type: ignore[no-untyped-def]
-    """|other - here| and its derivative by `here`, 0 where there is no neighbour."""
+    """|other - here| and its derivative by `here`; 0 without a neighbour."""
     step = other - here
     sign = tl.where(step > 0.0, 1.0, tl.where(step < 0.0, -1.0, 0.0))
     return tl.where(ok, tl.abs(step), 0.0), tl.where(ok, -sign, 0.0)
@@ -215,7 +215,7 @@ def _total_variation(volume, gradient, sums, weight, nz, ny, nx, voxels, BLOCK: 
 
 
 def total_variation(volume: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """weight * mean |difference of neighbours| over the three axes (float64, no dimensions), and its gradient."""
+    """weight * mean |difference of neighbours| over the three axes (float64 scalar), and its gradient."""
     nz, ny, nx = volume.shape
     count = (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)
     gradient = torch.zeros_like(volume)

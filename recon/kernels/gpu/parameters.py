@@ -1,4 +1,4 @@
-"""Raw parameters to physical ones, gradients back, and Adam's update: what a step does once a Gaussian (Triton)."""
+"""Raw parameters to physical ones, gradients back, and Adam's update: the part of a step for each Gaussian (Triton)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from recon.kernels.cpu.adam import BETA1, BETA2
 
 _BLOCK = 128
 _WIDEST = torch.finfo(torch.float32).max
-_SHORTEST = tl.constexpr(1e-12)  # a quaternion shorter than this acts as the identity
-_FARTHEST = tl.constexpr(87.0)  # e^x of more is no float32 number, of less than its negative no normal one
+_SHORTEST = tl.constexpr(1e-12)  # a shorter quaternion counts as the identity
+_FARTHEST = tl.constexpr(87.0)  # largest |x| for which e^x is a normal float32 number
 
 
 @triton.jit
 def _softplus(r):  # type: ignore[no-untyped-def]
-    """log(1 + e^r), without overflow on one side or lost digits on the other, see `activation`."""
+    """log(1 + e^r), without overflow or cancellation, see `cpu.activation`."""
     t = tl.exp(-tl.minimum(tl.abs(r), _FARTHEST))
     z = t / (t + 2.0)
     w = z * z
@@ -29,7 +29,7 @@ def _softplus(r):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _sigmoid(r):  # type: ignore[no-untyped-def]
-    """Its slope, with all its digits far down too."""
+    """Derivative of softplus, accurate also for very negative r."""
     t = tl.exp(-tl.minimum(tl.abs(r), _FARTHEST))
     return tl.where(r >= 0.0, 1.0, t) / (1.0 + t)
 
@@ -38,7 +38,7 @@ def _sigmoid(r):  # type: ignore[no-untyped-def]
 def _unit_quaternion(quaternions, i, live):  # type: ignore[no-untyped-def]
     w, x = tl.load(quaternions + 4 * i, live, 1.0), tl.load(quaternions + 4 * i + 1, live, 0.0)
     y, z = tl.load(quaternions + 4 * i + 2, live, 0.0), tl.load(quaternions + 4 * i + 3, live, 0.0)
-    # Scaled by the largest part first: squares of 1e-30 are no float32 numbers.
+    # Scale by the largest component first: the square of 1e-30 underflows in float32.
     most = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     scale = tl.where(most > 0.0, most, 1.0)
     w, x, y, z = w / scale, x / scale, y / scale, z / scale
@@ -72,7 +72,7 @@ def _activate(log_scales, quaternions, raw, scales, rotations, densities, unit, 
 
 
 def activate(log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Scales [n, 3], rotations [n, 9] (row-major) and densities [n]; logarithms are taken in +-87."""
+    """Scales [n, 3], rotations [n, 9] (row-major) and densities [n]; logarithms are clamped to +-87."""
     n = raw.shape[0]
     scales, rotations, densities = torch.empty_like(log_scales), raw.new_empty((n, 9)), torch.empty_like(raw)
     grid = (triton.cdiv(n, _BLOCK),)
@@ -98,7 +98,7 @@ def _activation_backward(  # type: ignore[no-untyped-def]
     gx = 2.0 * (y * (g1 + g3) + z * (g2 + g6) + w * (g7 - g5)) - 4.0 * x * (g4 + g8)
     gy = 2.0 * (x * (g1 + g3) + z * (g5 + g7) + w * (g2 - g6)) - 4.0 * y * (g0 + g8)
     gz = 2.0 * (x * (g2 + g6) + y * (g5 + g7) + w * (g3 - g1)) - 4.0 * z * (g0 + g4)
-    # Only the part across the unit quaternion turns anything; the rest would change its length.
+    # Only the part orthogonal to the unit quaternion rotates; the part along it would change its length.
     along = gw * w + gx * x + gy * y + gz * z
     per = tl.where(turned, 1.0 / tl.where(turned, norm, 1.0), 0.0)
     tl.store(d_quaternions + 4 * i, per * (gw - along * w), live)

@@ -1,7 +1,7 @@
-"""The exact integral along each ray of a cone, for Gaussians whose affine footprint is not good enough (Triton).
+"""Rays: exact line integrals in a cone, for Gaussians whose affine footprint is not accurate enough (Triton).
 
-The formulas are those of `rays_cpu`: with the affine footprint's centre, K and weight, N = δᵀKδ, and α, η, |D|, |D₀|
-as there, a Gaussian gives a pixel
+The formulas are those of `cpu.rays`: with the affine footprint's centre, K and weight, N = δᵀKδ, and α, η, |D|, |D₀|
+as there, the value of a Gaussian at a pixel is
 
     V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   where N / Q <= c²
 """
@@ -35,14 +35,14 @@ from recon.kernels.gpu.tiles import tile_lists
 
 _BLOCK = 128
 _EDGE = 8  # pixels a tile's edge
-_GROUP = 4  # Gaussians that a tile takes up at once
+_GROUP = 4  # Gaussians that a tile processes at once
 _PIXELS = (8, 16)  # of a Gaussian at once, (rows, cols)
 _HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))  # exp(-q / 2) = 2^(q * this)
 _ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
 # Columns of the terms: α, η, W / |D₀|, the truncation c².
 _AU, _AV, _ETA, _WEIGHT, _CUT = (tl.constexpr(column) for column in range(5))
 _TERMS = tl.constexpr(8)
-# Columns of the sums, as in rays_cpu.
+# Columns of the sums, as in `cpu.rays`.
 _A, _BT, _BV, _BTT, _BTV, _BVV, _L, _LU, _LV, _N = (tl.constexpr(column) for column in range(10))
 
 
@@ -53,7 +53,7 @@ def _terms(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
-    i = tl.minimum(i, n - 1)  # lanes past the end compute the last one again and store nothing
+    i = tl.minimum(i, n - 1)  # lanes past the end repeat the last Gaussian and store nothing
     f, t = table + 8 * i, terms + _TERMS * i
     seen = live & (tl.load(f + HU) >= 0.0)
     _, _, _, a, b, depth, norm = along_ray(means, i, seen, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, True)
@@ -161,7 +161,7 @@ def _sums(  # type: ignore[no-untyped-def]
             )  # fmt: skip
             inside = inside & (row < row_high) & (col < col_high)
             a = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * weight * value
-            a = tl.where(inside, a, 0.0)  # where nothing is seen the value may be infinite
+            a = tl.where(inside, a, 0.0)  # outside the value may be infinite
             aq = 0.5 * a * inverse * (square * inverse - 1.0)
             ab, al = eta * aq - 0.5 * inverse * a, lift * aq
             abt, abv = ab * across, ab * dv
@@ -187,7 +187,7 @@ def _bend(  # type: ignore[no-untyped-def]
     means, scales, rotations, table, terms, boxes, sums, moments, d_means, d_log_scales, d_rotations, n,
     ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The moments with which an affine footprint has the same gradient through W, K and the centre; add the rest."""
+    """Moments that give an affine footprint the same gradient through W, K and the centre; add the other parts."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     hit = live & (tl.load(boxes + 4 * i + 1, live, 0) > 0)
@@ -195,7 +195,7 @@ def _bend(  # type: ignore[no-untyped-def]
     au, av, eta = tl.load(t + _AU, hit, 0.0), tl.load(t + _AV, hit, 0.0), tl.load(t + _ETA, hit, 1.0)
     whole, sl = tl.load(s + _A, hit, 0.0), tl.load(s + _L, hit, 0.0)
     per_w = -2.0 / tl.load(f + W, hit, 1.0)
-    # Σ₂α is (αu / k, 0) but for its part along the slant, in the directions τ and v.
+    # Σ₂α in the directions τ and v: αu / k, and its part along the slant.
     along = (tl.load(f + SHEAR, hit, 0.0) * au + av) / tl.load(f + KV, hit, 1.0)
     tl.store(m, -0.5 * per_w * whole, live)
     tl.store(m + 1, per_w * (tl.load(s + _BT, hit, 0.0) + sl * au / tl.load(f + K, hit, 1.0)), live)
@@ -203,7 +203,7 @@ def _bend(  # type: ignore[no-untyped-def]
     tl.store(m + 3, per_w * tl.load(s + _BTT, hit, 0.0), live)
     tl.store(m + 4, per_w * tl.load(s + _BTV, hit, 0.0), live)
     tl.store(m + 5, per_w * tl.load(s + _BVV, hit, 0.0), live)
-    # What flows through α, η and |D₀|, which an affine footprint has not.
+    # The gradient through α, η and |D₀|, which an affine footprint does not have.
     _, _, _, a, b, depth, norm = along_ray(means, i, hit, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, True)
     hh = 1.0 / (eta * depth * depth)
     bent = eta * tl.load(s + _N, hit, 0.0)
@@ -233,13 +233,13 @@ def _bend(  # type: ignore[no-untyped-def]
 
 
 class Rays:
-    """One or more Gaussians in one view of a cone, ray by ray; shared by the forward and the backward pass."""
+    """Gaussians (one or more) in one view of a cone, integrated ray by ray, with forward and backward pass."""
 
     def __init__(
         self, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
         geometry: Geometry, view: int, faint: float, cut: float,
     ) -> None:  # fmt: skip
-        """A Gaussian ends `cut` standard deviations from its centre, or where no ray has more than `faint` of it."""
+        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them."""
         self.parameters, self.geometry, self.view = (means, scales, rotations, densities), geometry, view
         self.footprints = footprints(*self.parameters, geometry, view, faint, cut)
         n = densities.shape[0]
@@ -268,7 +268,7 @@ class Rays:
         self, gradient: Tensor, d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor,
         d_centres: Tensor,
     ) -> None:  # fmt: skip
-        """Add to the gradients; d_centres [n, 2] gets ∂/∂(col, row) of the footprint's centre in 1/px."""
+        """Add to the gradients; d_centres [n, 2] receives ∂/∂(col, row) of the footprint's centre in 1/px."""
         n, table = self.boxes.shape[0], self.footprints.table
         axes, focal, sod = beam_of(self.geometry, self.view)
         high, wide = _PIXELS

@@ -1,6 +1,6 @@
-"""Which Gaussians touch which tile of an image or brick of voxels: lists made by counting and one sort (torch).
+"""tile_lists: the Gaussians that touch each tile of an image or brick of voxels, by counting and one sort (torch).
 
-The sum is additive, so within a tile any order will do; a stable sort keeps it the same from run to run.
+A pixel is a sum, so the order within a tile is free; a stable sort makes it the same in every run.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_PROGRAMS = 4096  # as many programs as keep a large device busy
-_LEAST = 32  # but a part of a list should hold so many Gaussians
+_PROGRAMS = 4096  # programs that keep a large device busy
+_LEAST = 32  # Gaussians that a part of a list should hold at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class TileLists:
     """Gaussians tile by tile.
 
     Attributes:
-        owners: int32 [pairs], Gaussians; those of tile t are owners[starts[t]:starts[t + 1]].
+        owners: int32 [pairs], indices of Gaussians; those of tile t are owners[starts[t]:starts[t + 1]].
         starts: int32 [tiles + 1]; tiles are numbered row-major.
         counts: tiles along each axis.
     """
@@ -36,7 +36,7 @@ class TileLists:
 
     @property
     def shares(self) -> int:
-        """Into how many parts each list is cut, each with a layer of its own, so that few tiles still fill a device."""
+        """Number of parts of each list, each with a layer of its own, so that few tiles still occupy a device."""
         return max(1, min(_PROGRAMS // self.n_tiles, self.owners.shape[0] // (_LEAST * self.n_tiles)))
 
 
@@ -51,7 +51,7 @@ def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int) -> TileLists:
     first = low // edge
     spans = torch.where(high > low, (high - 1) // edge - first + 1, 0)
     ends = spans.prod(1, dtype=torch.int64).cumsum(0)
-    # The one number that the host must know: how much room the lists need.
+    # The only number read from the device: the length of the lists.
     pairs = int(ends[-1]) if len(boxes) > 0 else 0
     if pairs >= 2**31:
         raise MemoryError(

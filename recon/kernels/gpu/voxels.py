@@ -1,11 +1,11 @@
-"""Voxelisation of Gaussians: any box of voxels, gathered brick by brick; ten moments a Gaussian backward (Triton).
+"""Voxelisation of Gaussians on a GPU, brick by brick; backward from ten moments a Gaussian (Triton).
 
 With P = Σ⁻¹ and Σ_yz the covariance's block in y and z the exponent is a sum of three squares,
 
     δᵀPδ = Pxx τ² + l δ'² + δz² / Σzz,   τ = δx + Pxy/Pxx δy + Pxz/Pxx δz,   δ' = δy - r δz
     l = Σzz / det Σ_yz,   r = Σyz / Σzz,   det Σ_yz = Pxx (s₁ s₂ s₃)²
 
-all from inner products, so that it cannot cancel. Backward as in `voxelize_cpu`, from the moments of (τ, δ', δz): in
+all from inner products, without cancellation. Backward as in `cpu.voxelize`, from the moments of (τ, δ', δz): in
 moments of δ itself the thin sides of a needle would be small differences of large sums.
 """
 
@@ -25,7 +25,7 @@ from recon.kernels.gpu.tiles import tile_lists
 
 _BLOCK = 128
 _EDGE = 8  # voxels a brick edge
-_GROUP = 4  # Gaussians that a brick takes up at once
+_GROUP = 4  # Gaussians that a brick processes at once
 _DEEP, _HIGH, _WIDE = 2, 8, 8  # voxels of a Gaussian at once
 _HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))
 _HUGE, _LEAST = tl.constexpr(3.0e38), tl.constexpr(1.0e-30)
@@ -50,7 +50,7 @@ def _placed(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
-    i = tl.minimum(i, n - 1)  # lanes past the end compute the last one again and store nothing
+    i = tl.minimum(i, n - 1)  # lanes past the end repeat the last Gaussian and store nothing
     zero = tl.zeros((BLOCK,), tl.float32)
     xx, yy, zz, yz, pxx, pxy, pxz = zero, zero, zero, zero, zero, zero, zero
     for k in tl.static_range(3):
@@ -62,7 +62,7 @@ def _placed(  # type: ignore[no-untyped-def]
         h0, h1, h2 = r0 / (s * per_x), r1 / (s * per_x), r2 / (s * per_z)
         pxx, pxy, pxz = pxx + h0 * h0, pxy + h0 * h1, pxz + h0 * h2
     kx, kz = pxx, 1.0 / zz
-    # sqrt(l), by quotients one after the other: a product of three small scales would leave float32's range.
+    # sqrt(l), by successive quotients: a product of three small scales would leave float32's range.
     steep = tl.sqrt(zz) / tl.sqrt(pxx) / (tl.load(scales + 3 * i) * per_x)
     steep = steep / (tl.load(scales + 3 * i + 1) * per_x) / (tl.load(scales + 3 * i + 2) * per_z)
     ky = steep * steep
@@ -89,7 +89,7 @@ def _placed(  # type: ignore[no-untyped-def]
     tl.store(f + RHO, tl.where(seen, density, 0.0), live)
     hit = seen & (x + hx >= 0.0) & (x - hx <= nx - 1.0) & (y + hy >= 0.0) & (y - hy <= ny - 1.0)
     hit = hit & (z + hz >= 0.0) & (z - hz <= nz - 1.0)
-    # Clipped as floats: a box far outside is no int32.
+    # Clip as floats: a box far outside exceeds int32.
     x_low, x_high = tl.maximum(tl.ceil(x - hx), 0.0), tl.minimum(tl.floor(x + hx) + 1.0, nx * 1.0)
     y_low, y_high = tl.maximum(tl.ceil(y - hy), 0.0), tl.minimum(tl.floor(y + hy) + 1.0, ny * 1.0)
     z_low, z_high = tl.maximum(tl.ceil(z - hz), 0.0), tl.minimum(tl.floor(z + hz) + 1.0, nz * 1.0)
@@ -106,7 +106,7 @@ def _placed(  # type: ignore[no-untyped-def]
 def place(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, grid: Grid, faint: float, cut: float
 ) -> Placed:
-    """Where Gaussians fall on a grid, ending below `faint` (a density) and at the latest after `cut` σ."""
+    """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ."""
     n = densities.shape[0]
     z, y, x = (float(axis[0]) for axis in grid.coordinates())
     nz, ny, nx = grid.shape
@@ -224,7 +224,7 @@ def _backward(  # type: ignore[no-untyped-def]
     rho = tl.load(densities + i, hit, 0.0)
     add_to(d_densities + i, tl.load(m, hit, 0.0), hit)
     s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8 = shape_of(scales, rotations, i, hit)
-    # A = H e_x and C = c / Σzz per voxel; B, along c x A, has the length sqrt(l), whatever the digits of its factors.
+    # A = H e_x and C = c / Σzz per voxel; B, along c x A, is scaled to its length sqrt(l).
     a0, a1, a2 = r0 / (s0 * per_x), r1 / (s1 * per_x), r2 / (s2 * per_x)
     c0, c1, c2 = r6 * s0 * per_z, r7 * s1 * per_z, r8 * s2 * per_z
     b0, b1, b2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
@@ -255,7 +255,7 @@ def fill_backward(
     placed: Placed, gradient: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, *, means_too: bool = True,
 ) -> None:  # fmt: skip
-    """Add the gradients that follow from `gradient` [z, y, x]; `means_too=False` leaves positions alone."""
+    """Back-propagate `gradient` [z, y, x], adding to the others; `means_too=False` leaves positions out."""
     n = densities.shape[0]
     _, ny, nx = placed.grid.shape
     if n == 0:

@@ -1,4 +1,4 @@
-"""Errors of the float32 kernels against the float64 twin, and the bounds that float32 sets; see docs/numerics.md."""
+"""Errors of the float32 kernels against the float64 reference, and the bounds of float32; see docs/numerics.md."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import Kernel, project, voxelize
 from tests.recon.helpers import as_leaves, gradients, in_double
 
-WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and twin sum the same terms
+WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and reference sum the same terms
 STEP = 2.0**-24  # half a float32 step, relative: the error of one rounding
-RECURRENCE = 1e-5  # of a footprint's weight, stated in project_cpu
+RECURRENCE = 1e-5  # of a footprint's weight, stated in `cpu.project`
 ROUNDINGS = 12  # of a position on the detector: sums of three products, turned into pixels
 
 
@@ -52,30 +52,30 @@ def compare(
     seed: int = 0,
     device: torch.device | None = None,
 ) -> Found:
-    """Kernel against twin, on a picture or a volume weighed by random numbers; asserts that all of it is finite.
+    """Kernel against reference, on a picture or a volume weighed by random numbers; asserts that all of it is finite.
 
     The kernel is the GPU's where a `device` is given, else the CPU's.
     """
-    fast, twin = as_leaves(g, device), in_double(g)
+    fast, double = as_leaves(g, device), in_double(g)
     kernel: Kernel = "cpu" if device is None else "gpu"
     if isinstance(where, Grid):
-        found, expected = voxelize(fast, where, truncation=WHOLE, kernel=kernel), voxelize(twin, where)
+        found, expected = voxelize(fast, where, truncation=WHOLE, kernel=kernel), voxelize(double, where)
         weight = float(g.densities.max())
     else:
         found = project(fast, where, truncation=WHOLE, model=model, kernel=kernel)
-        expected = project(twin, where, model=model)
+        expected = project(double, where, model=model)
         weight = float((g.densities * g.scales.amin(1)).max()) * math.sqrt(2 * math.pi)
     y = torch.from_numpy(np.random.default_rng(seed).normal(size=tuple(expected.shape)))
     (found * y.float().to(device)).sum().backward()
     (expected * y).sum().backward()
-    slopes, exact = gradients(fast), gradients(twin)
+    slopes, exact = gradients(fast), gradients(double)
     found = found.detach().cpu()
     for name, values in (("image", found), *slopes.items()):
         assert torch.isfinite(values).all(), name
     top = max(float(expected.detach().abs().max()), weight)
     off = float((found - expected).detach().abs().max()) / top
     # The size of a gradient is at least what one Gaussian's whole weight makes, even where symmetry cancels it.
-    pull = (exact["raw_densities"] / torch.sigmoid(twin.raw_densities.detach()) * g.densities / g.density_unit).abs()
+    pull = (exact["raw_densities"] / torch.sigmoid(double.raw_densities.detach()) * g.densities / g.density_unit).abs()
     size = {
         "means": float((pull / g.scales.amax(1)).max()),
         "log_scales": float(pull.max()),
@@ -107,15 +107,15 @@ def gradient_bound(far: float, thin: float) -> float:
 
 
 def directional(g: Gaussians, where: Geometry | Grid, steps: dict[str, float], seed: int = 0) -> tuple[float, float]:
-    """The twin's slope along a random direction with these lengths by parameter: by autograd and by differences.
+    """The reference's slope along a random direction with these lengths by parameter: by autograd and by differences.
 
     In float64. The differences are central, over 1e-3 of the direction each way.
     """
     rng = np.random.default_rng(seed)
-    twin = in_double(g)
+    double = in_double(g)
     named = {
-        "means": twin.means, "log_scales": twin.log_scales, "quaternions": twin.quaternions,
-        "raw_densities": twin.raw_densities,
+        "means": double.means, "log_scales": double.log_scales, "quaternions": double.quaternions,
+        "raw_densities": double.raw_densities,
     }  # fmt: skip
     moves = {k: torch.from_numpy(rng.normal(size=tuple(v.shape))) * steps[k] for k, v in named.items()}
     sample: Tensor | None = None
@@ -129,6 +129,6 @@ def directional(g: Gaussians, where: Geometry | Grid, steps: dict[str, float], s
         return (image * sample).sum()
 
     loss(0.0).backward()
-    slope = sum(float((value * moves[k]).sum()) for k, value in gradients(twin).items())
+    slope = sum(float((value * moves[k]).sum()) for k, value in gradients(double).items())
     with torch.no_grad():
         return slope, float(loss(1e-3) - loss(-1e-3)) / 2e-3

@@ -43,9 +43,9 @@ def test_images_far_brighter_than_they_should_be_do_not_break_the_loss(rng: np.r
     assert absolute * (1 - 1e-6) <= value <= absolute + 0.25 * 2.001  # SSIM lies in -1..1
     assert np.isfinite(gradient).all()
     if size == 10.0:
-        twin = projection_loss(torch.from_numpy(image).double(), torch.from_numpy(target).double(), 0.25)
+        expected = projection_loss(torch.from_numpy(image).double(), torch.from_numpy(target).double(), 0.25)
         # A variance is known to some eight roundings of the square.
-        assert value == pytest.approx(float(twin), abs=0.25 * 2 * 8 * 2.0**-24 * size**2 / 0.03**2)
+        assert value == pytest.approx(float(expected), abs=0.25 * 2 * 8 * 2.0**-24 * size**2 / 0.03**2)
     one = np.zeros((14, 18), np.float32)
     one[7, 9] = size
     value, gradient = losses_of(one, target / size)

@@ -81,7 +81,7 @@ def test_near_the_source_of_a_cone_a_gaussian_is_large_and_right(model: RayModel
     assert found.worst < gradient_bound(60.0, 0.6), found.gradients
 
 
-def test_the_twins_gradients_near_the_source_are_its_differences() -> None:
+def test_the_reference_gradients_near_the_source_are_its_differences() -> None:
     g = at([(0.05, -9.0, 0.02), (-0.2, -8.0, 0.1), (0.3, -6.0, -0.2)], 0.05)
     steps = {"means": 0.01, "log_scales": 0.1, "quaternions": 0.1, "raw_densities": 0.1}
     slope, difference = directional(g, CONE, steps)

@@ -96,7 +96,7 @@ def test_naive_gradients_of_a_needle_lose_what_its_own_directions_keep() -> None
 
 
 @pytest.mark.parametrize(("shape", "where"), [((0.5, 0.5, 50.0), "parallel"), ((2.0, 2.0, 2e-2), "cone")])
-def test_the_twins_gradients_of_needles_and_discs_are_its_differences(shape: Shape, where: str) -> None:
+def test_the_reference_gradients_of_needles_and_discs_are_its_differences(shape: Shape, where: str) -> None:
     thin = min(shape) / max(shape)
     steps = {"means": 0.1 * min(shape), "log_scales": 0.1, "quaternions": 0.1 * thin, "raw_densities": 0.1}
     slope, difference = directional(some(shape, 5), BEAMS[where], steps)

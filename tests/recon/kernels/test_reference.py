@@ -1,4 +1,4 @@
-"""The readable twin against integrals along the rays, finite differences, and laws that every projection obeys."""
+"""The reference implementation against integrals along rays, finite differences, and laws of every projection."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def along_the_rays(parameters: Parameters, geometry: Geometry, view: int) -> F64
 
 @pytest.mark.parametrize("view", [0, 1])
 @pytest.mark.parametrize("geometry", [PARALLEL, CONE], ids=["parallel", "cone"])
-def test_the_twin_is_the_integral_along_the_ray(geometry: Geometry, view: int, rng: np.random.Generator) -> None:
+def test_the_reference_is_the_integral_along_the_ray(geometry: Geometry, view: int, rng: np.random.Generator) -> None:
     parameters = some(rng)
     every = torch.ones(12, dtype=torch.bool)
     image = reference.project_view(*parameters, geometry, view, exact=every).numpy()

@@ -1,4 +1,4 @@
-"""The voxel projector as an explicit sparse matrix in float64: the readable twin of its kernels, for small boxes."""
+"""Reference implementation of the voxel projector: an explicit sparse matrix in float64, for small boxes."""
 
 from __future__ import annotations
 

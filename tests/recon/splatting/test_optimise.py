@@ -12,7 +12,7 @@ from recon.base.geometry import Geometry
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.kernels.reference import projection_loss
-from recon.kernels.reference import total_variation as twin_tv
+from recon.kernels.reference import total_variation as reference_tv
 from recon.splatting import optimise as fit
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
@@ -78,23 +78,23 @@ def test_units_do_not_matter(random_gaussians: Make, rng: np.random.Generator, u
     assert loss(unit) == pytest.approx(loss(1.0), rel=1e-3)
 
 
-def test_one_step_moves_along_the_twins_gradient(random_gaussians: Make, rng: np.random.Generator) -> None:
-    # The whole chain, fused kernels and all, against autograd through the twin: Adam's first moments are 0.1 gradients.
+def test_one_step_moves_along_the_gradient_of_the_reference(random_gaussians: Make, rng: np.random.Generator) -> None:
+    # The whole chain of fused kernels against autograd through the reference: Adam's first moments are 0.1 gradients.
     settings = replace(PLAIN, truncation=Truncation(9.0, 1e-12), tv_weight=0.05, tv_size=64, tv_moves=True)
     truth = random_gaussians(12, extent=7.0)
     start = _disturbed(truth, rng)
     problem = _problem(truth, settings)
     state = fit.init(start, 0)
-    twin = in_double(fit.gaussians_of(state))
+    double = in_double(fit.gaussians_of(state))
     scale = problem.half_field * problem.unit
-    image = project(twin, VIEWS.select([5]))[0] / scale
+    image = project(double, VIEWS.select([5]))[0] / scale
     loss = projection_loss(image, torch.from_numpy(problem.images[5]).double(), settings.ssim_weight)
-    loss = loss + settings.tv_weight * twin_tv(voxelize(twin, GRID) / problem.unit)
+    loss = loss + settings.tv_weight * reference_tv(voxelize(double, GRID) / problem.unit)
     loss.backward()
     fit.step(state, problem, settings, 0.0, view=5)
     assert state.loss == pytest.approx(loss.item(), rel=1e-4)
     for name, key in zip(("means", "log_scales", "quaternions", "raw_densities"), NAMES, strict=True):
-        expected = gradients(twin)[name].numpy()
+        expected = gradients(double)[name].numpy()
         found = state.first[key] / 0.1
         np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max(), err_msg=name)
 
@@ -106,10 +106,10 @@ def test_the_statistic_is_the_gradient_with_respect_to_the_centre_per_half_detec
     truth = random_gaussians(12, extent=7.0)
     problem = _problem(truth, settings)
     state = fit.init(_disturbed(truth, rng), 0)
-    twin = in_double(fit.gaussians_of(state))
-    image = project(twin, VIEWS.select([5]))[0] / (problem.half_field * problem.unit)
+    double = in_double(fit.gaussians_of(state))
+    image = project(double, VIEWS.select([5]))[0] / (problem.half_field * problem.unit)
     projection_loss(image, torch.from_numpy(problem.images[5]).double(), settings.ssim_weight).backward()
-    dx, dy, dz = gradients(twin)["means"].numpy().T
+    dx, dy, dz = gradients(double)["means"].numpy().T
     across = dx * np.cos(VIEWS.angles[5]) + dy * np.sin(VIEWS.angles[5])
     fit.step(state, problem, settings, 0.0, view=5)
     expected = np.hypot(across, dz) * VIEWS.pixel_pitch * VIEWS.detector_shape[1] / 2
@@ -134,12 +134,12 @@ def test_total_variation_sees_the_box_that_was_drawn(random_gaussians: Make) -> 
     truth = random_gaussians(12, extent=7.0)
     problem = _problem(truth, settings)
     state = fit.init(truth, 3)
-    twin = in_double(fit.gaussians_of(state))
+    double = in_double(fit.gaussians_of(state))
     draw = np.random.default_rng(3)
     cut = tuple(slice(c, c + 5) for c in (int(draw.integers(0, n - 5 + 1)) for n in GRID.shape))
-    image = project(twin, VIEWS.select([5]))[0] / (problem.half_field * problem.unit)
+    image = project(double, VIEWS.select([5]))[0] / (problem.half_field * problem.unit)
     expected = projection_loss(image, torch.from_numpy(problem.images[5]).double(), settings.ssim_weight)
-    expected = expected + settings.tv_weight * twin_tv(voxelize(twin, GRID)[cut] / problem.unit)
+    expected = expected + settings.tv_weight * reference_tv(voxelize(double, GRID)[cut] / problem.unit)
     fit.step(state, problem, settings, 0.0, view=5)
     assert state.loss == pytest.approx(expected.item(), rel=1e-4)
 

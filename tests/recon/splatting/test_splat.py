@@ -1,4 +1,4 @@
-"""The CPU kernels against the float64 twin, the twin against closed forms and finite differences."""
+"""The CPU kernels against the float64 reference, and this against closed forms and finite differences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from recon.splatting.splat import Active, Gradients, Scratch, project, render_vi
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
 
-# No cut-off worth the name, so that kernel and twin sum the same terms.
+# Cut off so far out that kernel and reference sum the same terms.
 WHOLE = Truncation(sigmas=9.0, faint=1e-12)
 SHAPE = (24, 30)
 
@@ -78,18 +78,18 @@ def test_mass_is_the_same_from_every_side(angle: float, tilt: float, roll: float
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_cpu_projection_and_gradients_equal_the_twins(
+def test_cpu_projection_and_gradients_equal_the_reference(
     path: str, random_gaussians: Make, rng: np.random.Generator
 ) -> None:
     views, model = PATHS[path]
     g, weights = random_gaussians(), torch.from_numpy(rng.normal(size=(4, *SHAPE)))
-    fast, twin = as_leaves(g), in_double(g)
-    found, expected = project(fast, views, truncation=WHOLE, model=model), project(twin, views, model=model)
+    fast, double = as_leaves(g), in_double(g)
+    found, expected = project(fast, views, truncation=WHOLE, model=model), project(double, views, model=model)
     # The image kernel's recurrence costs up to 2e-5 of a footprint's weight, and some dozen overlap.
     assert float((found - expected).detach().abs().max()) < 1e-5 * float(expected.detach().max())
     (found * weights.float()).sum().backward()
     (expected * weights).sum().backward()
-    for name, gradient in gradients(twin).items():
+    for name, gradient in gradients(double).items():
         off = (gradients(fast)[name] - gradient).abs().max()
         assert float(off) < 2e-5 * float(gradient.abs().max()), name
 
@@ -116,18 +116,18 @@ def test_a_ray_model_that_makes_no_sense_is_refused(options: dict[str, float], m
 @pytest.mark.parametrize(
     ("n_slices", "slice_pitch"), [(9, None), (11, 0.05), (11, 1.3)], ids=["cubes", "flat voxels", "tall voxels"]
 )
-def test_cpu_voxels_and_gradients_equal_the_twins(
+def test_cpu_voxels_and_gradients_equal_the_reference(
     random_gaussians: Make, rng: np.random.Generator, n_slices: int, slice_pitch: float | None
 ) -> None:
     g = random_gaussians()
     grid = Grid((n_slices, 12, 20), 0.6, centre=(0.4, -0.8, 1.1), slice_pitch=slice_pitch)
     weights = torch.from_numpy(rng.normal(size=grid.shape))
-    fast, twin = as_leaves(g), in_double(g)
-    a, b = voxelize(fast, grid, truncation=WHOLE), voxelize(twin, grid)
+    fast, double = as_leaves(g), in_double(g)
+    a, b = voxelize(fast, grid, truncation=WHOLE), voxelize(double, grid)
     assert float((a - b).detach().abs().max()) < 3e-6 * float(b.detach().max())
     (a * weights.float()).sum().backward()
     (b * weights).sum().backward()
-    for name, expected in gradients(twin).items():
+    for name, expected in gradients(double).items():
         found = gradients(fast)[name]
         assert float((found - expected).abs().max()) < 2e-5 * float(expected.abs().max()), name
 

@@ -26,7 +26,7 @@ from recon.voxels.methods.sirt import Sirt
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import density_unit, largest_eigenvalue
 from tests.recon.kernels.voxels_reference import system_matrix
-from tests.recon.voxels.tv_twin import differences, total_variation, transposed_differences
+from tests.recon.voxels.tv_reference import differences, total_variation, transposed_differences
 
 METHODS = (Sirt(), Sart(), Cgls(), AsdPocs(), FistaTv(), OsSirtTv())
 CUBES = (1.0, 1.0, 1.0)

@@ -52,7 +52,7 @@ def test_what_would_be_updated_as_a_copy_is_refused() -> None:
     for bad in (whole[:, ::2], whole[:, :2]):
         with pytest.raises(ValueError, match="C-contiguous"):
             adam(bad, *(np.zeros(bad.shape, np.float32) for _ in range(3)), 0.1, 1)
-    with pytest.raises(ValueError, match="alike"):
+    with pytest.raises(ValueError, match="of one shape"):
         adam(whole, *(np.zeros((6, 4), np.float32) for _ in range(3)), 0.1, 1)
 
 

@@ -1,4 +1,4 @@
-"""Footprint tables and their backward pass against the twin, with plain sums over pixels in between."""
+"""Footprint tables and their backward pass against the reference, with plain sums over pixels in between."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def leaves(parameters: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return tuple(p.double().requires_grad_() for p in parameters)
 
 
-def twin_image(doubles: tuple[Tensor, ...], geometry: Geometry, view: int, length: float) -> Tensor:
+def reference_image(doubles: tuple[Tensor, ...], geometry: Geometry, view: int, length: float) -> Tensor:
     means, log_scales, quaternions, densities = doubles
     density = UNIT * torch.nn.functional.softplus(densities)
     return reference.project_view(means, log_scales.exp(), quaternions, density, geometry, view, length=length)
@@ -84,7 +84,7 @@ def twin_image(doubles: tuple[Tensor, ...], geometry: Geometry, view: int, lengt
 
 @pytest.mark.parametrize("length", [0.0, 2.5], ids=["rectified", "plain"])
 @pytest.mark.parametrize("name", GEOMETRIES)
-def test_footprints_and_gradients_equal_the_twins(name: str, length: float, rng: np.random.Generator) -> None:
+def test_footprints_and_gradients_equal_the_reference(name: str, length: float, rng: np.random.Generator) -> None:
     geometry, parameters = GEOMETRIES[name], raw(rng)
     active = active_of(parameters)
     weights = rng.normal(size=(2, *SHAPE))
@@ -94,7 +94,7 @@ def test_footprints_and_gradients_equal_the_twins(name: str, length: float, rng:
         table = table_of(active, geometry, view, length=length)
         shapes, dt, dv = on_pixels(table)
         image = np.einsum("n,nrc->rc", table[:, W], shapes)
-        expected = twin_image(doubles, geometry, view, length)
+        expected = reference_image(doubles, geometry, view, length)
         np.testing.assert_allclose(image, expected.detach().numpy(), atol=3e-6 * float(expected.detach().max()))
 
         (expected * torch.from_numpy(weights[view])).sum().backward()

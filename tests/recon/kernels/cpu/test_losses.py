@@ -1,4 +1,4 @@
-"""Fused losses against their torch twins, and the twin's SSIM against scikit-image."""
+"""Fused losses against their reference implementations in torch, and the reference's SSIM against scikit-image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm, ProjectionLoss, total_variation
 from recon.kernels.reference import data_term, projection_loss, ssim
-from recon.kernels.reference import total_variation as twin_total_variation
+from recon.kernels.reference import total_variation as reference_total_variation
 
 
 def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tuple[np.ndarray, np.ndarray]:
@@ -18,7 +18,7 @@ def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tupl
 
 
 @pytest.mark.parametrize("shape", [(27, 33), (40, 48), (9, 16), (30, 5), (1, 40), (3, 1), (17, 31)])
-def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int]) -> None:
+def test_projection_loss_and_gradient_equal_the_reference(rng: np.random.Generator, shape: tuple[int, int]) -> None:
     image, target = _images(rng, shape)
     loss = ProjectionLoss(image.shape, 0.25)
     gradient = np.empty_like(image)
@@ -36,7 +36,7 @@ def test_projection_loss_and_gradient_equal_the_twin(rng: np.random.Generator, s
 
 
 @pytest.mark.parametrize("shape", [(27, 33), (40, 48), (30, 5), (1, 40), (3, 1)])
-def test_weighted_loss_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int]) -> None:
+def test_weighted_loss_and_gradient_equal_the_reference(rng: np.random.Generator, shape: tuple[int, int]) -> None:
     image, target = _images(rng, shape)
     weights = (rng.random(shape) * (rng.random(shape) > 0.3)).astype(np.float32)
     weights[: shape[0] // 3] = 0  # whole rows, more than a window can look across where there are so many
@@ -44,7 +44,7 @@ def test_weighted_loss_and_gradient_equal_the_twin(rng: np.random.Generator, sha
     loss, gradient = ProjectionLoss(image.shape, 0.25), np.empty_like(image)
     value = loss(image, target, loss.target_maps(target, weights), gradient, weights)
     x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
-    # The twin cannot see what is masked, not even a NaN.
+    # The reference cannot see what is masked, not even a NaN.
     hidden = torch.from_numpy(np.where(weights > 0, target, np.nan).astype(np.float64))
     expected = projection_loss(x, hidden, 0.25, torch.from_numpy(weights.astype(np.float64)))
     expected.backward()
@@ -60,7 +60,7 @@ def test_weighted_loss_and_gradient_equal_the_twin(rng: np.random.Generator, sha
 
 @pytest.mark.parametrize("term", [DataTerm(L2, 0.05, 1.0), DataTerm(POISSON, 0.02, 3.0)])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_squares_and_the_poisson_likelihood_equal_the_twin(
+def test_squares_and_the_poisson_likelihood_equal_the_reference(
     rng: np.random.Generator, term: DataTerm, weighted: bool
 ) -> None:
     image, target = _images(rng)
@@ -85,8 +85,8 @@ def test_no_transmission_is_above_one(rng: np.random.Generator) -> None:
     squares(image, target, maps, expected)
     expected *= np.where(target < 0, 1, np.exp(-4 * target))
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-7 * np.abs(expected).max())
-    twin = projection_loss(torch.from_numpy(image), torch.from_numpy(target), 0.0, term=likely.term)
-    assert value == pytest.approx(twin.item(), rel=1e-5)
+    expected = projection_loss(torch.from_numpy(image), torch.from_numpy(target), 0.0, term=likely.term)
+    assert value == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_the_poisson_term_is_the_likelihood_of_counts_near_its_minimum() -> None:
@@ -133,9 +133,9 @@ def test_images_far_brighter_than_they_should_be_do_not_break_the_loss(rng: np.r
     assert absolute <= value <= absolute + 0.25 * 2.001  # SSIM lies in -1..1
     assert np.isfinite(gradient).all()
     if size == 10.0:
-        twin = projection_loss(torch.from_numpy(image).double(), torch.from_numpy(target).double(), 0.25)
+        expected = projection_loss(torch.from_numpy(image).double(), torch.from_numpy(target).double(), 0.25)
         # A variance is known to some eight roundings of the square.
-        assert value == pytest.approx(float(twin), abs=0.25 * 2 * 8 * 2.0**-24 * size**2 / loss.c2)
+        assert value == pytest.approx(float(expected), abs=0.25 * 2 * 8 * 2.0**-24 * size**2 / loss.c2)
     else:
         assert abs(naive - 0.05**2) > 0.05**2
     one = np.zeros((40, 48), np.float32)
@@ -169,7 +169,9 @@ def test_equal_images_cost_nothing(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 4), (1, 1, 3), (1, 1, 1)])
-def test_total_variation_and_gradient_equal_the_twin(rng: np.random.Generator, shape: tuple[int, int, int]) -> None:
+def test_total_variation_and_gradient_equal_the_reference(
+    rng: np.random.Generator, shape: tuple[int, int, int]
+) -> None:
     volume = rng.normal(size=shape).astype(np.float32)
     gradient = np.empty_like(volume)
     value = total_variation(volume, gradient, 0.3)
@@ -177,7 +179,7 @@ def test_total_variation_and_gradient_equal_the_twin(rng: np.random.Generator, s
         assert value == 0 and gradient[0, 0, 0] == 0
         return
     x = torch.from_numpy(volume.astype(np.float64)).requires_grad_()
-    expected = 0.3 * twin_total_variation(x)
+    expected = 0.3 * reference_total_variation(x)
     expected.backward()
     assert value == pytest.approx(expected.item(), rel=1e-6)
     assert x.grad is not None

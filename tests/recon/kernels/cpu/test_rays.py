@@ -1,4 +1,4 @@
-"""Exact rays of a cone: the kernel against the twin, where it may end a Gaussian, Gaussians that break naive code."""
+"""Exact rays of a cone: the kernel against the reference, its cut-off, and Gaussians that break naive code."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def rays_of(active: Active, geometry: Geometry, faint: float = 1e-12, cut: float
     return Rays(*parameters, camera(geometry, 0), geometry.detector_shape, faint, cut)
 
 
-def twin(leaves: Sequence[torch.Tensor], geometry: Geometry) -> torch.Tensor:
+def exact_view(leaves: Sequence[torch.Tensor], geometry: Geometry) -> torch.Tensor:
     means, log_scales, quaternions, densities = leaves
     every = torch.ones(means.shape[0], dtype=torch.bool)
     density = UNIT * torch.nn.functional.softplus(densities)
@@ -60,12 +60,12 @@ def backward(rays: Rays, weights: F32) -> tuple[Gradients, F32]:
     return into, centres
 
 
-def test_rays_and_gradients_equal_the_twins(rng: np.random.Generator) -> None:
+def test_rays_and_gradients_equal_the_reference(rng: np.random.Generator) -> None:
     parameters, weights = raw(rng), rng.normal(size=SHAPE).astype(np.float32)
     rays, image = rays_of(Active.of(*parameters, UNIT), WIDE), np.zeros(SHAPE, np.float32)
     rays.add_to(image)
     leaves = as_leaves(parameters)
-    expected = twin(leaves, WIDE)
+    expected = exact_view(leaves, WIDE)
     np.testing.assert_allclose(image, expected.detach().numpy(), atol=5e-6 * float(expected.detach().max()))
     (expected * torch.from_numpy(weights)).sum().backward()
     into, _ = backward(rays, weights)
@@ -86,13 +86,13 @@ def test_rays_are_linear_in_density_and_the_density_gradient_is_the_adjoint(rng:
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), cut=st.floats(1.0, 4.0), largest=st.sampled_from([0.5, 2.0, 6.0]))
 def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: float, largest: float) -> None:
-    # The rays within `cut` standard deviations: what is missing is what the twin has beyond them, and what is there is
-    # within, but for Gaussians that reach the source's plane, whose rays fill no ellipse.
+    # The rays within `cut` standard deviations: the kernel lacks only what the reference has beyond them, and adds
+    # nothing beyond, except for Gaussians that reach the source's plane, whose rays fill no ellipse.
     parameters = raw(np.random.default_rng(seed), 1, 9.0, largest)
     active = Active.of(*parameters, UNIT)
     image = np.zeros(SHAPE, np.float32)
     rays_of(active, WIDE, cut=cut).add_to(image)
-    whole = twin(as_leaves(parameters), WIDE).detach().numpy()
+    whole = exact_view(as_leaves(parameters), WIDE).detach().numpy()
     peak = active.densities[0] * active.scales[0].max() * math.sqrt(2 * math.pi)
     edge = float(peak) * math.exp(-(cut**2) / 2)
     seen = image > 0
@@ -159,7 +159,7 @@ def test_long_thin_ones_keep_their_digits(aspect: float, rng: np.random.Generato
     parameters = (means, np.log(scales).astype(np.float32), turn, np.zeros(n, np.float32))
     rays, image = rays_of(Active.of(*parameters, UNIT), WIDE), np.zeros(SHAPE, np.float32)
     rays.add_to(image)
-    expected = twin(as_leaves(parameters), WIDE).detach().numpy()
+    expected = exact_view(as_leaves(parameters), WIDE).detach().numpy()
     # A thousandth of a needle's width is what its centre's place in float32 leaves.
     step = 2e-7 * 20 * aspect
     assert float(np.abs(image - expected).max()) < (1e-5 + step) * float(expected.max())

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.kernels.cpu import tv as tv_cpu
-from tests.recon.voxels.tv_twin import differences, total_variation, transposed_differences
+from tests.recon.voxels.tv_reference import differences, total_variation, transposed_differences
 
 WEIGHTS = (1.0, 0.8, 1.3)
 shapes = st.tuples(st.integers(1, 9), st.integers(1, 6), st.integers(1, 6))
@@ -16,7 +16,7 @@ shapes = st.tuples(st.integers(1, 9), st.integers(1, 6), st.integers(1, 6))
 
 @given(shapes, st.booleans(), st.integers(0, 2**31))
 @settings(max_examples=30)
-def test_dual_steps_are_the_twins(shape: tuple[int, int, int], nonnegative: bool, seed: int) -> None:
+def test_dual_steps_are_the_reference_s(shape: tuple[int, int, int], nonnegative: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
     x, threshold = rng.normal(size=shape).astype(np.float32), 0.3
     found, expected = np.zeros((3, *shape), np.float32), np.zeros((3, *shape))
@@ -49,6 +49,6 @@ def test_the_gradient_is_the_slope_of_tv(shape: tuple[int, int, int], seed: int)
     assert float((found * way).sum()) == pytest.approx(rise / (2 * h), rel=1e-4, abs=1e-4)
 
 
-def test_twin_is_a_transpose(rng: np.random.Generator) -> None:
+def test_reference_is_a_transpose(rng: np.random.Generator) -> None:
     x, p = rng.normal(size=(4, 5, 6)), rng.normal(size=(3, 4, 5, 6))
     assert (differences(x, WEIGHTS) * p).sum() == pytest.approx((x * transposed_differences(p, WEIGHTS)).sum())

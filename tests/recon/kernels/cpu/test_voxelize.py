@@ -1,4 +1,4 @@
-"""Voxelisation and its backward pass against the float64 twin: anisotropic voxels, needles, dots, small boxes."""
+"""Voxelisation and its backward pass against the float64 reference: anisotropic voxels, needles, dots, small boxes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def _axes(origin: tuple[float, ...], spacing: tuple[float, ...], shape: tuple[in
     )
 
 
-def _twin(model: Model, quaternions: F32, axes: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def _reference(
+    model: Model, quaternions: F32, axes: tuple[torch.Tensor, ...]
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
     means, scales, _, densities = model
     leaves = [
         torch.from_numpy(a.astype(np.float64)).requires_grad_() for a in (means, np.log(scales), quaternions, densities)
@@ -50,13 +52,13 @@ def _twin(model: Model, quaternions: F32, axes: tuple[torch.Tensor, ...]) -> tup
         ((1, 1, 1), (1, 1, 1)),
     ],
 )
-def test_density_and_gradients_equal_the_twin(
+def test_density_and_gradients_equal_the_reference(
     rng: np.random.Generator, spacing: tuple[float, float, float], shape: tuple[int, int, int]
 ) -> None:
     model, quaternions = _model(rng, 12)
     origin = tuple(-e * (n - 1) / 2 for e, n in zip(spacing[::-1], shape[::-1], strict=True))
     layout = Layout(*model, origin, spacing, shape, 0.0, 6.0)  # type: ignore[arg-type]
-    expected, leaves = _twin(model, quaternions, _axes(origin, spacing, shape))
+    expected, leaves = _reference(model, quaternions, _axes(origin, spacing, shape))
     top = float(expected.detach().max())
     np.testing.assert_allclose(layout.fill(), expected.detach().numpy(), atol=1e-5 * max(1.0, top))
 
@@ -104,7 +106,7 @@ def test_needles_discs_and_dots_keep_their_digits(rng: np.random.Generator, scal
         means = (np.round(means) + 0.02).astype(np.float32)  # else no voxel sees them
     model = (means, thin, rotations, densities)
     layout = Layout(*model, (-6.0, -6.0, -6.0), 1.0, (13, 13, 13), 0.0, 5.0)
-    expected = _twin(model, quaternions, _axes((-6.0,) * 3, (1.0,) * 3, (13, 13, 13)))[0].detach().numpy()
+    expected = _reference(model, quaternions, _axes((-6.0,) * 3, (1.0,) * 3, (13, 13, 13)))[0].detach().numpy()
     assert expected.max() > 0.05
     # A float32 rotation turns a needle by 6e-8: at its end, ten voxels off, a few 1e-6 of the thin width's slope.
     np.testing.assert_allclose(layout.fill(), expected, atol=3e-5)

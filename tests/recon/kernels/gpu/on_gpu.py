@@ -44,12 +44,12 @@ def raw_of(g: Gaussians, device: torch.device) -> tuple[Tensor, ...]:
     return tuple(t.detach().to(device).requires_grad_() for t in tensors)
 
 
-def twin_view(g: Gaussians, geometry: Geometry, view: int) -> Tensor:
+def reference_view(g: Gaussians, geometry: Geometry, view: int) -> Tensor:
     return reference.project_view(g.means, g.scales, g.quaternions, g.densities, geometry, view)
 
 
-def assert_gradients(found: tuple[Tensor, ...], twin: Gaussians, relative: float = 2e-5) -> None:
-    for tensor, (name, expected) in zip(found, gradients(twin).items(), strict=True):
+def assert_gradients(found: tuple[Tensor, ...], double: Gaussians, relative: float = 2e-5) -> None:
+    for tensor, (name, expected) in zip(found, gradients(double).items(), strict=True):
         assert tensor.grad is not None
         off = float((tensor.grad.cpu().double() - expected).abs().max())
         assert off < relative * float(expected.abs().max()), name

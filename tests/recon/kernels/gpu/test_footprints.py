@@ -1,4 +1,4 @@
-"""Footprints, images and what flows back from them: the Triton kernels against the twin and the CPU's."""
+"""Footprints, images and what flows back from them: the Triton kernels against the reference and the CPU's."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.recon.kernels.gpu.on_gpu import (
     leaned,
     parallel,
     raw_of,
-    twin_view,
+    reference_view,
 )
 
 autograd = importlib.import_module("recon.kernels.gpu.autograd")
@@ -37,33 +37,33 @@ engine = importlib.import_module("recon.kernels.gpu.engine")
 
 
 @pytest.mark.parametrize("make", [parallel, leaned, cone])
-def test_images_and_gradients_equal_the_twins(make: object, random_gaussians: Make) -> None:
+def test_images_and_gradients_equal_the_reference(make: object, random_gaussians: Make) -> None:
     geometry = make()  # type: ignore[operator]
     g = random_gaussians(18, 9.0)
-    raw, twin = raw_of(g, DEVICE), in_double(g)
+    raw, double = raw_of(g, DEVICE), in_double(g)
     found = autograd.project(*raw, UNIT, geometry, *WHOLE, AFFINE)
-    expected = torch.stack([twin_view(twin, geometry, view) for view in range(geometry.n_views)])
+    expected = torch.stack([reference_view(double, geometry, view) for view in range(geometry.n_views)])
     peak = float(expected.detach().max())
     assert float((found.detach().cpu() - expected.detach()).abs().max()) < 3e-6 * peak
     weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
     (found * weights.float().to(DEVICE)).sum().backward()
     (expected * weights).sum().backward()
-    assert_gradients(raw, twin)
+    assert_gradients(raw, double)
 
 
 @pytest.mark.parametrize("make", [parallel, cone])
-def test_the_uncorrected_factor_equals_the_twins(make: object, random_gaussians: Make) -> None:
+def test_the_uncorrected_factor_equals_the_references(make: object, random_gaussians: Make) -> None:
     geometry = make()  # type: ignore[operator]
     g = random_gaussians(10, 9.0)
-    raw, twin = raw_of(g, DEVICE), in_double(g)
+    raw, double = raw_of(g, DEVICE), in_double(g)
     plain = RayModel(rectified=False)
     found = autograd.project(*raw, UNIT, geometry, *WHOLE, plain)[0]
-    physical = (twin.means, twin.scales, twin.quaternions, twin.densities)
+    physical = (double.means, double.scales, double.quaternions, double.densities)
     expected = reference.project_view(*physical, geometry, 0, length=plain.length(geometry))
     assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
     (found * found).sum().backward()
     (expected * expected).sum().backward()
-    assert_gradients(raw, twin)
+    assert_gradients(raw, double)
 
 
 def test_footprints_equal_the_cpus(random_gaussians: Make) -> None:
@@ -138,19 +138,19 @@ def test_a_needle_keeps_its_digits(aspect: float) -> None:
     # Askew and longer than the image: the expanded quadratic form would lose it in float32.
     g = Gaussians.from_physical([[0.1, 0.2, -0.3]], [[0.03 * aspect, 0.03, 0.03]], [1.0], [[0.9, 0.1, 0.35, 0.2]])
     geometry = Geometry.parallel([0.3], (24, 24), 0.05)
-    raw, twin = raw_of(g, DEVICE), in_double(g)
+    raw, double = raw_of(g, DEVICE), in_double(g)
     found = autograd.project(*raw, g.density_unit, geometry, *WHOLE, AFFINE)
-    expected = twin_view(twin, geometry, 0)
+    expected = reference_view(double, geometry, 0)
     assert float((found[0].cpu() - expected).detach().abs().max()) < 1e-5 * float(expected.detach().max())
     found.sum().backward()
     expected.sum().backward()
-    assert_gradients(raw, twin, 2e-5)
+    assert_gradients(raw, double, 2e-5)
 
 
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_none_one_and_those_that_cover_everything(n: int) -> None:
     g = Gaussians.from_physical(np.full((n, 3), 0.2), np.full((n, 3), 40.0), np.ones(n), density_unit=1.0)
-    raw, twin = raw_of(g, DEVICE), in_double(g)
+    raw, double = raw_of(g, DEVICE), in_double(g)
     geometry, grid = Geometry.parallel([1.0], (9, 17)), Grid((3, 9, 9))
     image = autograd.project(*raw, 1.0, geometry, *WHOLE, AFFINE)
     volume = autograd.voxelize(*raw, 1.0, grid, *WHOLE)
@@ -160,13 +160,13 @@ def test_none_one_and_those_that_cover_everything(n: int) -> None:
         assert not image.any() and not volume.any()
         return
     z, y, x = (torch.from_numpy(axis) for axis in grid.coordinates())
-    expected = twin_view(twin, geometry, 0)
-    dense = reference.voxelize(twin.means, twin.scales, twin.quaternions, twin.densities, (z, y, x))
+    expected = reference_view(double, geometry, 0)
+    dense = reference.voxelize(double.means, double.scales, double.quaternions, double.densities, (z, y, x))
     np.testing.assert_allclose(image.detach().cpu().numpy()[0], expected.detach().numpy(), rtol=3e-6)
     np.testing.assert_allclose(volume.detach().cpu().numpy(), dense.detach().numpy(), rtol=3e-6)
     (expected.sum() + dense.sum()).backward()
     # The rotation of a ball has no gradient: what is left of it is rounding.
-    for tensor, (name, value) in zip(raw, gradients(twin).items(), strict=True):
+    for tensor, (name, value) in zip(raw, gradients(double).items(), strict=True):
         assert tensor.grad is not None
         np.testing.assert_allclose(tensor.grad.cpu(), value, rtol=1e-4, atol=0.3 if name == "quaternions" else 1e-3)
 

@@ -1,4 +1,4 @@
-"""Exact rays of a cone: the Triton kernels against the twin, and cut off where the CPU's are."""
+"""Exact rays of a cone: the Triton kernels against the reference, and cut off where the CPU's are."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from tests.recon.kernels.gpu.on_gpu import DEVICE, EXACT, SHAPE, UNIT, WHOLE, as
 autograd = importlib.import_module("recon.kernels.gpu.autograd")
 
 
-def test_exact_rays_and_gradients_equal_the_twins(random_gaussians: Make) -> None:
+def test_exact_rays_and_gradients_equal_the_reference(random_gaussians: Make) -> None:
     geometry, g = cone(), random_gaussians(18, 9.0)
-    twin = in_double(g)
-    errors = reference.affine_error(twin.means, twin.scales, twin.quaternions, geometry, 0)
+    double = in_double(g)
+    errors = reference.affine_error(double.means, double.scales, double.quaternions, geometry, 0)
     for worst in (0.0, float(errors.median())):
-        raw, twin = raw_of(g, DEVICE), in_double(g)
+        raw, double = raw_of(g, DEVICE), in_double(g)
         found = autograd.project(*raw, UNIT, geometry, *WHOLE, RayModel(exact_above=worst))[0]
-        physical = (twin.means, twin.scales, twin.quaternions, twin.densities)
+        physical = (double.means, double.scales, double.quaternions, double.densities)
         expected = reference.project_view(*physical, geometry, 0, exact=errors > worst)
         assert float((found.detach().cpu() - expected.detach()).abs().max()) < 5e-6 * float(expected.detach().max())
         weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
         (found * weights.float().to(DEVICE)).sum().backward()
         (expected * weights).sum().backward()
-        assert_gradients(raw, twin)
+        assert_gradients(raw, double)
 
 
 @pytest.mark.parametrize("cut", [1.5, 3.0])

@@ -12,7 +12,7 @@ from recon.base.volume import Grid
 from recon.kernels import reference
 from recon.splatting.gaussians import Gaussians
 from tests.recon.helpers import in_double
-from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, WHOLE, raw_of, twin_view
+from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, WHOLE, raw_of, reference_view
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
 tiles = importlib.import_module("recon.kernels.gpu.tiles")
@@ -47,7 +47,7 @@ def test_a_long_list_is_shared_out_and_sums_to_the_same() -> None:
     assert tiles.tile_lists(boxes, (7, 8), 8).shares > 1
     assert tiles.tile_lists(torch.zeros_like(boxes), (7, 8), 8).shares == 1
     double = in_double(g)
-    expected = twin_view(double, geometry, 0).detach()
+    expected = reference_view(double, geometry, 0).detach()
     np.testing.assert_allclose(view.image.cpu(), expected, rtol=2e-6)
     z, y, x = (torch.from_numpy(axis) for axis in grid.coordinates())
     volume = reference.voxelize(double.means, double.scales, double.quaternions, double.densities, (z, y, x)).detach()

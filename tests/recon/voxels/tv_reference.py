@@ -1,4 +1,4 @@
-"""Total variation in plain numpy and float64: the readable twin of the kernels."""
+"""Total variation in plain numpy and float64: the reference implementation of the kernels."""
 
 from __future__ import annotations
 
