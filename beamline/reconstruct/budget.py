@@ -38,7 +38,7 @@ class Budgeted:
 
     Attributes:
         result: what came out.
-        prepared: the views it was made from, joined where the choice says so.
+        prepared: the views it is of, with joined pixels if the choice joins them.
         choice, speeds: what was chosen, and the measurements behind it.
         seconds: of everything, calibration included.
         placed: Gaussians at the start.
@@ -68,8 +68,8 @@ class Budgeted:
             "measured_fill_s": s.fill,
         }
 
-    def said(self, budget: float) -> str:
-        """What was chosen, in a line."""
+    def summary(self, budget: float) -> str:
+        """The choice in a line."""
         fit = ""
         if self.choice.fits:
             fit = f", {self.result.history[-1].step} steps from {self.placed} Gaussians"
@@ -89,7 +89,7 @@ def within(
     """Reconstruct within `budget` seconds by `now`, the measuring included.
 
     Placing is run and timed before the fit gets what is left, and filling is timed on a slab of what was placed: only
-    the choice rests on predictions. Where even the cheapest choice will be late, `warn` is told so before the work.
+    the choice rests on predictions. Where even the cheapest choice will be late, `warn` gets a warning before the work.
 
     Raises:
         ValueError: the views cannot be reconstructed.

@@ -35,7 +35,7 @@ def reconstruct_file(
 ) -> dict[str, float]:
     """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
 
-    A fit that is stopped within `stop_scope` delivers what it has, marked `ended_early`.
+    A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -67,19 +67,19 @@ def reconstruct_file(
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
     with stop_scope() as stopped:
-        work = _Work(options, prepared, sink, clock, StopLatch(stopped), warn)
+        job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn)
         if options.budget is not None:
-            made, prepared, factor = _spend(work, options.budget)
+            outcome, prepared, factor = _within_budget(job, options.budget)
             selection = replace(selection, binning=selection.binning * factor)
         else:
-            made = _fit(work, options.method) if isinstance(options.method, R2) else _made(work)
-    truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
+            outcome = _by_fit(job, options.method) if isinstance(options.method, R2) else _by_method(job)
+    truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
     context = ReportContext(facts, selection, options.command, options.seed, warn.messages, started)
-    return write_result(made, prepared, truth, options.target, context, sink, clock)
+    return write_result(outcome, prepared, truth, options.target, context, sink, clock)
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
-    """Say what is about to be reconstructed."""
+    """Send the event `recon_started`."""
     data = {
         "file": options.source.path,
         "method": options.method.name,
@@ -101,8 +101,8 @@ def check_device(device: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
-    """What a reconstruction is made of and with."""
+class _Job:
+    """A reconstruction: its options and data, and the channels to its user."""
 
     options: ReconOptions
     prepared: PreparedProjections
@@ -120,29 +120,29 @@ class _Work:
 
     @contextmanager
     def refused(self, by: str = "") -> Iterator[None]:
-        """What the data do not allow, as a DataError that names the file."""
+        """Turns a ValueError into a DataError that names the file."""
         try:
             yield
         except ValueError as error:
             raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
 
     def run(self, method: Method, control: RunControl) -> recon.Reconstruction:
-        """By a method, with the views held out where it takes them, until it ends or is stopped."""
+        """Run a method, with views held out if it takes any, until it ends or is stopped."""
         prepared, data, geometry = self.prepared, self.prepared.projections.data, self.prepared.geometry
         held_out: Sequence[int] = ()
         if method.traits.held_out:
             data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
         control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
         with self.refused(f" by {method.name}"):
-            # So that the time of the run, and the time it says is left, hold no compilation.
+            # Compilation must not count in the time of the run, nor in its estimate of the time left.
             warm_up(method, prepared.geometry, device=self.options.device)
             return recon.reconstruct(
                 data, geometry, method, grid=self.grid, seed=self.options.seed, device=self.options.device,
                 use=DataUse(held_out=held_out), control=control,
             )  # fmt: skip
 
-    def made(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:
-        """The result with what it was made with: its own settings, `settings`, and whether it ended early."""
+    def outcome(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:
+        """The result with its own settings, `settings`, and whether it ended early."""
         return ReconOutcome(
             volume=result.volume,
             method=result.method,
@@ -154,20 +154,20 @@ class _Work:
         )
 
 
-def _made(work: _Work) -> ReconOutcome:
-    """By a method without a state to keep."""
-    result = work.run(work.options.method, RunControl(on_progress=work.listener()))
+def _by_method(job: _Job) -> ReconOutcome:
+    """Run a method that has no presets and no checkpoints."""
+    result = job.run(job.options.method, RunControl(on_progress=job.listener()))
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    return work.made(result, work.stop_latch.cut(reached, planned))
+    return job.outcome(result, job.stop_latch.cut(reached, planned))
 
 
-def _fit(work: _Work, method: R2) -> ReconOutcome:
-    """Fit Gaussians; save the state of the fit and continue from a saved one where that is wanted."""
-    options, prepared = work.options, work.prepared
+def _by_fit(job: _Job, method: R2) -> ReconOutcome:
+    """Fit Gaussians; save checkpoints and continue from one if asked to."""
+    options, prepared = job.options, job.prepared
     asked, chosen = method.gaussians, ""
     if options.quality is not None:
         method = method.with_quality(
-            options.quality, default_count(Grid.of_field(prepared.geometry, work.grid.voxel_size))
+            options.quality, default_count(Grid.of_field(prepared.geometry, job.grid.voxel_size))
         )
     steps, checkpoints = method.planned_steps or 0, options.checkpoints
     origin, resume = {}, None
@@ -175,36 +175,36 @@ def _fit(work: _Work, method: R2) -> ReconOutcome:
         assert method.gaussians is None or isinstance(method.gaussians, int)
         others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
         origin = fit_origin(prepared, method.fit, others)
-        resume = checkpoints.begin(origin, steps, work.warn)
-    keep = partial(checkpoints.write, origin, steps, work.warn)
+        resume = checkpoints.begin(origin, steps, job.warn)
+    keep = partial(checkpoints.write, origin, steps, job.warn)
     control = RunControl(
-        on_progress=work.listener(method.seconds),
+        on_progress=job.listener(method.seconds),
         on_checkpoint=None if checkpoints.path is None else keep,
         resume=resume,
     )
-    result = work.run(method, control)
+    result = job.run(method, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
-    begun = int(result.settings["gaussians_at_start"])
+    started_from = int(result.settings["gaussians_at_start"])
     if options.quality is not None:
-        chosen = f"{options.quality}: {method.steps} steps from {begun} Gaussians"
+        chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
         chosen += f", {method.polish} sweeps on voxels" if method.polish else ""
-    if isinstance(asked, int) and resume is None and begun < asked:
-        work.warn(f"The fit started from {begun} Gaussians, not from {asked}: the sample has no room for more.")
+    if isinstance(asked, int) and resume is None and started_from < asked:
+        job.warn(f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more.")
     result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
-    # Sweeps come after the last step, and end early as well.
-    early = work.stop_latch.stopped if method.polish else work.stop_latch.cut(result.history[-1].step, steps)
+    # The sweeps follow the last step, and can be stopped as well.
+    early = job.stop_latch.stopped if method.polish else job.stop_latch.cut(result.history[-1].step, steps)
     resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return work.made(result, early, chosen, **resumed)
+    return job.outcome(result, early, chosen, **resumed)
 
 
-def _spend(work: _Work, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
-    """Reconstruct within a budget of seconds: what was made, of which views, and how many pixels were joined a side."""
-    warm_up(geometry=work.prepared.geometry)  # compilation happens once on a machine; no budget pays for it
-    with work.refused():
+def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
+    """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the joined pixels a side."""
+    warm_up(geometry=job.prepared.geometry)  # compilation happens once on a machine and is not part of the budget
+    with job.refused():
         done = within(
-            budget, work.prepared, work.options.seed, work.options.filter, work.clock.now, work.listener(budget),
-            work.stop_latch, work.warn,
+            budget, job.prepared, job.options.seed, job.options.filter, job.clock.now, job.listener(budget),
+            job.stop_latch, job.warn,
         )  # fmt: skip
-    made = work.made(done.result, work.stop_latch.stopped, done.said(budget), **done.settings(budget))
-    return replace(made, seconds=done.seconds), done.prepared, done.choice.binning
+    outcome = job.outcome(done.result, job.stop_latch.stopped, done.summary(budget), **done.settings(budget))
+    return replace(outcome, seconds=done.seconds), done.prepared, done.choice.binning

@@ -47,7 +47,7 @@ class Trial:
 
     @property
     def label(self) -> str:
-        """The settings, as short as they can be said."""
+        """The settings in a few words."""
         if self.group == PRECISION:
             return "float32 against float64"
         parts = [self.method, f"{self.views} views"]
@@ -177,9 +177,9 @@ class Timed:
 
     @classmethod
     def of(cls, outcome: Outcome, wall: float) -> Timed:
-        """What is known of a trial that has ended; one without figures has told nothing of its work."""
-        made = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
-        return cls(outcome.trial, wall, min(wall, made) if math.isfinite(made) else 0.0)
+        """The times of a trial that has ended; one without figures has 0 s of work."""
+        seconds = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
+        return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
 
 
 def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:

@@ -2,7 +2,7 @@
 
 Reads the job and its arrays, says progress and the result as lines of JSON on stdout. A job may also be to compile what
 trials will need, once for all of them: compiling takes memory that would otherwise count as the first trial's. Its
-stdin is a pipe that nothing is written to: once that ends, whoever wanted the result is gone, and so is this process.
+stdin is a pipe that nothing is written to: when it ends, the parent process has ended, and this one ends, too.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ def half_set_resolution(trial: Trial, projections: F32, geometry: Geometry, grid
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
 
     def half(views: NDArray[np.int64]) -> F32:
-        made = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None)
-        return on_grid(made.volume, grid).data
+        result = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None)
+        return on_grid(result.volume, grid).data
 
     even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
     return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
@@ -146,20 +146,20 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
 
 def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
     """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
-    judged = residual_curve(history_arrays(result.history))
-    if judged is None:
+    curve = residual_curve(history_arrays(result.history))
+    if curve is None:
         return []
-    seconds, quality = record(judged.seconds, judged.residuals)
+    seconds, quality = record(curve.seconds, curve.residuals)
     return list(zip(seconds.tolist(), quality.tolist(), strict=True))
 
 
 def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:
-    said = -math.inf
+    reported = -math.inf
 
     def listen(progress: recon.Progress) -> None:
-        nonlocal said
-        if now() - said >= _SAY_EVERY:
-            said = now()
+        nonlocal reported
+        if now() - reported >= _SAY_EVERY:
+            reported = now()
             say({"event": "progress", "step": progress.step, "steps": progress.steps})
 
     return listen
@@ -188,16 +188,16 @@ def main(job: Path) -> int:
     def say(line: Mapping[str, Any]) -> None:
         print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
 
-    said = json.loads(job.read_text(encoding="utf-8"))
-    if "compile" in said:
-        geometry = geometry_in(Path(said["data"]))
-        for trial in said["compile"]:
+    request = json.loads(job.read_text(encoding="utf-8"))
+    if "compile" in request:
+        geometry = geometry_in(Path(request["data"]))
+        for trial in request["compile"]:
             with suppress(ValueError):  # a method that does not take these views: its own trial will say so
                 warm_up(Trial(**trial).build(), geometry)
         return 0
-    trial = Trial(**said["trial"])
+    trial = Trial(**request["trial"])
     try:
-        result = run(trial, Data.load(Path(said["data"])), int(said["seed"]), say)
+        result = run(trial, Data.load(Path(request["data"])), int(request["seed"]), say)
     except ValueError as error:
         say({"event": "failed", "message": str(error)})
         return 1

@@ -21,7 +21,7 @@ from recon.splatting.problem import FitProblem, make_problem
 from recon.splatting.settings import NAMES, FitSettings, tv_size, tv_weight
 from recon.splatting.splat import Active, voxelize
 
-_NORMALISE = 100  # steps between two times that quaternions are made of length 1
+_NORMALISE = 100  # steps between two normalisations of the quaternions
 
 
 @dataclass(eq=False)

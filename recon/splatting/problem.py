@@ -79,7 +79,7 @@ def make_problem(
     """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
 
     Values that are not finite, or more than a million half fields times density units, get no weight, see
-    `masks.masked`. The squared losses are made of the size of the
+    `masks.masked`. The squared losses are scaled to the size of the
     absolute one at the data's noise (see `noise_level`), so that the weights of SSIM and total variation keep their
     meaning.
 

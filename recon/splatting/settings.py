@@ -1,4 +1,4 @@
-"""Settings of a fit: weights, rates and limits, and what those that follow the data come to for a scan and a grid."""
+"""Settings of a fit: weights, rates and limits, and the values of those that depend on the scan and the grid."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TV_SHARE, _TV_SIZES = 4, (32, 96)
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a fit runs; weights and rates are the published ones (Zha et al. 2024) where not said otherwise.
+    """Settings of a fit. Defaults are the published ones (Zha et al. 2024) unless stated otherwise.
 
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighed by the transmission).
@@ -36,16 +36,16 @@ class FitSettings:
             squared, so that in effect it does not (there the weight is 0.05); with the right gradient we measure
             +0.2 dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
-        pace: factor on all rates. The published ones are made for 30 000 steps; a fit of 1000 is far from its end with
-            them. Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there (measured on
-            seven scans, see docs/exploration.md).
+        pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
+            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there (measured on seven
+            scans, see docs/exploration.md).
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end.
         smallest: standard deviation, in pixels, below which none shrinks: point sampling sees nothing thinner.
         views_per_step: gradients of so many views are averaged.
         coarse, coarse_until: the fit begins on pixels joined by this factor, until this fraction of its steps.
-        rays: what a Gaussian gives a ray; matters for cones.
+        rays: the integral of a Gaussian along a ray; matters for cones.
     """
 
     loss: Loss = "l1"

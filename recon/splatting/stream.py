@@ -32,8 +32,8 @@ Clock = Callable[[], float]
 _NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _ROUND = 400.0  # steps over which the rates decay within a round
-_BLIND = 100.0  # data so many times larger than the density unit explains: the first views showed nothing
-_ROOM = 0.1  # of the first count that a round may add; the last one has what is left of the growth
+_BLIND = 100.0  # data so many times larger than the density unit implies: the first views showed no sample
+_ROUND_GROWTH = 0.1  # share of the first count that a round may add; the last round may add the rest of the growth
 
 # Slower than where all views are there from the start: each round would undo with its first fast steps what the last
 # one had learnt (battery of 180 views: 30.7 dB with the rates of `FitSettings`, 31.9 with these).
@@ -212,13 +212,13 @@ class StreamingFit:
             self._begin_round()
         if self._state is None or self._problem is None:
             return self.progress()
-        said = begin
+        reported = begin
         while True:
             spent = self._now() - begin
             fraction = min(1.0, spent / seconds) if finishing and seconds > 0 else self._round_fraction()
             fit.step(self._state, self._problem, self._settings, fraction, self._choose(finishing))
-            if on_progress is not None and self._now() - said > 0.1:
-                said = self._now()
+            if on_progress is not None and self._now() - reported > 0.1:
+                reported = self._now()
                 if on_progress(self.progress()):
                     break
             if self._now() - begin >= seconds:
@@ -254,9 +254,9 @@ class StreamingFit:
             self._data = list(self._problem.projections)
             self._place_first()
         assert self._state is not None
-        # Room is for what later views show: early ones span a narrow angle and would fill it with their streaks.
+        # Later views need new Gaussians: early ones span a narrow angle and would use all of them for their streaks.
         most = round(self._placed * growth(self._settings))
-        self._state.limit = most if force else min(most, self._state.n + round(_ROOM * self._placed))
+        self._state.limit = most if force else min(most, self._state.n + round(_ROUND_GROWTH * self._placed))
         self._round_views, self._round_step = self.n_views, self._state.step
         self._state.drawn = []  # draw from all views from now on
 

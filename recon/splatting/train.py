@@ -28,14 +28,14 @@ from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 if TYPE_CHECKING:
     from recon.splatting.r2 import R2
 
-_LOOK = 50  # steps between two looks at the views held out
+_LOOK = 50  # steps between two measurements of the views held out
 _BEST = "best."  # names of the best model's arrays in a checkpoint begin so
 _PATIENCE = 0.2  # of the steps planned, and at least six looks, may pass without a better one
 
 
 @dataclass(eq=False)
 class _HeldOutTracker:
-    """The residual of views held out, and the model that had it lowest."""
+    """Tracks the residual of views held out, and keeps the model with the lowest one."""
 
     problem: FitProblem | None
     settings: FitSettings
@@ -48,7 +48,7 @@ class _HeldOutTracker:
     def over(
         cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
     ) -> _HeldOutTracker:
-        """At `step`, or as a checkpoint has left it."""
+        """A tracker for a fit at `step`, or the one that a checkpoint holds."""
         if problem is None or "watch" not in resume:
             return cls(problem, settings, best_step=step)
         best, best_step = resume["watch"]
@@ -56,7 +56,7 @@ class _HeldOutTracker:
         return cls(problem, settings, best=float(best), best_step=int(best_step), kept=kept)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What a checkpoint holds of it."""
+        """Its arrays in a checkpoint."""
         if self.problem is None:
             return {}
         best = {_BEST + name: values for name, values in self.kept.items()}

@@ -67,7 +67,7 @@ def test_the_time_is_used_and_not_exceeded(
     assert done.choice.fits
     assert 0.9 * budget < done.seconds <= budget
     assert done.result.volume.grid == Grid.matching(prepared.geometry)
-    assert f"of {budget:.3g} s" in done.said(budget)
+    assert f"of {budget:.3g} s" in done.summary(budget)
     assert done.settings(budget)["measured_step_s"] == 0.01
     assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
 
@@ -79,7 +79,7 @@ def test_a_slow_machine_takes_fbp_of_joined_pixels(
     done = _spend(prepared, 5.0, Ticking(0.01))
     assert not done.choice.fits and done.choice.binning == 2
     assert done.result.volume.grid.shape == (3, 20, 20)
-    assert "pixels joined 2 x 2" in done.said(5.0) and done.said(5.0).startswith("fbp")
+    assert "pixels joined 2 x 2" in done.summary(5.0) and done.summary(5.0).startswith("fbp")
 
 
 def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said_to_be_late(
@@ -96,7 +96,7 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
     done = _spend(prepared, 5.0, clock, warned)
     joined_pixels = done.choice.binning
     assert not done.choice.fits and joined_pixels >= 4  # about as many as six rows allow
-    assert done.seconds > 7 and f"of {5.0:.3g} s" in done.said(5.0)
+    assert done.seconds > 7 and f"of {5.0:.3g} s" in done.summary(5.0)
     assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
     late = 7.01 + 432 / joined_pixels**3 - 5
     assert warned[0].endswith(f"fbp, pixels joined {joined_pixels} x {joined_pixels}, will be about {late:.3g} s late.")
@@ -156,7 +156,7 @@ def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(
 ) -> None:
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
     done = _spend(_cone(prepared, 2 * np.pi), 5.0, Ticking(0.01))
-    assert done.said(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
+    assert done.summary(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
 
 
 @pytest.mark.parametrize(("turn", "tilt"), [(3.6, 0.0), (2 * np.pi, 0.02)])
