@@ -54,9 +54,9 @@ def _entries(version: int) -> tuple[Kernel, Kernel]:
             _depth_rows(p, view, scratch, rows, out)
 
     @njit(cache=True, **KERNEL)
-    def count_rows(p, view, scratch, start, step, open_beam, air, top, out, doubtful):  # type: ignore[no-untyped-def]
+    def count_rows(p, view, scratch, start, step, counter, out, doubtful):  # type: ignore[no-untyped-def]
         if version != 0:
-            _count_rows(p, view, scratch, start, step, open_beam, air, top, out, doubtful)
+            _count_rows(p, view, scratch, start, step, counter, out, doubtful)
 
     return depth_rows, count_rows
 
@@ -87,8 +87,9 @@ def counts(p: Packed, view: View, open_beam: float, rule: Callable[[Reals], Coun
     """
     out, doubtful = np.empty((view.v.size, view.u.size), np.uint16), np.zeros(view.v.size, np.bool_)
     air, top = (int(rule(np.full((1, 1), depth))[0, 0]) for depth in (0.0, -_BRIGHT))
+    counter = Counter(float(open_beam), air, float(top))
     _shared(
-        lambda first, step: count_rows(p, view, _scratch(p, view), first, step, open_beam, air, top, out, doubtful),
+        lambda first, step: count_rows(p, view, _scratch(p, view), first, step, counter, out, doubtful),
         out.size,
     )
     rows = np.flatnonzero(doubtful)
@@ -132,11 +133,18 @@ def _depth_rows(p: Packed, view: View, scratch: Scratch, rows: NDArray[np.int64]
 
 @njit(**KERNEL)
 def _count_rows(
-    p: Packed, view: View, scratch: Scratch, start: int, step: int, open_beam: float, air: int, top: float, out: Counts,
+    p: Packed,
+    view: View,
+    scratch: Scratch,
+    start: int,
+    step: int,
+    counter: Counter,
+    out: Counts,
     doubtful: NDArray[np.bool_],
-) -> None:  # fmt: skip
+) -> None:
     """Counts of every step-th row; marks the rows in which the rounding of a count is in doubt."""
     place, facets, lines, touched, row, base, of_base = scratch
+    open_beam, air, top = counter
     _locate_all(p, view, place, facets)
     known, base_in_doubt = -1, False
     for j in range(start, view.v.size, step):
@@ -161,6 +169,14 @@ def _count_rows(
                 _copy(base[begin:end], row[begin:end])
             k += 1
         doubtful[j] = doubt
+
+
+class Counter(NamedTuple):
+    """Counts without a sample before rounding, the same rounded, and the largest count."""
+
+    open_beam: float
+    air: int
+    top: float
 
 
 class Scratch(NamedTuple):

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -137,23 +137,29 @@ def holes(points: Reals, radii: Reals, smallest: float, gap: float, n: int) -> R
     at = (at[:, 0] * cells[1] + at[:, 1]) * cells[2] + at[:, 2]
     order = np.argsort(at, kind="stable")
     first = np.searchsorted(at[order], np.arange(cells.prod() + 1))
-    return _holes(points[order], radii[order].copy(), low, size, cells, first, smallest, gap, n)
+    return _holes(points[order], radii[order].copy(), Cells(low, size, cells, first), smallest, gap, n)
+
+
+class Cells(NamedTuple):
+    """Boxes into which points are sorted.
+
+    Attributes:
+        low, size: float64 [3], mm, corner of the first cell and edges of a cell.
+        number: int64 [3], of cells along each axis.
+        first: int64 [cell + 1], index of each cell's first point.
+    """
+
+    low: Reals
+    size: Reals
+    number: NDArray[np.int64]
+    first: NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)
-def _holes(
-    points: Reals,
-    radii: Reals,
-    low: Reals,
-    size: Reals,
-    cells: NDArray[np.int64],
-    first: NDArray[np.int64],
-    smallest: float,
-    gap: float,
-    n: int,
-) -> Reals:
+def _holes(points: Reals, radii: Reals, grid: Cells, smallest: float, gap: float, n: int) -> Reals:
     """Points are sorted by cell. A new ball is at least as large as all later ones, so that it affects only points
     within two of its radii (and the gap)."""
+    low, size, cells, first = grid
     queue = [(-radii[i], i) for i in range(radii.size) if radii[i] >= smallest]
     heapq.heapify(queue)
     out = np.empty((n, 4))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numba import config, njit
@@ -22,6 +23,23 @@ Reals = NDArray[np.float64]
 Voxels32 = NDArray[np.float32]
 
 _EDGE = 1e-7  # voxels: distance kept from the outer edge
+
+
+class Lattice(NamedTuple):
+    """A padded volume and its place; see `project`."""
+
+    volume: Voxels32
+    spacing: Reals
+    first: Reals
+
+
+class Rays(NamedTuple):
+    """(u, v) of pixel (0, 0), the pitch, and the distance from the source to the axis, all in mm."""
+
+    u0: float
+    v0: float
+    pitch: float
+    sod: float
 
 
 def padded(values: NDArray[np.floating]) -> Voxels32:
@@ -38,19 +56,21 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
         first: float64 (x, y, z) in mm, centre of the first voxel that is not padding.
     """
     out = np.zeros(detector.shape)
-    u0, v0 = -detector.axis_col * detector.pitch, -detector.axis_row * detector.pitch
+    lattice = Lattice(volume, spacing, first)
+    pitch = float(detector.pitch)
+    rays = Rays(-detector.axis_col * pitch, -detector.axis_row * pitch, pitch, float(detector.sod))
 
     if pose.tilt is None and math.isinf(detector.sod):
         shift = np.zeros((detector.shape[0], 3)) if pose.shift is None else pose.shift
         cosine, sine = np.cos(pose.angle), np.sin(pose.angle)
 
         def rows(low: int, high: int) -> None:
-            _upright(volume, spacing, first, cosine, sine, shift, u0, v0, detector.pitch, low, high, out)
+            _upright(lattice, rays, cosine, sine, shift, low, high, out)
     else:
         axes, origin = pose.frames()
 
         def rows(low: int, high: int) -> None:
-            _any(volume, spacing, first, axes, origin, u0, v0, detector.pitch, detector.sod, low, high, out)
+            _any(lattice, rays, axes, origin, low, high, out)
 
     # Not numba's get_num_threads, which starts numba's own threads and slows torch down.
     threads = min(int(config.NUMBA_NUM_THREADS), detector.shape[0])
@@ -66,20 +86,11 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
 
 @njit(cache=True, nogil=True)
 def _upright(
-    volume: Voxels32,
-    spacing: Reals,
-    first: Reals,
-    cosine: Reals,
-    sine: Reals,
-    shift: Reals,
-    u0: float,
-    v0: float,
-    pitch: float,
-    low: int,
-    high: int,
-    out: Reals,
+    lattice: Lattice, rays: Rays, cosine: Reals, sine: Reals, shift: Reals, low: int, high: int, out: Reals
 ) -> None:
     """Rows low ... high - 1 of a parallel beam across z: in each, x = u cos θ - t sin θ and y = u sin θ + t cos θ."""
+    volume, spacing, first = lattice
+    u0, v0, pitch, _ = rays
     nz, ny, nx = volume.shape[0] - 2, volume.shape[1] - 2, volume.shape[2] - 2
     between = np.empty(volume.shape[1:], np.float32)
     for j in range(low, high):
@@ -130,21 +141,10 @@ def _columns(at: float, step: float, n: int, cols: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def _any(
-    volume: Voxels32,
-    spacing: Reals,
-    first: Reals,
-    axes: Reals,
-    origin: Reals,
-    u0: float,
-    v0: float,
-    pitch: float,
-    sod: float,
-    low: int,
-    high: int,
-    out: Reals,
-) -> None:
+def _any(lattice: Lattice, rays: Rays, axes: Reals, origin: Reals, low: int, high: int, out: Reals) -> None:
     """Rows low ... high - 1 for any pose and source; coordinates in voxels of the padded volume."""
+    volume, spacing, first = lattice
+    u0, v0, pitch, sod = rays
     size = np.array([volume.shape[2] - 2, volume.shape[1] - 2, volume.shape[0] - 2])
     point, along, step = np.empty(3), np.empty(3), np.empty(3)
     for j in range(low, high):
