@@ -2,15 +2,15 @@
 
 In the laboratory's axes (u, b, v) a parallel ray is (u, 0, v) + t (0, 1, 0) and a cone's (0, -sod, 0) + t (u, sod, v),
 t = 1 being the plane of the rotation axis; `axes` [3, 3] has these axes as columns, in the sample's (x, y, z). Each
-function adds attenuation x length in t to the pixels in the body's shadow and returns their range: the first and the
-one after the last. `u` has the positions of the columns in mm, `per_mm` is the number of columns a mm. In a cone the
-caller multiplies by the length of (u, sod, v). Positions are relative to the body's middle, so that no digits cancel
-where the source is far.
+function adds attenuation x length in t to the pixels of a `Row` in the body's shadow and returns their range: the first
+and the one after the last. In a cone the caller multiplies by the length of (u, sod, v). Positions are relative to the
+body's middle, so that no digits cancel where the source is far.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -26,6 +26,24 @@ EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an
 KERNEL = {"nogil": True, "error_model": "numpy", "_nrt": False}
 """Options of these kernels. Without reference counts (_nrt): arrays are allocated outside, and counting references to
 slices takes longer than a short chord. They are cached on disk within the kernels called from Python (see rows)."""
+
+
+class Row(NamedTuple):
+    """A row of the detector.
+
+    Attributes:
+        depth: float64 [col], to which chords are added.
+        u: float64 [col], positions of the columns, mm.
+        per_mm: columns a mm.
+        v: position of the row, mm.
+        sod: mm, infinite in a parallel beam.
+    """
+
+    depth: Reals
+    u: Reals
+    per_mm: float
+    v: float
+    sod: float
 
 
 @njit(**KERNEL)
@@ -78,8 +96,9 @@ def upright_cylinder(row: Reals, u: Reals, per_mm: float, middle: float, radius:
 
 
 @njit(**KERNEL)
-def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Span:
+def ellipsoid(rays: Row, place: Reals) -> Span:
     """Parallel rays; `place` from `locate`."""
+    row, u, per_mm, v, _ = rays
     dv = v - place[2]
     rest = 1.0 - place[5] * dv * dv
     if rest <= 0.0:
@@ -95,12 +114,10 @@ def ellipsoid(row: Reals, u: Reals, per_mm: float, v: float, place: Reals) -> Sp
 
 
 @njit(**KERNEL)
-def cone_ellipsoid(
-    row: Reals, u: Reals, per_mm: float, v: float, sod: float, matrix: Reals, attenuation: float, axes: Reals,
-    place: Reals,
-) -> Span:  # fmt: skip
+def cone_ellipsoid(rays: Row, matrix: Reals, attenuation: float, axes: Reals, place: Reals) -> Span:
     """A cone's rays, in the space where the ellipsoid is the unit ball: half a chord squared is |D|² - |R x D|² over
     |D|⁴, with R the ray's point next to the middle and D its direction, both linear in u."""
+    row, u, per_mm, v, sod = rays
     near = (sod + place[1]) / sod
     middle, w = place[0] / near, near * v - place[2]
     U, B, V = _times(matrix, axes, 0), _times(matrix, axes, 1), _times(matrix, axes, 2)
@@ -121,11 +138,9 @@ def cone_ellipsoid(
 
 
 @njit(**KERNEL)
-def leaning_cylinder(
-    row: Reals, u: Reals, per_mm: float, v: float, sod: float, radius: float, half: float, attenuation: float,
-    axes: Reals, place: Reals,
-) -> Span:  # fmt: skip
-    """Any rays (sod is infinite in a parallel beam): inside the round wall and between the ends."""
+def leaning_cylinder(rays: Row, radius: float, half: float, attenuation: float, axes: Reals, place: Reals) -> Span:
+    """Any rays: inside the round wall and between the ends."""
+    row, u, per_mm, v, sod = rays
     reach = radius * math.hypot(axes[0, 0], axes[1, 0]) + half * abs(axes[2, 0])
     low, high, near, turn = place[0] - reach, place[0] + reach, 1.0, 0.0
     R0 = D0 = (axes[0, 1], axes[1, 1], axes[2, 1])

@@ -11,15 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from simulators.samples.bodies.chords import EDGE_ON, KERNEL, Reals, Span, columns, in_lab
+from simulators.samples.bodies.chords import EDGE_ON, KERNEL, Reals, Row, Span, columns, in_lab
 from simulators.samples.bodies.packing import Packed
 
 
 @njit(**KERNEL)
-def polyhedron(
-    row: Reals, u: Reals, per_mm: float, v: float, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals
-) -> Span:
+def polyhedron(rays: Row, p: Packed, b: int, place: Reals, facets: Reals, lines: Reals) -> Span:
     """Parallel rays; `lines` float64 [4, faces] is scratch memory."""
+    row, u, per_mm, v, _ = rays
     dv = v - place[2]
     left, right, high, low = place[3], place[4], 0, 0
     for f in range(p.first_face[b], p.first_face[b + 1]):
@@ -34,25 +33,15 @@ def polyhedron(
             left, right = _bounded(left, right, slope, a)
     first, stop = _opened(u, per_mm, place[0], lines, high, low, left, right)
     if max(high, low) > 8:
-        return _walk(row, u, per_mm, place[0], p.attenuation[b], lines, high, low, first, stop, False)
+        return _walk(rays, place[0], p.attenuation[b], lines, high, low, (first, stop), False)
     _add_gap(row[first:stop], u[first:stop], place[0], p.attenuation[b], lines, high, low)
     return first, stop
 
 
 @njit(**KERNEL)
-def cone_polyhedron(
-    row: Reals,
-    u: Reals,
-    per_mm: float,
-    v: float,
-    sod: float,
-    p: Packed,
-    b: int,
-    axes: Reals,
-    place: Reals,
-    lines: Reals,
-) -> Span:
+def cone_polyhedron(rays: Row, p: Packed, b: int, axes: Reals, place: Reals, lines: Reals) -> Span:
     """A cone's rays. With s = 1/t a face is n · (u, sod, v) <= s x (the source's distance from it), linear in u."""
+    _, u, per_mm, v, sod = rays
     middle = place[0] * sod / (sod + place[1])
     front, back = sod / (sod + place[1] + place[5]), sod / (sod + place[1] + place[6])
     left, right = place[0] + place[3], place[0] + place[4]
@@ -71,7 +60,7 @@ def cone_polyhedron(
             lines[2, low], lines[3, low] = at_middle / inside, nu / inside
             low += 1
     first, stop = _opened(u, per_mm, middle, lines, high, low, left, right)
-    return _walk(row, u, per_mm, middle, p.attenuation[b], lines, high, low, first, stop, True)
+    return _walk(rays, middle, p.attenuation[b], lines, high, low, (first, stop), True)
 
 
 @njit(**KERNEL)
@@ -148,10 +137,11 @@ def _add_gap(row: Reals, u: Reals, middle: float, attenuation: float, lines: Rea
 
 @njit(**KERNEL)
 def _walk(
-    row: Reals, u: Reals, per_mm: float, middle: float, attenuation: float, lines: Reals, high: int, low: int,
-    first: int, stop: int, cone: bool,
-) -> Span:  # fmt: skip
-    """Add attenuation x the gap from column first to stop, from kink to kink; in a cone the gap is that of t."""
+    rays: Row, middle: float, attenuation: float, lines: Reals, high: int, low: int, span: Span, cone: bool
+) -> Span:
+    """Add attenuation x the gap in a range of columns, from kink to kink; in a cone the gap is that of t."""
+    row, u, per_mm, _, _ = rays
+    first, stop = span
     if first >= stop:
         return 0, 0
     k, m, above, below = 0, 0, np.inf, -np.inf

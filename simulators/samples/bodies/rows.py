@@ -21,6 +21,7 @@ from simulators.samples.bodies import chords, counting, facets, packing
 from simulators.samples.bodies import view as views
 from simulators.samples.bodies.chords import (
     KERNEL,
+    Row,
     cone_ellipsoid,
     ellipsoid,
     leaning_cylinder,
@@ -255,7 +256,8 @@ def _add_bodies(
     p: Packed, view: View, j: int, row: Reals, place: Reals, facets: Reals, lines: Reals, touched: NDArray[np.bool_]
 ) -> None:
     """Add all bodies but upright cylinders to a row; marks the tiles of columns that they shadow."""
-    v, u, per_mm, sod = view.v[j], view.u, 1.0 / view.pitch, view.sod
+    v, sod = view.v[j], view.sod
+    rays = Row(row, view.u, 1.0 / view.pitch, v, sod)
     one, parallel = view.axes.shape[0] == 1, view.sod == np.inf
     axes, origin = view.axes[0 if one else j], view.origin[0 if one else j]
     left, right = row.size, 0
@@ -265,21 +267,21 @@ def _add_bodies(
         if not one:
             locate(p, b, axes, origin, parallel, place[b], facets)
         if kind == CYLINDER:
-            first, stop = leaning_cylinder(row, u, per_mm, v, sod, p.size[b, 0], p.size[b, 1], a, axes, place[b])
+            first, stop = leaning_cylinder(rays, p.size[b, 0], p.size[b, 1], a, axes, place[b])
         elif kind == ELLIPSOID and parallel:
-            first, stop = ellipsoid(row, u, per_mm, v, place[b])
+            first, stop = ellipsoid(rays, place[b])
         elif kind == ELLIPSOID:
-            first, stop = cone_ellipsoid(row, u, per_mm, v, sod, p.matrix[b], a, axes, place[b])
+            first, stop = cone_ellipsoid(rays, p.matrix[b], a, axes, place[b])
         elif parallel:
-            first, stop = polyhedron(row, u, per_mm, v, p, b, place[b], facets, lines)
+            first, stop = polyhedron(rays, p, b, place[b], facets, lines)
         else:
-            first, stop = cone_polyhedron(row, u, per_mm, v, sod, p, b, axes, place[b], lines)
+            first, stop = cone_polyhedron(rays, p, b, axes, place[b], lines)
         if stop > first:
             left, right = min(left, first), max(right, stop)
             for tile in range(first // TILE, (stop - 1) // TILE + 1):
                 touched[tile] = True
     if not parallel and left < right:  # from t to length
-        part, at = row[left:right], u[left:right]
+        part, at = row[left:right], view.u[left:right]
         square = sod * sod + v * v
         for i in range(part.size):
             part[i] *= math.sqrt(square + at[i] * at[i])
