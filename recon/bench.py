@@ -16,12 +16,13 @@ from recon.assess.metrics import psnr, ssim3d
 from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
 from recon.base.volume import Grid
+from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view, view_table
 from recon.kernels.cpu.footprints import HU, HV
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
-from recon.splatting.splat import Active, Gradients, Scratch, project, render_view, view_table
+from recon.splatting.splat import project
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]

@@ -18,8 +18,8 @@ from recon.base.volume import Grid
 from recon.kernels.cpu import losses as losses_cpu
 from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.adam import adam_all, add_lengths
+from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, grid_layout, render_view
 from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
-from recon.splatting.splat import Active, Gradients, RenderedView, Scratch, grid_layout, render_view
 
 Array = TypeVar("Array")
 

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
+from recon.kernels.cpu.engine import Active
 from recon.splatting.backend import Backend, Cpu, Pass
 from recon.splatting.density_control import DensityPolicy, control
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import morton_order
 from recon.splatting.problem import FitProblem, make_problem
 from recon.splatting.settings import NAMES, FitSettings, tv_size, tv_weight
-from recon.splatting.splat import Active, voxelize
+from recon.splatting.splat import voxelize
 
 _NORMALISE = 100  # steps between two normalisations of the quaternions
 

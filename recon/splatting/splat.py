@@ -8,179 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.kernels import reference
-from recon.kernels.cpu.activation import F32, activate, activation_backward
-from recon.kernels.cpu.footprints import HU, INEXACT, Camera, footprint_table, footprints, footprints_backward
-from recon.kernels.cpu.project import moments, render, render_layers
-from recon.kernels.cpu.rays import Rays
-from recon.kernels.cpu.voxelize import Layout
+from recon.kernels.cpu.activation import F32
+from recon.kernels.cpu.engine import Active, Gradients, Scratch, grid_layout, render_view
+from recon.kernels.cpu.footprints import footprint_table
 from recon.splatting.gaussians import Gaussians
 
 Kernel = Literal["auto", "cpu", "gpu", "reference"]
-
-
-@dataclass(frozen=True, eq=False)
-class Active:
-    """Physical parameters of Gaussians as float32 arrays, row-major rotations [n, 9]."""
-
-    means: F32
-    scales: F32
-    rotations: F32
-    densities: F32
-
-    @classmethod
-    def of(cls, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> Active:
-        n = raw.shape[0]
-        scales, rotations = np.empty((n, 3), np.float32), np.empty((n, 9), np.float32)
-        densities = np.empty(n, np.float32)
-        activate(log_scales, quaternions, raw, unit, scales, rotations, densities)
-        return cls(means, scales, rotations, densities)
-
-
-@dataclass(frozen=True, eq=False)
-class Gradients:
-    """Gradients on the physical parameters; each projection or box of voxels adds to them."""
-
-    means: F32
-    log_scales: F32
-    rotations: F32
-    densities: F32
-
-    @classmethod
-    def zeros(cls, n: int) -> Gradients:
-        shapes: list[tuple[int, ...]] = [(n, 3), (n, 3), (n, 9), (n,)]
-        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
-
-    def to_raw(self, quaternions: F32, raw: F32, unit: float) -> tuple[F32, F32, F32, F32]:
-        """Gradients on means, log scales, quaternions and raw densities."""
-        d_quaternions, d_raw = np.empty_like(quaternions), np.empty_like(raw)
-        activation_backward(quaternions, raw, unit, self.rotations, self.densities, d_quaternions, d_raw)
-        return self.means, self.log_scales, d_quaternions, d_raw
-
-
-def camera(geometry: Geometry, view: int) -> Camera:
-    """One view of a geometry as the kernels' Camera."""
-    axes = geometry.axes(view).astype(np.float32)
-    col, row = geometry.origin(view)
-    if geometry.is_cone:
-        return Camera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, straight=False)
-    straight = bool(geometry.roll[view] == 0 and geometry.tilt[view] == 0)
-    return Camera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
-
-
-def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
-    """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
-    table = footprint_table(active.densities.shape[0])
-    parameters = (active.means, active.scales, active.rotations, active.densities)
-    footprints(*parameters, camera(geometry, view), faint, sigmas, table)
-    return table
-
-
-@dataclass(frozen=True, eq=False)
-class Scratch:
-    """Scratch buffers for a view of n Gaussians; views rendered one after the other may share one.
-
-    New ones for each view would allocate several MB a step for 50 000 Gaussians.
-
-    Attributes:
-        table: float32 [n, 8], the footprints.
-        moments: float32 [n, 6], moments of the image gradient under each footprint.
-        layers: see `render_layers`.
-    """
-
-    table: F32
-    moments: F32
-    layers: F32
-
-    @classmethod
-    def of(cls, n: int, detector_shape: tuple[int, int]) -> Scratch:
-        return cls(footprint_table(n), np.empty((n, 6), np.float32), render_layers(*detector_shape))
-
-
-@dataclass(frozen=True, eq=False)
-class RenderedView:
-    """One rendered view with everything that its backward pass needs.
-
-    Attributes:
-        image: line integrals [row, col].
-        active: the Gaussians; neither they nor `scratch` may change before `backward`.
-        camera: the view.
-        length: see `RayModel.length`.
-        scratch: holds the table of footprints.
-        exact: indices of the Gaussians that are integrated ray by ray.
-        rays: their rays; None if there are none.
-    """
-
-    image: F32
-    active: Active
-    camera: Camera
-    length: float
-    scratch: Scratch
-    exact: NDArray[np.intp]
-    rays: Rays | None
-
-    def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
-        """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
-        a, table = self.active, self.scratch.table
-        footprints_backward(
-            table, moments(table, gradient, self.scratch.moments), a.means, a.scales, a.rotations, a.densities,
-            self.camera, into.means, into.log_scales, into.rotations, into.densities, centres, length=self.length,
-        )  # fmt: skip
-        if self.rays is None:
-            return
-        some, moved = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
-        self.rays.backward(gradient, some.means, some.log_scales, some.rotations, some.densities, moved)
-        centres[self.exact] = moved
-        into.means[self.exact] += some.means
-        into.log_scales[self.exact] += some.log_scales
-        into.rotations[self.exact] += some.rotations
-        into.densities[self.exact] += some.densities
-
-
-def render_view(
-    active: Active,
-    geometry: Geometry,
-    view: int,
-    faint: float,
-    sigmas: float,
-    model: RayModel | None = None,
-    *,
-    image: F32 | None = None,
-    scratch: Scratch | None = None,
-) -> RenderedView:
-    """Render the line integrals of one view into `image` [row, col]; `faint` in the same unit.
-
-    `image` and `scratch` are overwritten (None: new ones). A view that shares `scratch` must have run `backward` before
-    the next one is rendered.
-    """
-    chosen, shape, a = model or RayModel(), geometry.detector_shape, active
-    picture = np.empty(shape, np.float32) if image is None else image
-    buffers = Scratch.of(len(a.densities), shape) if scratch is None else scratch
-    projection, length = camera(geometry, view), chosen.length(geometry)
-    footprints(
-        a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, buffers.table,
-        length=length, exact_above=chosen.exact_above,
-    )  # fmt: skip
-    render(buffers.table, picture, buffers.layers)
-    exact, rays = np.empty(0, np.intp), None
-    if geometry.is_cone and chosen.exact_above < math.inf:
-        exact = np.flatnonzero(buffers.table[:, HU] == INEXACT)
-    if exact.size:
-        some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
-        rays = Rays(*some, projection, shape, faint, sigmas)
-        rays.add_to(picture)
-    return RenderedView(picture, active, projection, length, buffers, exact, rays)
 
 
 class _Project(torch.autograd.Function):
@@ -229,13 +73,6 @@ class _Voxelize(torch.autograd.Function):
 
 def _array(tensor: Tensor) -> F32:
     return tensor.detach().contiguous().numpy()
-
-
-def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
-    """Layout of Gaussians on a grid, for filling it and its backward pass; `faint` is a density."""
-    z, y, x = (float(axis[0]) for axis in grid.coordinates())
-    parameters = (active.means, active.scales, active.rotations, active.densities)
-    return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas)
 
 
 def project(

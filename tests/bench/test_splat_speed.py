@@ -27,6 +27,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu import lanes
 from recon.kernels.cpu.activation import OPTIONS, activation_backward
 from recon.kernels.cpu.adam import adam_all
+from recon.kernels.cpu.engine import Active, Gradients, grid_layout, render_view, view_table
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
 from recon.kernels.cpu.losses import ProjectionLoss, total_variation
 from recon.kernels.cpu.project import moments, render, render_layers
@@ -34,7 +35,7 @@ from recon.splatting import optimise as fit
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, FitSettings
-from recon.splatting.splat import Active, Gradients, grid_layout, project, render_view, view_table
+from recon.splatting.splat import project
 from recon.warm_up import warm_up
 
 F32 = NDArray[np.float32]

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
+from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import Active, Gradients, Scratch, project, render_view, voxelize
+from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.kernels import reference
+from recon.kernels.cpu.engine import Active, Gradients, camera
 from recon.kernels.cpu.footprints import (
     HIDDEN,
     HU,
@@ -25,7 +26,6 @@ from recon.kernels.cpu.footprints import (
     footprints,
     footprints_backward,
 )
-from recon.splatting.splat import Active, Gradients, camera
 
 F64 = NDArray[np.float64]
 

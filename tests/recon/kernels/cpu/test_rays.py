@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.kernels import reference
+from recon.kernels.cpu.engine import Active, Gradients, camera
 from recon.kernels.cpu.rays import Rays
-from recon.splatting.splat import Active, Gradients, camera
 
 F32 = NDArray[np.float32]
 
