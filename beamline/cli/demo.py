@@ -98,7 +98,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         )
     folder = result.path.parent
     if result.recon is None:
-        raise DataError(f"The live reconstruction made no volume; {folder / RECON_LOG} says why. The scan is unhurt.")
+        raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
 
     record = read_reconstruction(folder / RECON)
     warnings: list[str] = []

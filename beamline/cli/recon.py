@@ -97,7 +97,7 @@ def recon(
     follow: bool,
     unfinished: bool,
     as_json: bool,
-    **said: Any,
+    **values: Any,
 ) -> None:
     """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
 
@@ -105,12 +105,12 @@ def recon(
     report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or iterations
     stops with the volume reached so far (exit code 4), the second discards it.
     """
-    settings = {name: said.pop(name) for name in SETTINGS}
+    settings = {name: values.pop(name) for name in SETTINGS}
     refuse_contradictions(click.get_current_context(), method, follow)
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})
-    source, selection = chosen(file, seed, said)
+    source, selection = chosen(file, seed, values)
     options = ReconOptions(
         source=source,
         target=OutputPaths(output, page),

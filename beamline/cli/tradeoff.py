@@ -66,7 +66,7 @@ def tradeoff(
     seed: int,
     output: Path | None,
     as_json: bool,
-    **said: Any,
+    **values: Any,
 ) -> None:
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
@@ -74,7 +74,7 @@ def tradeoff(
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
-    source, selection = chosen(file, seed, said)
+    source, selection = chosen(file, seed, values)
     options = TradeoffOptions(
         source=source,
         selection=selection,

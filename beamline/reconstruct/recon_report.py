@@ -1,4 +1,4 @@
-"""What the report on a reconstruction says: the scan, the settings, the figures of merit and the pictures."""
+"""The content of the report on a reconstruction: scan, settings, figures of merit, pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from recon.voxels.fbp import Filter
 
 @dataclass(frozen=True)
 class ScanFacts:
-    """What a report says of the scan itself.
+    """The facts of a scan for a report.
 
     Attributes:
         path, name: of the file.
@@ -87,8 +87,8 @@ class ReconOutcome:
         return next_decibel(judged.seconds, judged.residuals)
 
     @property
-    def next_decibel_said(self) -> str:
-        """The same in words; empty where there is nothing to say."""
+    def next_decibel_text(self) -> str:
+        """The time of the next dB as text; empty if it is not known."""
         found, judged = self.next_decibel, residual_curve(history_arrays(self.history))
         if found is None or judged is None:
             return ""
@@ -142,7 +142,7 @@ def facts_of(source: ScanSource) -> ScanFacts:
     }
     table |= {str(k): _text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n = int(source.image_key.size)
-    remarks = [f"The monitor flagged {flagged} frames while they were taken."] if flagged else []
+    remarks = [f"The monitor flagged {flagged} frames during the scan."] if flagged else []
     return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks)
 
 
@@ -167,19 +167,19 @@ def compose(
         summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
-    if made.next_decibel_said:
-        summary += f". The next dB: {made.next_decibel_said}"
+    if made.next_decibel_text:
+        summary += f". The next dB: {made.next_decibel_text}"
     settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
-        f"SNR, CNR: between the two classes that k-means makes of {'the truth' if truth else 'this volume'}'s values.",
+        f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}.",
     ]
     if _grew(made):
         footnotes.append(
-            "Time of R²-Gaussian: from the first look at the growing file to the volume, the scan included."
+            "Time of R²-Gaussian: from the first look at the growing file to the volume; it includes the scan."
         )
     if "resumed_from" in made.settings:
-        footnotes.append(f"Time of {name}: since the fit was resumed; what went before is not in it.")
+        footnotes.append(f"Time of {name}: since the fit was resumed, without the time before.")
     if truth is not None:
         footnotes.append(
             "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
@@ -208,8 +208,8 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the middle of what is bright, all in one grey window (1st to 99.5th "
-            "percentile of what is shown).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, all in one grey window (1st to "
+            "99.5th percentile of these slices).",
             figures.orthogonal_slices(shown, unit),
         )
     ]
@@ -217,17 +217,17 @@ def _pictures(
         pictures.append(
             Picture(
                 "Quality against time",
-                _told_by_history(made),
+                _history_caption(made),
                 figures.quality_against_time(history_arrays(made.history), made.psnr, made.next_decibel),
             )
         )
     pictures += [
         Picture(
             "Projection",
-            "One view after correction: the line integral of the attenuation along each ray.",
+            "One corrected view: the line integral of the attenuation along each ray.",
             figures.projection(data, geometry, 0, unit),
         ),
-        Picture("Sinogram", "The middle detector row in all views used.", figures.sinogram(data, geometry, row)),
+        Picture("Sinogram", "The middle detector row of all views used.", figures.sinogram(data, geometry, row)),
     ]
     if prepared.axis is not None:
         axis = prepared.axis
@@ -235,7 +235,7 @@ def _pictures(
             Picture(
                 "Rotation axis",
                 f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 is perfect "
-                "agreement, about 1 is none. Columns as reconstructed, after binning.",
+                "agreement, about 1 is none. Columns of the binned detector.",
                 figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
             )
         )
@@ -243,23 +243,23 @@ def _pictures(
 
 
 def _grew(made: ReconOutcome) -> bool:
-    """The views came while the volume was fitted."""
+    """The number of views grew during the fit."""
     return len({progress.n_views for progress in made.history}) > 1
 
 
-def _told_by_history(made: ReconOutcome) -> str:
+def _history_caption(made: ReconOutcome) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * _grew(made) + ["Gaussians"] * (len(gaussians) > 1)
-    parts = ["Misfit to the views it had"]
+    parts = ["Misfit to the views in use"]
     if (judged := residual_curve(history_arrays(made.history))) is not None:
         parts.append(f"the residual of {judged.views} as dB below the data")
     parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
-    parts += [f"how many {' and '.join(growing)} there were"] if growing else []
-    return f"{', '.join(parts)}, in the time since {'the file was first seen' if _grew(made) else 'it began'}."
+    parts += [f"number of {' and of '.join(growing)}"] if growing else []
+    return f"{', '.join(parts)}, against the time since {'the file was found' if _grew(made) else 'the start'}."
 
 
 def _text(value: object) -> str:
-    """A value as people read it; the file keeps it exactly."""
+    """A value as text for people; the file holds the exact value."""
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)

@@ -102,7 +102,7 @@ def write_result(
     if made.chosen:
         summary["chosen"] = made.chosen
     if (further := made.next_decibel) is not None:
-        summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_said}
+        summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_text}
     if len(metrics) > 1:
         summary[BASELINE] = metrics[BASELINE]
     sink(Event("done", clock.now(), summary))

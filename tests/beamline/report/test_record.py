@@ -72,20 +72,20 @@ def test_each_look_at_views_held_out_counts_once() -> None:
 def test_a_fit_says_what_longer_fits_gained() -> None:
     made = _made(_record(3.0), "r2")
     assert made.next_decibel == next_decibel_of_fit(30.0, 60)
-    assert "as longer fits gained on two other scans" in made.next_decibel_said
+    assert "as longer fits gained on two other scans" in made.next_decibel_text
     late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
     followed = replace(_made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace})
-    assert followed.next_decibel is None and followed.next_decibel_said == ""
-    assert _made(late, "r2").next_decibel_said == "none in reach of what was measured"
+    assert followed.next_decibel is None and followed.next_decibel_text == ""
+    assert _made(late, "r2").next_decibel_text == "none in reach of what was measured"
 
 
 def test_iterations_say_what_another_decibel_would_cost() -> None:
     made = _made(_record(3.0))
     assert made.next_decibel is not None
     assert made.next_decibel.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
-    assert made.next_decibel_said.startswith("about 11.9 s more (")
-    assert "none measurable" in _made(_record(0.0)).next_decibel_said
-    assert _made(()).next_decibel is None and _made(()).next_decibel_said == ""
+    assert made.next_decibel_text.startswith("about 11.9 s more (")
+    assert "none measurable" in _made(_record(0.0)).next_decibel_text
+    assert _made(()).next_decibel is None and _made(()).next_decibel_text == ""
 
 
 def test_while_views_still_come_nothing_is_extrapolated() -> None:
