@@ -19,6 +19,7 @@ from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest as ingest_scan
+from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.validate import validate as findings_of
 from drivers.clock import Clock, SystemClock
 
@@ -33,7 +34,7 @@ _SAY_EVERY = 0.2  # s between words on how far an ingest is
 def info(file: Path, as_json: bool, **said: Any) -> None:
     """Describe the scan in FILE: frames, angles, geometry, and problems of its format."""
     with json_events(as_json) as sinks:
-        facts = dict(describe(file, **said))
+        facts = dict(describe(SourceOptions(file, **said)))
         for sink in sinks:
             sink(Event("done", SystemClock().now(), facts))
     if as_json:
@@ -69,7 +70,7 @@ def validate(file: Path, as_json: bool, **said: Any) -> None:
     """Check the scan in FILE against the rules of its format. Exit code: 0 no error (warnings may be), 5 errors."""
     now = SystemClock().now()
     with json_events(as_json) as sinks:
-        findings = findings_of(file, **said)
+        findings = findings_of(SourceOptions(file, **said))
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for sink in sinks:
             for finding in findings:
@@ -116,14 +117,13 @@ def ingest(
     with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         refuse_existing(output)
         done = ingest_scan(
-            source,
+            SourceOptions(source, **said),
             output,
             pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
             energy_kev=energy_kev,
             sample=sample,
             no_data=no_data,
             progress=_progress(fan_out(*(json_sinks or [terminal])), clock),
-            **said,
         )
         seconds = clock.now() - began
         for sink in json_sinks:

@@ -17,7 +17,7 @@ def underscored(ctx: click.Context, param: click.Parameter, value: str | None) -
 
 
 def scan_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --quantity, --angles, --angle-rows, --darks and --flats: the keywords of storage.source.open_scan."""
+    """Adds --quantity, --angles, --angle-rows, --darks and --flats: the fields of SourceOptions."""
     for option in reversed(_OPTIONS):
         command = option(command)
     return command

@@ -13,7 +13,7 @@ import click
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.projections.selection import Selection
-from beamline.reconstruct.options import SourceOptions
+from beamline.storage.readers.open import SourceOptions
 from recon.prep.correct import CorrectionSettings
 
 

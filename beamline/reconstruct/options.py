@@ -3,42 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.result import OutputPaths
-from beamline.storage.readers.open import Quantity, ScanSource, open_scan
+from beamline.storage.readers.open import SourceOptions
 from recon.assess.time_model import Quality
 from recon.base.method import Method
 from recon.methods import names, streams
 from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingMethod
 from recon.voxels.fbp import Filter
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """Which scan, and what to take instead of what its file says (see storage.source.open_scan)."""
-
-    path: Path
-    quantity: Quantity | None = None
-    angles: Path | None = None
-    angle_rows: str | None = None
-    darks: Path | None = None
-    flats: Path | None = None
-
-    def open(self, *, follow: bool = False) -> ScanSource:
-        return open_scan(
-            self.path,
-            angles=self.angles,
-            angle_rows=self.angle_rows,
-            darks=self.darks,
-            flats=self.flats,
-            quantity=self.quantity,
-            follow=follow,
-        )
 
 
 @dataclass(frozen=True)

@@ -8,24 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from beamline.storage.readers.angle_table import Angles
-from beamline.storage.readers.base import Quantity, ScanSource
-from beamline.storage.readers.open import Images, open_scan
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import source_findings
 from drivers.frame import FrameKind
 
 
-def describe(
-    path: Path | str,
-    *,
-    angles: Angles | None = None,
-    angle_rows: str | None = None,
-    darks: Images | None = None,
-    flats: Images | None = None,
-    quantity: Quantity | None = None,
-) -> Mapping[str, Any]:
-    """Describe the scan in a file; the keywords are open_scan's. DataError where it cannot be opened."""
-    with open_scan(path, angles=angles, angle_rows=angle_rows, darks=darks, flats=flats, quantity=quantity) as source:
+def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
+    """Describe a scan. DataError where it cannot be opened."""
+    with open_scan(scan) as source:
         return describe_source(source)
 
 

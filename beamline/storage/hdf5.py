@@ -62,6 +62,22 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     )
 
 
+def is_hdf5(path: Path, follow: bool = False) -> bool:
+    """Whether to open the path as HDF5: by its signature, at the start or after a user block.
+
+    h5py.is_hdf5 says no to a file that is being written. A path that does not exist, or that is followed, counts as
+    HDF5: `open_hdf5` says what is wrong with it, or that it is not ready.
+    """
+    if follow or not path.is_file():
+        return True
+    with path.open("rb") as file:
+        for offset in (0, 512, 1024, 2048):
+            file.seek(offset)
+            if file.read(8) == b"\x89HDF\r\n\x1a\n":
+                return True
+    return False
+
+
 def reason(error: Exception) -> str:
     """Why the disk or the system did not do it, in its own words; HDF5 wraps them in addresses and offsets."""
     said = re.search(r"error message = '([^']*)'", str(error))

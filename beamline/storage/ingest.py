@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, ScanStopped
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
-from beamline.storage.readers.angle_table import Angles
-from beamline.storage.readers.base import Quantity, ScanSource
-from beamline.storage.readers.open import Images, open_scan
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from drivers.frame import FrameKind
@@ -39,14 +38,9 @@ class Ingested:
 
 
 def ingest(
-    tif: Path | str,
+    scan: SourceOptions | Path | str,
     out: Path | str,
     *,
-    angles: Angles | None = None,
-    angle_rows: str | None = None,
-    darks: Images | None = None,
-    flats: Images | None = None,
-    quantity: Quantity | None = None,
     pixel_size_mm: float | None = None,
     energy_kev: float | None = None,
     sample: str | None = None,
@@ -57,8 +51,7 @@ def ingest(
     """Copy a scan into the new file `out`, one frame in memory at a time.
 
     Args:
-        tif: whatever open_scan reads: a multi-page TIFF, a folder or .zip of TIFFs, or another HDF5 scan.
-        angles, angle_rows, darks, flats, quantity: as for open_scan.
+        scan: of any format that open_scan reads.
         pixel_size_mm, energy_kev, sample: for the record, where the input does not say.
         no_data: a value that marks pixels without a measurement; they count as invalid in the statistics.
         progress: called with (frames written, frames in all) after each.
@@ -72,16 +65,16 @@ def ingest(
     if out.exists():
         raise DataError(f"{out} exists. Nothing is ever overwritten: name a new file.")
     part = out.with_name(out.name + ".part")
-    with open_scan(tif, angles=angles, angle_rows=angle_rows, darks=darks, flats=flats, quantity=quantity) as source:
+    with open_scan(scan) as source:
         views = source.image_key == FrameKind.PROJECTION
         if not np.isfinite(source.angles[views]).all():
             raise DataError(
-                f"{tif} does not say the angles of its {views.sum()} projections: give --angles FILE "
+                f"{source.path} does not say the angles of its {views.sum()} projections: give --angles FILE "
                 "(degrees, one a line). Nothing was written."
             )
         info = layout.ScanInfo(
-            sample=sample or str(source.attributes.get("sample", Path(tif).stem)),
-            title=f"ingested from {Path(tif).name}",
+            sample=sample or str(source.attributes.get("sample", source.path.stem)),
+            title=f"ingested from {source.path.name}",
             pixel_size_mm=pixel_size_mm or source.pixel_size_mm,
             energy_kev=energy_kev or source.energy_kev,
             axis_col=source.axis_col,

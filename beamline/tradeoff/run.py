@@ -18,8 +18,8 @@ from beamline.core.machine import machine
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
-from beamline.reconstruct.options import SourceOptions
 from beamline.reconstruct.recon_report import facts_of
+from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.report import write_figures, write_table

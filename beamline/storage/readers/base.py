@@ -1,8 +1,10 @@
-"""ScanSource: one view of a scan, whatever the file."""
+"""ScanSource: one view of a scan, whatever the file. ScanReader and Format: what a file format adds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
@@ -108,27 +110,108 @@ def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
     return rows - np.maximum.accumulate(starts)
 
 
-def bare_frames(source: ScanSource) -> Iterator[Frame]:
-    """Frames of a source that knows no more than ScanSource tells: no framestamps and no times."""
-    require_counts(source)
-    keys, angles, exposures = source.image_key, source.angles, source.exposures
-    triggers = count_in_blocks(keys)
-    for i, key in enumerate(keys):
-        yield Frame(
-            counts=source.read([i])[0],
-            kind=FrameKind(int(key)),
-            index=i,
-            trigger=int(triggers[i]),
-            framestamp=-1,
-            angle=float(angles[i]),
-            time=np.nan,
-            exposure=float(exposures[i]),
-        )
+class ScanReader(ABC):
+    """Base class of the readers: a format adds what it knows and `read`; the rest is here once.
+
+    A subclass sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and `facts` (its attributes) where it
+    opens the file, and whatever of the other fields its format states; see ScanSource for their meaning.
+    """
+
+    path: Path
+    format: str
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+    image_key: NDArray[np.int32]
+    angles: NDArray[np.float64]
+    exposures: NDArray[np.float64]
+    facts: Attributes
+    quantity: Quantity = "unknown"
+    pixel_size_mm: float | None = None
+    energy_kev: float | None = None
+    axis_col: float | None = None
+    cone: tuple[float, float] | None = None
+
+    @property
+    def finished(self) -> bool:
+        return True
+
+    @property
+    def attributes(self) -> Attributes:
+        return self.facts
+
+    @abstractmethod
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the file."""
+
+    def refresh(self) -> int:
+        """Number of frames that can be read; a format that grows looks again."""
+        return int(self.image_key.size)
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames one after the other. A format without framestamps and times yields -1 and NaN for them.
+
+        Raises:
+            DataError: the pixels are not the uint16 that a Frame holds.
+        """
+        self.require_counts()
+        keys, angles, exposures = self.image_key, self.angles, self.exposures
+        triggers = count_in_blocks(keys)
+        for i, key in enumerate(keys):
+            yield Frame(
+                counts=self.read([i])[0],
+                kind=FrameKind(int(key)),
+                index=i,
+                trigger=int(triggers[i]),
+                framestamp=-1,
+                angle=float(angles[i]),
+                time=np.nan,
+                exposure=float(exposures[i]),
+            )
+
+    def require_counts(self) -> None:
+        """DataError where the pixels are not the uint16 that a Frame holds."""
+        if self.dtype != np.uint16:
+            raise DataError(
+                f"{self.path} holds {self.dtype} pixels; a camera's frames are uint16. Read them as arrays instead."
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
 
-def require_counts(source: ScanSource) -> None:
-    """DataError where the pixels are not the uint16 that a Frame holds."""
-    if source.dtype != np.uint16:
-        raise DataError(
-            f"{source.path} holds {source.dtype} pixels; a camera's frames are uint16. Read them as arrays instead."
-        )
+@dataclass(frozen=True)
+class Opening:
+    """How a scan is opened.
+
+    Attributes:
+        follow: the file may still be growing.
+        own_angles: the file's angles are wanted; False: the caller brings them, so the file may lack them.
+    """
+
+    follow: bool = False
+    own_angles: bool = True
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format in the registry `storage.readers.open.FORMATS`.
+
+    Attributes:
+        name: for messages.
+        recognises: whether a path holds this format. It is asked in the registry's order, and it may raise DataError
+            (NotReadyError while following) for a file of its kind that cannot be read.
+        open: the reader of a path that is recognised.
+    """
+
+    name: str
+    recognises: Callable[[Path, Opening], bool]
+    open: Callable[[Path, Opening], ScanReader]

@@ -6,19 +6,17 @@ numbered darks first, then flats, then projections.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.storage.readers.base import WHOLE, Quantity, bare_frames, frame_indices
-from drivers.frame import Frame, FrameKind
+from beamline.storage.readers.base import WHOLE, Format, Opening, ScanReader, frame_indices
+from drivers.frame import FrameKind
 
 PARTS = (
     (FrameKind.DARK, "exchange/data_dark"),
@@ -27,21 +25,13 @@ PARTS = (
 )
 
 
-def is_data_exchange(file: h5py.File) -> bool:
-    return hdf5.dataset(file, "exchange/data") is not None
-
-
-class DataExchangeSource:
+class DataExchangeSource(ScanReader):
     """A Data Exchange scan; see ScanSource. `finished` is always True: the format has no way to grow.
 
     Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
     """
 
     format = "data_exchange"
-    finished = True
-    energy_kev: float | None = None
-    axis_col: float | None = None
-    cone: tuple[float, float] | None = None
 
     def __init__(self, path: Path, *, own_angles: bool = True) -> None:
         """Open. `own_angles` False: the caller brings the angles, so theta may be absent."""
@@ -54,16 +44,16 @@ class DataExchangeSource:
             sizes = [len(item) for _, item in self._parts]
             self._starts = np.cumsum([0, *sizes])
             n_views = sizes[-1]
-            self.shape: tuple[int, int] = tuple(self._parts[-1][1].shape[1:])
-            self.dtype: np.dtype[Any] = np.result_type(*(item.dtype for _, item in self._parts))
+            self.shape = tuple(self._parts[-1][1].shape[1:])
+            self.dtype = np.result_type(*(item.dtype for _, item in self._parts))
             self.image_key = np.repeat([kind for kind, _ in self._parts], sizes).astype(np.int32)
             self.angles = np.full(self.image_key.size, np.nan)
             self.exposures = np.full(self.image_key.size, np.nan)
             if own_angles:
                 self.angles[-n_views:] = self._theta(n_views)
             kinds = {kind for kind, _ in self._parts}
-            self.quantity: Quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
-            self.attributes = self._attributes()
+            self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
+            self.facts = self._attributes()
             pixel = self._file.attrs.get("pixel_size_mm")
             self.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
         except BaseException:
@@ -118,18 +108,19 @@ class DataExchangeSource:
                 out[wanted] = part
         return out
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames one after the other; time, exposure and framestamp are not in the file."""
-        return bare_frames(self)
-
-    def refresh(self) -> int:
-        return int(self.image_key.size)
-
     def close(self) -> None:
         self._file.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not hdf5.is_hdf5(path, opening.follow):
+        return False
+    with hdf5.open_hdf5(path, opening.follow) as file:
+        return hdf5.dataset(file, "exchange/data") is not None
+
+
+FORMAT = Format(
+    "/exchange/data (Data Exchange)",
+    _recognises,
+    lambda path, opening: DataExchangeSource(path, own_angles=opening.own_angles),
+)

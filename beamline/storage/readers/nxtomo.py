@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,13 +17,13 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, flagged_by, read_legend
 from beamline.storage.hdf5 import require_real
-from beamline.storage.readers.base import WHOLE, Quantity, count_in_blocks, frame_indices, require_counts
+from beamline.storage.readers.base import WHOLE, Format, Opening, Quantity, ScanReader, count_in_blocks, frame_indices
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
 from drivers.frame import Frame, FrameKind
 
 
-class NXtomoSource:
+class NXtomoSource(ScanReader):
     """A scan in NXtomo's structure; see ScanSource."""
 
     def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
@@ -36,7 +36,7 @@ class NXtomoSource:
             self._check()
             shape = places.data.shape
             self.shape = (int(shape[1]), int(shape[2]))
-            self.dtype: np.dtype[Any] = places.data.dtype
+            self.dtype = places.data.dtype
             definition = hdf5.text(_value(places.entry, "definition")) or hdf5.attribute(places.entry, "definition")
             self.format = _format(definition, hdf5.text(_value(places.entry, "program_name")))
             said = hdf5.text(_value(self._file, "/entry/record/quantity"))
@@ -149,7 +149,7 @@ class NXtomoSource:
 
     def frames(self) -> Iterator[Frame]:
         """The frames one after the other, with all that the file knows about each."""
-        require_counts(self)
+        self.require_counts()
         time = self._seconds(self._places.entry, "frame_log/time")
         trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
         framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
@@ -187,12 +187,6 @@ class NXtomoSource:
 
     def close(self) -> None:
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 BEAMS = ("instrument/beam", "beam", "sample/beam")
@@ -233,3 +227,17 @@ def _quantity(said: str, dtype: np.dtype[Any]) -> Quantity:
     return (
         "counts" if said == "counts" or (not said and dtype.kind in "iu") else "unknown"
     )  # NXtomo: data are integers, as detected
+
+
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not hdf5.is_hdf5(path, opening.follow):
+        return False
+    with hdf5.open_hdf5(path, opening.follow) as file:
+        return bool(find(file))
+
+
+FORMAT = Format(
+    "an NXdetector with frames and an image_key (NXtomo)",
+    _recognises,
+    lambda path, opening: NXtomoSource(path, follow=opening.follow, own_angles=opening.own_angles),
+)

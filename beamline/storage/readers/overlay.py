@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.angle_table import assign
-from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, bare_frames, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanReader, ScanSource, frame_indices
 from drivers.frame import Frame, FrameKind
 
 
-class Overlay:
+class Overlay(ScanReader):
     """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
 
     Where darks (flats) are given, those of `base` become INVALID: they stay, and nobody uses them.
@@ -50,66 +49,31 @@ class Overlay:
                     f"{base.shape} as in {base.path}."
                 )
         # One dtype, as of one camera: references are measured like the frames, and averages of them are floats.
-        self.dtype: np.dtype[Any] = np.result_type(base.dtype, *(images.dtype for _, images in given))
+        self.dtype = np.result_type(base.dtype, *(images.dtype for _, images in given))
         blocks = [images.astype(self.dtype) for _, images in given]
         self._front = np.concatenate(blocks) if blocks else np.empty((0, *base.shape), self.dtype)
         self._front_key = np.repeat([int(kind) for kind, _ in given], [len(images) for _, images in given])
         self._angles = None if angles is None else assign(base.image_key, angles, angles_from)
         self._quantity = quantity
+        self.path, self.format, self.shape = base.path, base.format, base.shape
+        self.pixel_size_mm, self.energy_kev = base.pixel_size_mm, base.energy_kev
+        self.cone, self.axis_col = base.cone, base.axis_col
+        self._update()
 
-    @property
-    def path(self) -> Path:
-        return self._base.path
-
-    @property
-    def format(self) -> str:
-        return self._base.format
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self._base.shape
-
-    @property
-    def quantity(self) -> Quantity:
-        if self._quantity is not None:
-            return self._quantity
-        has_both = {FrameKind.DARK, FrameKind.FLAT} <= set(self.image_key.tolist())
-        return "counts" if has_both and self._base.quantity == "unknown" else self._base.quantity
-
-    @property
-    def image_key(self) -> NDArray[np.int32]:
-        keys = self._base.image_key.copy()
+    def _update(self) -> None:
+        """Take over what `base` knows now; references that are laid over come without angles and exposures."""
+        base = self._base
+        unknown = np.full(len(self._front), np.nan)
+        keys = base.image_key.copy()
         for kind, images in self._replaced.items():
             if images is not None:
                 keys[keys == kind] = FrameKind.INVALID
-        return np.concatenate([self._front_key, keys]).astype(np.int32)
-
-    @property
-    def angles(self) -> NDArray[np.float64]:
-        return np.concatenate(
-            [np.full(len(self._front), np.nan), self._base.angles if self._angles is None else self._angles]
-        )
-
-    @property
-    def exposures(self) -> NDArray[np.float64]:
-        """References that are laid over come without an exposure."""
-        return np.concatenate([np.full(len(self._front), np.nan), self._base.exposures])
-
-    @property
-    def pixel_size_mm(self) -> float | None:
-        return self._base.pixel_size_mm
-
-    @property
-    def energy_kev(self) -> float | None:
-        return self._base.energy_kev
-
-    @property
-    def cone(self) -> tuple[float, float] | None:
-        return self._base.cone
-
-    @property
-    def axis_col(self) -> float | None:
-        return self._base.axis_col
+        self.image_key = np.concatenate([self._front_key, keys]).astype(np.int32)
+        self.angles = np.concatenate([unknown, base.angles if self._angles is None else self._angles])
+        self.exposures = np.concatenate([unknown, base.exposures])
+        has_both = {FrameKind.DARK, FrameKind.FLAT} <= set(self.image_key.tolist())
+        stated: Quantity = "counts" if has_both and base.quantity == "unknown" else base.quantity
+        self.quantity = self._quantity or stated
 
     @property
     def attributes(self) -> Attributes:
@@ -135,18 +99,14 @@ class Overlay:
     def frames(self) -> Iterator[Frame]:
         """The frames one after the other; those of `base` keep what their file knows about them."""
         if len(self._front) or self.dtype != np.uint16:
-            return bare_frames(self)
+            return super().frames()
         angles = self.angles
         return (replace(frame, angle=float(angles[frame.index])) for frame in self._base.frames())
 
     def refresh(self) -> int:
-        return len(self._front) + self._base.refresh()
+        n = len(self._front) + self._base.refresh()
+        self._update()
+        return n
 
     def close(self) -> None:
         self._base.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

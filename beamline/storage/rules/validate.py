@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.angle_table import Angles
-from beamline.storage.readers.base import Quantity, ScanSource
-from beamline.storage.readers.open import Images, open_scan
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.nexus import nexus_findings
 from drivers.frame import FrameKind
@@ -28,25 +27,14 @@ EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 BEAM_SIGMA = 3.0  # a flat must stand this far above the dark, in noise of one dark pixel
 
 
-def validate(
-    path: Path | str,
-    *,
-    angles: Angles | None = None,
-    angle_rows: str | None = None,
-    darks: Images | None = None,
-    flats: Images | None = None,
-    quantity: Quantity | None = None,
-) -> list[Finding]:
+def validate(scan: SourceOptions | Path | str) -> list[Finding]:
     """Everything that the rules find in a file, worst first; [] for a scan without fault.
 
-    The keywords are open_scan's. Never raises for what is wrong with the file: what cannot be opened is a finding.
+    Never raises for what is wrong with the file: what cannot be opened is a finding.
     """
-    path = Path(path)
-    findings = _as_hdf5(path)
+    findings = _as_hdf5(Path(scan.path if isinstance(scan, SourceOptions) else scan))
     try:
-        with open_scan(
-            path, angles=angles, angle_rows=angle_rows, darks=darks, flats=flats, quantity=quantity
-        ) as source:
+        with open_scan(scan) as source:
             findings += source_findings(source)
     except DataError as error:
         if not any(finding.severity == "error" for finding in findings):  # else it is already said why

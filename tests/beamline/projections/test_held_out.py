@@ -11,7 +11,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections.held_out import keep_back, with_held_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.options import SourceOptions
+from beamline.storage.readers.open import SourceOptions
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 ANGLES = np.radians(np.arange(0, 180, 6.0))

@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.projections import prepare as pipeline
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from recon.prep.align import AxisError, AxisEstimate
 from recon.prep.correct import CorrectionSettings
@@ -26,7 +26,7 @@ PLAIN = CorrectionSettings(air="none")
 
 def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[PreparedProjections, list[str]]:
     warnings: list[str] = []
-    with open_scan(path, **said) as source:
+    with open_scan(SourceOptions(path, **said)) as source:
         return prepare_projections(source, selection, warnings.append), warnings
 
 

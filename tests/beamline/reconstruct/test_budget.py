@@ -16,8 +16,9 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
 from beamline.reconstruct.budget import Budgeted, joined, within
 from beamline.reconstruct.finished import reconstruct_file
-from beamline.reconstruct.options import ReconOptions, SourceOptions
+from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
+from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.assess.metrics import psnr

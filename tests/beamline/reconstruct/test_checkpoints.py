@@ -14,7 +14,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions, differences, fit_origin
-from beamline.reconstruct.options import SourceOptions
+from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import Checkpoint, write_checkpoint
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of

@@ -21,8 +21,9 @@ from beamline.reconstruct import finished as offline
 from beamline.reconstruct import result as deliver
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.finished import reconstruct_file
-from beamline.reconstruct.options import ReconOptions, SourceOptions
+from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
+from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import read_checkpoint
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction

@@ -20,10 +20,10 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct import growing as module
 from beamline.reconstruct.follow import FollowTiming, follow
-from beamline.reconstruct.options import ReconOptions, SourceOptions
+from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.reconstruct.result import OutputPaths
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.frame import Frame, FrameKind

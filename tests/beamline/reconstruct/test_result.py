@@ -13,10 +13,10 @@ import recon
 from beamline.core.events import Event
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.options import SourceOptions
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.result import OutputPaths, write_result
 from beamline.report import figures
+from beamline.storage.readers.open import SourceOptions
 from drivers.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid

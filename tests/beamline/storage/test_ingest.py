@@ -14,7 +14,7 @@ import tifffile
 from beamline.core.errors import DataError, ScanStopped
 from beamline.monitor.digest import digest
 from beamline.storage.ingest import ingest
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from drivers.frame import Frame, FrameKind
@@ -41,10 +41,8 @@ def test_a_float_stack_keeps_its_pixels_and_gets_statistics(stack: tuple[Path, n
     tif, pages = stack
     seen: list[tuple[int, int]] = []
     done = ingest(
-        tif,
+        SourceOptions(tif, angles=ANGLES, quantity="line_integrals"),
         tmp_path / "out.h5",
-        angles=ANGLES,
-        quantity="line_integrals",
         pixel_size_mm=0.01,
         no_data=-999,
         progress=lambda i, n: seen.append((i, n)),
@@ -72,11 +70,8 @@ def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.
     tifffile.imwrite(tmp_path / "raw.tif", pages, photometric="minisblack")
     flats, darks = np.full((2, *SHAPE), 1000, np.uint16), np.full((1, *SHAPE), 100, np.uint16)
     done = ingest(
-        tmp_path / "raw.tif",
+        SourceOptions(tmp_path / "raw.tif", angles=ANGLES, flats=flats, darks=darks),
         tmp_path / "out.h5",
-        angles=ANGLES,
-        flats=flats,
-        darks=darks,
         pixel_size_mm=0.01,
         sample="rock",
     )
@@ -105,7 +100,7 @@ def left(folder: Path) -> set[str]:
 def test_stopping_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     count = iter(range(100))
     with pytest.raises(ScanStopped, match="after 4 of 9 frames"):
-        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES, should_stop=lambda: next(count) >= 4)
+        ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5", should_stop=lambda: next(count) >= 4)
     assert left(tmp_path) == {"lab.tif"}
 
 
@@ -115,7 +110,7 @@ def test_a_failure_halfway_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_pa
             raise OSError(28, "No space left on device")
 
     with pytest.raises(DataError, match="No space left"):
-        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES, progress=fail)
+        ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5", progress=fail)
     assert left(tmp_path) == {"lab.tif"}
 
 
@@ -130,7 +125,7 @@ def test_a_full_disk_is_one_sentence_however_hdf5_tells_of_it(
     monkeypatch.setattr(h5py.File, "close", no_room)
     monkeypatch.setattr(layout.Rows, "write", no_room)
     with pytest.raises(DataError) as error:
-        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES)
+        ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5")
     out = tmp_path / "out.h5"
     assert str(error.value) == f"{out} could not be written (No space left on device). Nothing is left of it."
     assert left(tmp_path) == {"lab.tif"}
@@ -140,18 +135,18 @@ def test_a_cut_input_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_path: Pa
     tif = stack[0]
     tif.write_bytes(tif.read_bytes()[: tif.stat().st_size // 2])
     with pytest.raises(DataError):
-        ingest(tif, tmp_path / "out.h5", angles=ANGLES)
+        ingest(SourceOptions(tif, angles=ANGLES), tmp_path / "out.h5")
     assert left(tmp_path) == {"lab.tif"}
 
 
 def test_nothing_is_overwritten(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     (tmp_path / "out.h5").write_text("precious")
     with pytest.raises(DataError, match="exists"):
-        ingest(stack[0], tmp_path / "out.h5", angles=ANGLES)
+        ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5")
     assert (tmp_path / "out.h5").read_text() == "precious"
     (tmp_path / "new.h5.part").write_text("someone's")
     with pytest.raises(DataError, match="another ingest"):
-        ingest(stack[0], tmp_path / "new.h5", angles=ANGLES)
+        ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "new.h5")
     assert (tmp_path / "new.h5.part").read_text() == "someone's"
 
 
@@ -163,7 +158,7 @@ def test_projections_need_angles(
     stack: tuple[Path, np.ndarray], tmp_path: Path, angles: np.ndarray | None, said: str
 ) -> None:
     with pytest.raises(DataError, match=said):
-        ingest(stack[0], tmp_path / "out.h5", angles=angles)
+        ingest(SourceOptions(stack[0], angles=angles), tmp_path / "out.h5")
     assert left(tmp_path) == {"lab.tif"}
 
 
@@ -175,7 +170,7 @@ def test_memory_does_not_grow_with_the_stack(tmp_path: Path, rng: np.random.Gene
             for _ in range(n):
                 tif.write(page, contiguous=True, photometric="minisblack")
         tracemalloc.start()
-        ingest(tmp_path / f"{n}.tif", tmp_path / f"{n}.h5", angles=np.linspace(0, 3, n))
+        ingest(SourceOptions(tmp_path / f"{n}.tif", angles=np.linspace(0, 3, n)), tmp_path / f"{n}.h5")
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < peaks[0] + page.nbytes  # 64 pages are 16.8 MB
@@ -187,7 +182,7 @@ def test_kinds_and_order_come_through(tmp_path: Path) -> None:
     (tmp_path / "scan").mkdir()
     for name, value in (("dark_1", 10), ("flat_1", 900), ("raw_2", 502), ("raw_10", 510)):
         tifffile.imwrite(tmp_path / "scan" / f"{name}.tif", np.full(SHAPE, value, np.uint16))
-    ingest(tmp_path / "scan", tmp_path / "out.h5", angles=[0.0, 1.0])
+    ingest(SourceOptions(tmp_path / "scan", angles=[0.0, 1.0]), tmp_path / "out.h5")
     with open_scan(tmp_path / "out.h5") as source:
         assert source.read(slice(None))[:, 0, 0].tolist() == [10, 900, 502, 510]
         assert source.image_key.tolist() == [FrameKind.DARK, FrameKind.FLAT, 0, 0]

@@ -17,7 +17,7 @@ import pytest
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.projections.selection import Selection
-from beamline.reconstruct.options import SourceOptions
+from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff import run as tradeoff
 from beamline.tradeoff.report import text
 from beamline.tradeoff.run import TradeoffOptions, run_tradeoff

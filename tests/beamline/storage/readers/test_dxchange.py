@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.frame import Frame, FrameKind
 
 Parts = dict[str, np.ndarray]
@@ -76,7 +76,7 @@ def test_without_references_the_quantity_is_unknown_until_it_is_said(
     path = store(tmp_path / "s.h5", {name: values for name, values in parts.items() if name not in missing})
     with open_scan(path) as source:
         assert source.quantity == "unknown"
-    with open_scan(path, quantity="line_integrals") as source:
+    with open_scan(SourceOptions(path, quantity="line_integrals")) as source:
         assert source.quantity == "line_integrals"
 
 

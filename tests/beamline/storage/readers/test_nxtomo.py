@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
-from beamline.storage.readers.open import NotReadyError, open_scan
+from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import INFO, StandingClock
@@ -77,7 +77,7 @@ def test_each_frame_has_its_own_exposure(tmp_path: Path, write: Write, frames: l
     own = [replace(frame, exposure=0.01 * (frame.index + 1)) for frame in frames]
     with open_scan(write(own)) as source:
         np.testing.assert_allclose(source.exposures, 0.01 * np.arange(1, 15))
-    with open_scan(tmp_path / "scan.h5", flats=np.ones((2, 12, 16), np.uint16)) as source:
+    with open_scan(SourceOptions(tmp_path / "scan.h5", flats=np.ones((2, 12, 16), np.uint16))) as source:
         np.testing.assert_allclose(source.exposures, [np.nan] * 2 + [frame.exposure for frame in own])
     with open_scan(foreign(tmp_path / "ms.nxs")) as source:
         np.testing.assert_allclose(source.exposures, np.full(6, 0.02))
@@ -147,7 +147,7 @@ def test_angles_without_a_unit_are_refused_unless_the_caller_brings_angles(
     path = foreign(tmp_path / "f.nxs", units=units)
     with pytest.raises(DataError, match=said):
         open_scan(path)
-    with open_scan(path, angles=[0.0, 1.0, 2.0]) as source:
+    with open_scan(SourceOptions(path, angles=[0.0, 1.0, 2.0])) as source:
         np.testing.assert_array_equal(source.angles, [np.nan, np.nan, 0, 1, 2, np.nan])
 
 
@@ -227,7 +227,7 @@ def test_diamond_nexus_with_external_links(shared_data: Path) -> None:
         with h5py.File(shared_data / "fixtures" / "k11-18014" / "k11-18014-imaging.h5") as pixels:
             np.testing.assert_array_equal(source.read([0, 3200]), pixels["entry/detector/detector"][[0, 3200]])
     angles = np.linspace(0, np.pi, 3001)
-    with open_scan(shared_data / "fixtures" / "diad_k11-18014.nxs", angles=angles) as source:
+    with open_scan(SourceOptions(shared_data / "fixtures" / "diad_k11-18014.nxs", angles=angles)) as source:
         np.testing.assert_array_equal(source.angles[source.image_key == 0], angles)
 
 

@@ -10,8 +10,9 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.tiff import kind_of, load_images, natural
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.tiff import load_images, natural
+from beamline.storage.readers.tiff_series import kind_of
 from drivers.frame import FrameKind
 
 SHAPE = (6, 8)
@@ -87,9 +88,9 @@ def test_angles_that_do_not_fit_are_refused_with_the_rows_that_would(series: tup
     np.savetxt(folder / "angles.txt", table)
     with pytest.raises(DataError, match=r"19 angles, but there are 12 projections among 15 frames.*--angle-rows 4:16 "):
         open_scan(folder)
-    with open_scan(folder, angle_rows="4:16") as source:
+    with open_scan(SourceOptions(folder, angle_rows="4:16")) as source:
         np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12)))
-    with open_scan(folder, angles=folder / "angles.txt", angle_rows="4:16") as source:
+    with open_scan(SourceOptions(folder, angles=folder / "angles.txt", angle_rows="4:16")) as source:
         np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12)))
 
 
@@ -98,7 +99,7 @@ def test_explicit_angles_and_references_win(series: tuple[Path, np.ndarray], tmp
     flats = np.full((3, *SHAPE), 50000, np.uint16)
     tifffile.imwrite(tmp_path / "dark_stack.tif", np.full((2, *SHAPE), 9, np.uint16), photometric="minisblack")
     angles = np.arange(12) * 0.1
-    with open_scan(folder, angles=angles, flats=flats, darks=tmp_path / "dark_stack.tif") as source:
+    with open_scan(SourceOptions(folder, angles=angles, flats=flats, darks=tmp_path / "dark_stack.tif")) as source:
         assert source.image_key.tolist() == [2, 2, 1, 1, 1, 3, 3, 3, *[0] * 12]
         np.testing.assert_array_equal(source.angles[8:], angles)
         assert source.read([0, 4])[:, 0, 0].tolist() == [9, 50000]
@@ -107,7 +108,7 @@ def test_explicit_angles_and_references_win(series: tuple[Path, np.ndarray], tmp
 
 def test_references_of_another_shape_are_refused(series: tuple[Path, np.ndarray]) -> None:
     with pytest.raises(DataError, match=r"--flats are \(2, 3, 3\).*\(6, 8\)"):
-        open_scan(series[0], flats=np.zeros((2, 3, 3)))
+        open_scan(SourceOptions(series[0], flats=np.zeros((2, 3, 3))))
 
 
 def test_several_series_are_refused(series: tuple[Path, np.ndarray]) -> None:
@@ -120,7 +121,7 @@ def test_several_series_are_refused(series: tuple[Path, np.ndarray]) -> None:
 def test_a_gap_in_the_numbers_is_told(series: tuple[Path, np.ndarray]) -> None:
     folder, _ = series
     (folder / "tiffs" / "raw_5.tiff").unlink()
-    with open_scan(folder, angle_rows="0:11") as source:
+    with open_scan(SourceOptions(folder, angle_rows="0:11")) as source:
         assert source.attributes["missing_numbers"] == "5"
 
 
@@ -163,7 +164,7 @@ def test_empty_and_broken_places_are_refused(tmp_path: Path) -> None:
 def test_a_stack_is_read_page_by_page(tmp_path: Path, rng: np.random.Generator, how: dict[str, object]) -> None:
     stack = rng.normal(size=(7, *SHAPE)).astype(np.float32)
     tifffile.imwrite(tmp_path / "s.tif", stack, photometric="minisblack", **how)
-    with open_scan(tmp_path / "s.tif", angles=np.arange(7.0)) as source:
+    with open_scan(SourceOptions(tmp_path / "s.tif", angles=np.arange(7.0))) as source:
         assert (source.format, source.shape, source.dtype, source.quantity) == (
             "tiff_stack",
             SHAPE,
@@ -224,7 +225,7 @@ def test_the_real_series_is_the_real_hdf5_scan(shared_data: Path) -> None:
     with pytest.raises(DataError, match=r"111 angles, but there are 91 projections.*--angle-rows 10:101 "):
         open_scan(path)
     with (
-        open_scan(path, angle_rows="10:101") as tiffs,
+        open_scan(SourceOptions(path, angle_rows="10:101")) as tiffs,
         open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as exchange,
     ):
         np.testing.assert_allclose(tiffs.angles, exchange.angles, atol=1e-9)
@@ -239,7 +240,7 @@ def test_complex_pixels_are_refused(tmp_path: Path, series: tuple[Path, np.ndarr
         open_scan(tmp_path / "waves.tif")
     for flats in (tmp_path / "waves.tif", waves):
         with pytest.raises(DataError, match="holds complex numbers"):
-            open_scan(series[0], flats=flats)
+            open_scan(SourceOptions(series[0], flats=flats))
     tifffile.imwrite(series[0] / "dark_0.tif", waves[0], photometric="minisblack")
     with pytest.raises(DataError, match=r"dark_0\.tif in .* holds complex numbers"):
         open_scan(series[0])

@@ -13,7 +13,7 @@ import pytest
 
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import reconstruction_blockers, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
@@ -25,7 +25,7 @@ ANGLE = "entry/sample/rotation_angle"
 
 
 def found(path: Path, **how: object) -> set[tuple[str, str]]:
-    return {(finding.severity, finding.rule) for finding in validate(path, **how)}  # type: ignore[arg-type]
+    return {(finding.severity, finding.rule) for finding in validate(SourceOptions(path, **how))}  # type: ignore[arg-type]
 
 
 def test_a_good_scan_has_no_finding(write: Write, frames: list[Frame]) -> None:
@@ -321,6 +321,6 @@ def test_real_scans_can_be_reconstructed(shared_data: Path) -> None:
         ("aps2bm_tooth_181x2x640.h5", {}),
         ("walnut_parallel_rebinned_240x96x256.h5", {"quantity": "line_integrals"}),
     ):
-        with open_scan(shared_data / name, **how) as source:  # type: ignore[arg-type]
+        with open_scan(SourceOptions(shared_data / name, **how)) as source:  # type: ignore[arg-type]
             assert reconstruction_blockers(source) == [], name
             assert int((source.image_key == FrameKind.PROJECTION).sum()) >= 91

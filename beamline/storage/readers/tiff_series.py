@@ -1,0 +1,140 @@
+"""TIFF series: a folder (or .zip) with one image a file.
+
+Files tell what they are by name: `dark`, `flat`, `white` or `open_beam` at the start of a word of the name or of a
+folder above it; the others must be one series. They are put in the order of the numbers in their names, never of a
+listing. Files are read one at a time, so that memory does not grow with the scan.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.hdf5 import require_real
+from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, natural, read_image
+from drivers.frame import FrameKind
+
+REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
+ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+
+
+class TiffSeries(ScanReader):
+    """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series.
+
+    Attribute `angle_text`: (name, content) of the one file that is named after angles, or None.
+    """
+
+    format = "tiff_series"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._zip = _open_zip(path) if path.is_file() else None
+        try:
+            names = self._names()
+            images = sorted((name for name in names if name.lower().endswith(SUFFIXES)), key=natural)
+            kinds = {name: kind_of(name) for name in images}
+            series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
+            _check_one_series(path, series)
+            order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
+            self._files = order + series
+            self.image_key = np.array([kinds[name] for name in self._files], np.int32)
+            self.angles = np.full(len(self._files), np.nan)
+            self.exposures = np.full(len(self._files), np.nan)
+            samples = [self._image(name) for name in (*order, series[0])]
+            self.shape = samples[-1].shape[0], samples[-1].shape[1]
+            self.dtype = np.result_type(*(image.dtype for image in samples))
+            texts = [name for name in names if ANGLE_FILE.search(name.lower())]
+            self.angle_text = (texts[0], self._bytes(texts[0]).decode("utf-8", "replace")) if len(texts) == 1 else None
+        except BaseException:
+            self.close()
+            raise
+        gaps = ", ".join(map(str, _gaps(series)[:20]))
+        self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the files asked for, in that order."""
+        indices = frame_indices(frames, self.image_key.size)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        for i, number in enumerate(indices):
+            name = self._files[number]
+            image = self._image(name)
+            if image.shape != self.shape:
+                raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
+            out[i] = image[rows]
+        return out
+
+    def close(self) -> None:
+        if self._zip is not None:
+            self._zip.close()
+
+    def _names(self) -> list[str]:
+        if self._zip is not None:
+            return [name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name]
+        return [item.relative_to(self.path).as_posix() for item in self.path.rglob("*") if item.is_file()]
+
+    def _bytes(self, name: str) -> bytes:
+        return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
+
+    def _image(self, name: str) -> NDArray[Any]:
+        try:
+            image = read_image(io.BytesIO(self._bytes(name)))
+        except UNREADABLE as error:
+            raise DataError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+        if image.ndim != 2:
+            raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
+        require_real(image.dtype, f"{name} in {self.path}")
+        return image
+
+
+def kind_of(name: str) -> FrameKind:
+    """What a file shows, by its name relative to the scan's folder."""
+    match = REFERENCE.search(name.lower())
+    if match is None:
+        return FrameKind.PROJECTION
+    return FrameKind.DARK if match[1] == "dark" else FrameKind.FLAT
+
+
+def _open_zip(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except UNREADABLE as error:
+        raise DataError(f"{path} cannot be read as a zip file ({hdf5.reason(error)}).") from error
+
+
+def _prefix(name: str) -> str:
+    return re.sub(r"\d+(?=\.\w+$)", "", name)
+
+
+def _check_one_series(path: Path, names: list[str]) -> None:
+    prefixes = sorted({_prefix(name) for name in names})
+    if not names:
+        raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
+    if len(prefixes) > 1:
+        found = ", ".join(f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6])
+        raise DataError(
+            f"{path} holds several series of images: {found}. Name darks and flats so (dark_0001.tif, flat_0001.tif), "
+            "or give the folder of the projections, and the others apart, with --darks and --flats."
+        )
+
+
+def _gaps(names: list[str]) -> list[int]:
+    """Numbers that a series leaves out between its first and its last."""
+    found = [re.search(r"(\d+)\.\w+$", name) for name in names]
+    numbers = {int(match[1]) for match in found if match is not None}
+    return sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
+
+
+FORMAT = Format(
+    "a folder or .zip of TIFFs",
+    lambda path, opening: path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"),
+    lambda path, opening: TiffSeries(path),
+)
