@@ -1,4 +1,4 @@
-"""Anomalies: where a frame with one differs from the same frame without it, and what its label says of that."""
+"""Anomalies: compares where a frame with an anomaly differs from one without it, and its label."""
 
 from __future__ import annotations
 

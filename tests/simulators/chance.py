@@ -1,4 +1,4 @@
-"""Chance: is a sample what theory says? Each question raises a false alarm once in a million tests."""
+"""Chance: tests of samples against theory, each with one false alarm in a million."""
 
 from __future__ import annotations
 

@@ -24,12 +24,12 @@ PHANTOM = {
 
 
 def never(time: float) -> float:
-    raise AssertionError("a scene without motion asked where the stage was")
+    raise AssertionError("a scene without motion read the stage's angle")
 
 
 def shot(**changes: Any) -> Shot:
-    """10 ms of 60 x 80 pixels of 10 um in the middle of the sensor, the sample at 0.4 rad; whoever asks where the stage
-    is at another time fails."""
+    """10 ms of 60 x 80 pixels of 10 um in the middle of the sensor, the sample at 0.4 rad; reading the stage's angle
+    at another time fails."""
     values = {
         "detector": Detector.centred((60, 80), 0.01),
         "exposure": 0.01,

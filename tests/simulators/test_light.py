@@ -46,7 +46,7 @@ def test_light_is_linear_in_the_exposure(factor: float, flux: float) -> None:
 
 
 def test_no_light_is_made_by_depth_effects_in_air_or_lost_by_blur() -> None:
-    """Air stays air, and the blur keeps the sum of what scatter and profile made."""
+    """Air stays air, and the blur preserves the sum of light after scatter and profile."""
     air = shots.scene(*DEPTH, phantom={"kind": "solids", "solids": []})
     np.testing.assert_allclose(_photons(air, shots.shot(), 1e5), 1000.0, rtol=1e-5)
     without = shots.scene(*DEPTH, *PHOTONS[:2])

@@ -39,9 +39,14 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     runs = (Run("ghost", 1, (A, B)),)
     write_labels(path, runs, n_frames=9)
     assert read_labels(path) == runs
-    said = json.loads(path.read_text(encoding="utf-8"))
-    assert said["frames"] == 9
-    assert said["anomalies"][0] == {"kind": "ghost", "first_frame": 1, "last_frame": 2, "regions": [list(A), list(B)]}
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["frames"] == 9
+    assert content["anomalies"][0] == {
+        "kind": "ghost",
+        "first_frame": 1,
+        "last_frame": 2,
+        "regions": [list(A), list(B)],
+    }
     with pytest.raises(DataError, match="exists and results are never overwritten"):
         write_labels(path, (), n_frames=1)
 

@@ -42,11 +42,11 @@ def test_wrong_settings_of_a_volume_are_the_scenes_fault(scene: Path) -> None:
 
 @pytest.mark.parametrize("inline", [False, True])
 def test_the_simulated_instrument_finds_the_same_volume(scene: Path, inline: bool) -> None:
-    said = f"\n    phantom: {PHANTOM}\n    beam: {{photons_per_s: 1.0e+5}}\n" if inline else " scene.yaml\n"
+    entry = f"\n    phantom: {PHANTOM}\n    beam: {{photons_per_s: 1.0e+5}}\n" if inline else " scene.yaml\n"
     template = (Path(__file__).parents[3] / "configs" / "simulated.yaml").read_text(encoding="utf-8")
     head, found, rest = template.partition("\n  scene:")
     assert found
     config = scene.parent / "config.yaml"
-    config.write_text(f"{head}\n  scene:{said}{rest.partition(chr(10))[2]}", encoding="utf-8")
+    config.write_text(f"{head}\n  scene:{entry}{rest.partition(chr(10))[2]}", encoding="utf-8")
     sample = scene_of(load(config)).sample
     np.testing.assert_array_equal(sample.attenuation(Grid((2, 3, 4), 0.1)), VOLUME)

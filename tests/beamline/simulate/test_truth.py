@@ -34,7 +34,7 @@ scan: {views: 90, darks: 1, flats: 1}
 CONE = ("beam.sod=2", "beam.sdd=5", "scan.range_deg=360")
 
 
-def _silent(said: Event | str) -> None:
+def _silent(event: Event | str) -> None:
     """Nobody listens."""
 
 
@@ -63,8 +63,8 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
         prepared = prepare_projections(source, chosen, _silent)
     grid = Grid.matching(prepared.geometry)
     assert (grid.shape, grid.centre) == (truth.grid.shape, pytest.approx(truth.grid.centre))
-    made = (fdk if overrides else fbp)(prepared.projections.data, prepared.geometry, grid, "hann")
-    for found, stands in zip(_centroid(made, grid), _centroid(truth.attenuation, truth.grid), strict=True):
+    volume = (fdk if overrides else fbp)(prepared.projections.data, prepared.geometry, grid, "hann")
+    for found, stands in zip(_centroid(volume, grid), _centroid(truth.attenuation, truth.grid), strict=True):
         assert found == pytest.approx(stands, abs=0.15 * 0.012)
     assert _centroid(truth.labels * np.float32(4), truth.grid) == pytest.approx(
         _centroid(truth.attenuation, truth.grid), abs=0.25 * truth.grid.voxel_size

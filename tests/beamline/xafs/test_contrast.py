@@ -70,10 +70,10 @@ def test_dead_pixels_count_for_nothing_and_a_region_without_light_is_not_told() 
         pytest.approx(noise, rel=0.2),
     )
     assert np.isnan(contrast_of(np.where(rng.random(ROWS.shape) < 0.6, np.nan, frame), Regions(INSIDE))).all()
-    for share, told in ((0.003, True), (0.03, False)):
+    for share, usable in ((0.003, True), (0.03, False)):
         dark = np.where(rng.random(ROWS.shape) < share, np.inf, frame)
         contrast, _ = contrast_of(dark, Regions(INSIDE, AROUND))
-        assert contrast == pytest.approx(clean, abs=0.002) if told else np.isnan(contrast)
+        assert contrast == pytest.approx(clean, abs=0.002) if usable else np.isnan(contrast)
 
 
 def test_energies_of_which_nothing_is_known_are_left_out() -> None:

@@ -1,4 +1,4 @@
-"""Results: what people, programs and spreadsheets are told, and that nothing is overwritten."""
+"""Results: sentences, values and table of an energy scan, and that nothing is overwritten."""
 
 from __future__ import annotations
 

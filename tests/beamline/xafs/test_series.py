@@ -1,4 +1,4 @@
-"""Series: points in order, progress told, and an early end that keeps what there is."""
+"""Series: points in order, progress events, and an early end that keeps the points so far."""
 
 from __future__ import annotations
 

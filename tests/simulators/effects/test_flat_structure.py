@@ -79,7 +79,7 @@ def test_scratches_take_the_light_of_lines() -> None:
         loss = 1 - scratch.transmission(_roi(0, 0, 2304, 4096))
         assert loss.sum() == pytest.approx(deep * (length * math.sqrt(2 * math.pi) * 2 + 8 * math.pi), rel=2e-3)
         j, i = np.nonzero(loss > 0.5 * loss.max())
-        if length > 40:  # it points where its angle says: rows along its sine, columns along its cosine
+        if length > 40:  # its direction is its angle: rows along its sine, columns along its cosine
             moments = np.cov(j, i)
             assert math.atan2(2 * moments[0, 1], moments[1, 1] - moments[0, 0]) / 2 % math.pi == pytest.approx(
                 angle % math.pi, abs=0.05

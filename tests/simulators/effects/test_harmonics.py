@@ -1,4 +1,4 @@
-"""Harmonics: two exponentials, as the law says, at any depth."""
+"""Harmonics: the sum of two exponentials, at any depth."""
 
 from __future__ import annotations
 

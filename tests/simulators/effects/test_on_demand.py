@@ -1,5 +1,5 @@
 """On demand: a scene pays for no effect that it does not name, effects leave each other's random numbers alone, and a
-frame is the same whether it is made alone or in sequence."""
+frame is the same whether it is computed alone or in sequence."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def test_without_an_effect_named_its_file_is_not_read_and_the_frames_are_the_sam
         [sys.executable, str(worker), str(tmp_path), str(CHECKOUT)], capture_output=True, text=True, timeout=200
     )
     assert ran.returncode == 0, ran.stderr
-    said = json.loads(ran.stdout)
-    assert said["wrong"] == {}
-    assert said["taken"] == list(CATALOGUE)
+    report = json.loads(ran.stdout)
+    assert report["wrong"] == {}
+    assert report["taken"] == list(CATALOGUE)
 
 
 def test_an_effect_draws_the_same_numbers_whatever_else_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Saturation: a clip at the full well, or a bend that begins and ends as its equation says."""
+"""Saturation: a clip at the full well, or a bend by its equation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Threads: frames are the same to the last bit however many share the work, and several may be made at once."""
+"""Threads: frames are the same to the last bit however many share the work, and several may be computed at once."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ import threading
 from simulators.scenes.expose import expose
 from tests.simulators.effects.test_threads import large, with_all
 
-made = []
+frames = []
 
 def make():
-    made.append([expose(with_all(method), large()) for method in ("wave", "transport")])
+    frames.append([expose(with_all(method), large()) for method in ("wave", "transport")])
 
 threads = [threading.Thread(target=make) for _ in range(3)]
 for thread in threads:
     thread.start()
 for thread in threads:
     thread.join()
-assert len(made) == 3
-assert all((one == other).all() for frames in made for one, other in zip(frames, made[0]))
+assert len(frames) == 3
+assert all((one == other).all() for each in frames for one, other in zip(each, frames[0]))
 """
 
 

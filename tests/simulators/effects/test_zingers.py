@@ -1,4 +1,4 @@
-"""Zingers: as many as their rate says with exponential charges, in one frame only; tracks are straight."""
+"""Zingers: rate, exponential charges, in one frame only; tracks are straight."""
 
 from __future__ import annotations
 

@@ -12,10 +12,12 @@ from simulators.light.beam import Beam, Tube
 
 
 def test_a_scene_can_say_every_light() -> None:
-    said = {"photons_per_s": 1e5, "energy_kev": 8.3485, "bandwidth": 1e-4, "harmonics": {3: 0.01}}
-    beam = build(Beam, "beam", said)
+    mapping = {"photons_per_s": 1e5, "energy_kev": 8.3485, "bandwidth": 1e-4, "harmonics": {3: 0.01}}
+    beam = build(Beam, "beam", mapping)
     assert (beam.energy_kev, beam.bandwidth, dict(beam.harmonics or {})) == (8.3485, 1e-4, {3: 0.01})
-    assert dict(build(Beam, "beam", said | {"harmonics": {"3": 0.01}}).harmonics or {}) == {3: 0.01}  # as JSON says it
+    assert dict(build(Beam, "beam", mapping | {"harmonics": {"3": 0.01}}).harmonics or {}) == {
+        3: 0.01
+    }  # keys of JSON are text
     table = build(Beam, "beam", {"photons_per_s": 1, "spectrum": [[20, 1], [30, 2]]})
     assert table.spectrum == ((20.0, 1.0), (30.0, 2.0))
     tube = build(Beam, "beam", {"photons_per_s": 1, "tube": {"kv": 60, "filters": {"Al": 1.0}}}).tube

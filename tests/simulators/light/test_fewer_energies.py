@@ -19,7 +19,7 @@ Reals = NDArray[np.float64]
 @given(n=st.integers(5, 80), n_materials=st.integers(1, 3), seed=st.integers(0, 10**6), power=st.floats(1.0, 4.0))
 @example(n=53, n_materials=2, seed=15296, power=2.3125)  # an edge in each, and ways between them
 def test_light_through_any_ray_stays_the_same(n: int, n_materials: int, seed: int, power: float) -> None:
-    """To ten times the tolerance along ways between those that were looked at."""
+    """To ten times the tolerance along rays between the fitted ones."""
     rng = np.random.default_rng(seed)
     energies = np.linspace(10, 60, n)
     steps = 1 + 5 * (energies[:, None] > rng.uniform(10, 60, n_materials))

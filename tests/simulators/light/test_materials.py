@@ -66,7 +66,7 @@ def test_a_layered_oxide_has_its_crystal_s_density() -> None:
 
 
 def test_a_charged_oxide_is_the_table_far_from_its_edges() -> None:
-    """What the docstring says of lithium holds, too."""
+    """The docstring's statement on lithium holds, too."""
     plain = of_formula("LCO", "LiCoO2", 5.05)
     charged = Material("LCO", 5.05, plain.fractions, state_of_charge=0.7)
     np.testing.assert_array_equal(charged.attenuation(ENERGIES), plain.attenuation(ENERGIES))

@@ -100,7 +100,7 @@ def test_the_steps_that_were_taken_are_told() -> None:
 
 @dataclass(frozen=True)
 class _Plain:
-    """A sample that tells its line integrals and no more."""
+    """A sample with line integrals only."""
 
     phantom: Phantom
     radius: float = 1.0

@@ -1,4 +1,4 @@
-"""Filling: the voxel truth has each solid's mass and is sure where it says so; labels say what a voxel's centre is."""
+"""Filling: the voxel truth has each solid's mass and is exact off surfaces; labels are those of voxels' centres."""
 
 from __future__ import annotations
 

@@ -42,18 +42,18 @@ def test_grains_fill_what_is_asked_and_do_not_overlap() -> None:
 
 def test_sizes_are_log_normal(rng: np.random.Generator) -> None:
     """Kolmogorov and Smirnov's test against the normal distribution cut off at 2.5, once in 1e6 by chance."""
-    made = grains(rng, 2000 * math.pi / 6 * 0.02**3, Sizes(0.02, 0.3), {"sphere": 1.0, "plate": 2.0}, 0.1, 3.0)
-    diameters = np.array([(6 * solid.volume / math.pi) ** (1 / 3) for solid in made])
+    drawn = grains(rng, 2000 * math.pi / 6 * 0.02**3, Sizes(0.02, 0.3), {"sphere": 1.0, "plate": 2.0}, 0.1, 3.0)
+    diameters = np.array([(6 * solid.volume / math.pi) ** (1 / 3) for solid in drawn])
     deviations = np.log(diameters / 0.02) / 0.3
-    assert len(made) > 1000
+    assert len(drawn) > 1000
     assert kstest(deviations, truncnorm(-2.5, 2.5).cdf).pvalue > FALSE_ALARM
     assert kstest(deviations * 1.3, truncnorm(-2.5, 2.5).cdf).pvalue < FALSE_ALARM  # it would tell
 
 
 def test_habits_have_their_shares(rng: np.random.Generator) -> None:
-    made = grains(rng, 2000 * math.pi / 6 * 0.02**3, Sizes(0.02, 0.0), {"octahedron": 3.0, "plate": 1.0}, 0.0, 3.0)
-    assert abs(len(made) - 2000) <= 1
-    plates = sum(type(solid).__name__ == "Plate" for solid in made)
+    drawn = grains(rng, 2000 * math.pi / 6 * 0.02**3, Sizes(0.02, 0.0), {"octahedron": 3.0, "plate": 1.0}, 0.0, 3.0)
+    assert abs(len(drawn) - 2000) <= 1
+    plates = sum(type(solid).__name__ == "Plate" for solid in drawn)
     # Binomial with a standard deviation of 19.4: 4.9 of them are exceeded once in 1e6.
     assert abs(plates - 500) < 4.9 * math.sqrt(2000 * 0.25 * 0.75)
 
@@ -116,7 +116,7 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"size_um": 0}, "size_um must be positive"),
         ({"gap_um": -1}, "gap_um must be >= 0"),
@@ -142,8 +142,8 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
         ({"made_of": {"wall": "steel"}}, "need a beam with energies"),
     ],
 )
-def test_wrong_settings_are_refused(changed: dict[str, Any], said: str) -> None:
-    with pytest.raises(SceneError, match=said):
+def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneError, match=message):
         build_sample("phantom", {"kind": "cathode", **SMALL, "habits": {"sphere": 1}} | changed, Beam(1e5))
 
 

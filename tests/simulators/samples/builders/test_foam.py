@@ -38,7 +38,7 @@ def test_holes_neither_touch_nor_leave_the_matter(edges: Any) -> None:
 
 
 def test_each_hole_is_the_largest_that_fits_at_any_candidate(rng: np.random.Generator) -> None:
-    """Against the plain way: every candidate looked at for every hole."""
+    """Against the reference implementation: every candidate is checked for every hole."""
     points, room = rng.uniform(-0.5, 0.5, (2000, 3)), rng.uniform(0.02, 0.1, 2000)
     found = holes(points, room, 0.01, 0.003, 300)
     left, expected = room.copy(), []
@@ -96,7 +96,7 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"diameter": 0}, "must be positive"),
         ({"edges": [1, 1, 0]}, "must be positive"),
@@ -113,6 +113,6 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
         ({"attenuation": {"foam": 1.0}}, "'foam' is no part"),
     ],
 )
-def test_wrong_settings_are_refused(changed: dict[str, Any], said: str) -> None:
-    with pytest.raises(SceneError, match=said):
+def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneError, match=message):
         build_sample("phantom", {"kind": "foam", **changed}, Beam(1e5))

@@ -99,7 +99,7 @@ def test_a_pattern_may_have_one_kind_only() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"widths_um": [10, 0]}, "must be positive"),
         ({"balls_um": [-1.0]}, "must be positive"),
@@ -114,6 +114,6 @@ def test_a_pattern_may_have_one_kind_only() -> None:
         ({"made_of": {"wedge": "Al"}}, "'wedge' is no part"),
     ],
 )
-def test_wrong_settings_are_refused(changed: dict[str, Any], said: str) -> None:
-    with pytest.raises(SceneError, match=said):
+def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneError, match=message):
         _sample(**changed)

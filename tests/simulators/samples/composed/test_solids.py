@@ -1,4 +1,4 @@
-"""Made of: scenes that name materials, beside grey ones, and what is refused."""
+"""Solids: scenes with materials, with attenuations and with both, and what is refused."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"axes": "zyy"}, "axes must name x, y and z"),
         ({"voxel_mm": -1.0}, "voxel_mm must be positive"),
@@ -90,12 +90,12 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
         ({"file": "none", "attenuation_max": 2.0}, "needs a value above 0"),
     ],
 )
-def test_wrong_settings_are_refused_by_name(changed: dict[str, Any], said: str) -> None:
+def test_wrong_settings_are_refused_by_name(changed: dict[str, Any], message: str) -> None:
     def read(file: str, dataset: str | None) -> Stored:
-        made = {"v": VALUES, "flat": VALUES[0], "complex": VALUES * 1j, "none": VALUES * 0}
-        return Stored(VALUES, (1.0, 1.0, 1e-9)) if file == "thin" else Stored(made[file])
+        volumes = {"v": VALUES, "flat": VALUES[0], "complex": VALUES * 1j, "none": VALUES * 0}
+        return Stored(VALUES, (1.0, 1.0, 1e-9)) if file == "thin" else Stored(volumes[file])
 
-    with pytest.raises(SceneError, match=said):
+    with pytest.raises(SceneError, match=message):
         build_sample("phantom", {"kind": "volume", "file": "v", "voxel_mm": 0.1} | changed, Beam(1e5), read)
 
 

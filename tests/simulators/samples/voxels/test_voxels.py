@@ -150,8 +150,8 @@ def test_fine_voxels_of_a_sphere_come_to_its_chords() -> None:
         step = 0.48 / n
         at = (np.arange(4 * n) - (4 * n - 1) / 2) * step / 4
         inside = (at - x0) ** 2 + (at[:, None] - y0) ** 2 + (at[:, None, None] - z0) ** 2 <= radius**2
-        made = Voxels.of(inside.reshape(n, 4, n, 4, n, 4).mean(axis=(1, 3, 5)), step)
-        errors.append(np.sqrt(((made.line_integrals(0.6, detector) - expected) ** 2).mean()) / expected.max())
+        voxels = Voxels.of(inside.reshape(n, 4, n, 4, n, 4).mean(axis=(1, 3, 5)), step)
+        errors.append(np.sqrt(((voxels.line_integrals(0.6, detector) - expected) ** 2).mean()) / expected.max())
     assert errors[1] < 0.01
     assert errors[0] > 1.8 * errors[1]  # a surface smeared over a voxel: at least the first order
 
@@ -246,7 +246,7 @@ def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"attenuation": np.zeros((3, 3))}, "three axes"),
         ({"spacing": 0.0}, "positive size"),
@@ -259,6 +259,6 @@ def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch)
         ({"thresholds": [1.0, 2.0], "names": ("one",)}, "as many names"),
     ],
 )
-def test_wrong_volumes_are_refused(wrong: dict, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_wrong_volumes_are_refused(wrong: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Voxels.of(**({"attenuation": np.zeros((2, 2, 2)), "spacing": 0.1} | wrong))
