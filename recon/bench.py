@@ -1,6 +1,6 @@
-"""How fast this machine is and what quality it gets for it: one standard case for kernels and steps, one for volumes.
+"""Measures speed and quality on this machine: one standard case for kernels and steps, one for volumes.
 
-Everything takes its clock. Times are medians over repeats within one run: on a shared machine only ratios last.
+The clock is an argument. Times are medians over repeats within one run: on a shared machine only ratios are comparable.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _FAINT, _SIGMAS = 1e-3, 3.5
 
 @dataclass(frozen=True)
 class Timing:
-    """How long something takes.
+    """The time that a call takes.
 
     Attributes:
         name: of what was timed.
         ms: median of the repeats.
         spread_ms: between their quartiles.
-        pairs: Gaussian-pixel pairs that it goes through; 0 where that means nothing.
+        pairs: Gaussian-pixel pairs that it computes; 0 where there are none.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class VolumeRow:
-    """One reconstruction of the standard sample: settings, time and how good it is."""
+    """One reconstruction of the standard sample: settings, time and quality."""
 
     method: str
     settings: str

@@ -1,4 +1,4 @@
-"""How fast this machine is on this very scan: a second or so of small runs, scaled to the whole."""
+"""calibrate: the speed of this machine on a scan, from about a second of small runs, scaled to the whole."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     """Measure each part of a reconstruction on a part of the scan.
 
     The first volume (FBP, or its replacement, see `first_volume`), placing and filling on a slab of rows; the
-    step on whole views, with the number of Gaussians that a fit would start from, spread over what a coarse first
-    volume shows as matter: how much they overlap decides how long a step takes.
+    step on whole views, with the number of Gaussians that a fit would start from, spread over the matter in a
+    coarse first volume: the time of a step depends on how much they overlap.
 
     Args:
         projections: [view, row, col], line integrals.
@@ -49,7 +49,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     slices = Grid.of_field(part, part.sample_pitch)
     whole = field.shape[0] / slices.shape[0]
     views = geometry.n_views / part.n_views
-    first_volume(slab, part, slices)  # threads wake up and pages come in
+    first_volume(slab, part, slices)  # starts threads and loads pages; not timed
     begin = now()
     first = first_volume(slab, part, slices)
     fbp_seconds = (now() - begin) * whole * views

@@ -26,7 +26,7 @@ def warm_up(
 
     numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
     What another kind of geometry, first volume or ray needs is compiled for it alone: leaning views, a cone or weights
-    take a sixth of that time more, a start by TV a third, a cone's short scan with exact rays two thirds.
+    add a sixth of that time, a start by TV a third, a short scan of a cone with exact rays two thirds.
 
     Args:
         method: with the settings of the run to come; None: `R2` with its defaults.

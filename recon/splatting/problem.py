@@ -19,10 +19,10 @@ from recon.splatting.backend import Backend, ProjectionLoss
 Loss = Literal["l1", "l2", "poisson"]
 _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 
-# Images hold values of about one. Of ones beyond this no matter in the field can be the cause, and sums of products of
-# their squares, which SSIM takes, would leave float32's range.
+# Images hold values of about one. No matter in the field can cause values beyond this limit, and in SSIM the sums of
+# products of their squares would exceed the range of float32.
 _LARGEST = 1e6
-# Of later views, where the unit may be that of the noise before the sample was there: what SSIM could not hold.
+# For later views, where the unit may come from noise before the sample was there: the limit of SSIM in float32.
 _LARGEST_LATER = 1e9
 
 

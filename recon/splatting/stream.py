@@ -114,7 +114,7 @@ class StreamingFit:
 
     @property
     def settings(self) -> FitSettings:
-        """What the fit runs with."""
+        """Settings of the fit."""
         return self._settings
 
     @property
@@ -160,7 +160,7 @@ class StreamingFit:
             self._problem = with_projections(self._problem, images)
 
     def move_axis(self, axis_col: float) -> None:
-        """Say that the rotation axis lies elsewhere. The model stays: a fraction of a pixel is soon learnt again.
+        """Move the rotation axis. The model stays: the fit soon adapts to a shift of a fraction of a pixel.
 
         Begin a new fit where the axis moves by so much that edges in the model are doubled.
         """
@@ -170,11 +170,11 @@ class StreamingFit:
             self._problem = replace(self._problem, geometry=moved)
 
     def advance(self, seconds: float) -> Progress:
-        """Fit for about `seconds` s (at least one step once there is a model) and say where it stands."""
+        """Fit for about `seconds` s (at least one step once there is a model) and return the progress."""
         return self._advance(seconds, finishing=False)
 
     def finish(self, seconds: float, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
-        """The scan has ended: a last round over all views with the rates decaying to the end, in about `seconds` s.
+        """Fit a last round over all views, after the scan, with rates that decay to the end in about `seconds` s.
 
         `on_progress` is called about ten times a second and ends the fit by returning True.
 
@@ -250,7 +250,7 @@ class StreamingFit:
                 self._round_views = self.n_views
                 return
         elif self._problem is not None and max(float(image.max()) for image in self._problem.images) > _BLIND:
-            # The sample came, or the shutter opened, after the first views: their scale is that of noise.
+            # The sample or the beam came after the first views: the density unit is that of noise.
             self._data = list(self._problem.projections)
             self._place_first()
         assert self._state is not None

@@ -56,10 +56,10 @@ class Fbp:
 
 
 def direct(projections: F32, geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> F32:
-    """FBP or FDK [z, y, x], whichever the beam wants; see `fbp` and `fdk`."""
+    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp` and `fdk`."""
     return (fdk if geometry.is_cone else fbp)(projections, geometry, grid, filter)
 
 
 def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: they must be straight, and a cone's must stand all around."""
+    """Whether FBP or FDK takes these views: without roll and tilt, and over the full circle for a cone."""
     return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))

@@ -3,8 +3,8 @@
     volume = solve(FistaTv(), Projector(geometry, grid), projections)
 
 All work in float32. TV weights are fractions of the density unit (the 99.5th percentile of the positive voxels), so
-they hold for any unit of attenuation. Inside, lengths, line integrals and weights are about one, whatever their units:
-sums of their squares would leave float32's range.
+they hold for any unit of attenuation. Internally, lengths, line integrals and weights are scaled to about one:
+in other units sums of their squares could exceed the range of float32.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def solve(
     Memory: as each method's settings say, in volumes of the grid and in copies of the projections, float32.
 
     Args:
-        projections: [view, row, col], line integrals, finite where they weigh anything.
-        weight: of each ray, [view, row, col], 0 or more: 0 for pixels that are not to be trusted, or the inverse
-            variance; only their ratios count. None: all alike.
+        projections: [view, row, col], line integrals, finite where their weight is not 0.
+        weight: of each ray, [view, row, col], 0 or more: 0 for invalid pixels, or the inverse variance; only
+            ratios of weights matter. None: one for all.
         start: the volume to begin with; None: zero.
         nonnegative: voxels below zero are clipped in every step (CGLS: at the end).
         on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point
@@ -152,7 +152,7 @@ def _times_power(array: F32, power: int) -> F32:
 
 
 def _direct(projector: Projector, data: F32, rays: F32 | None) -> F32 | None:
-    """FBP or FDK [y, x, z] of the views that weigh anything, the rays that weigh nothing filled; None: neither can."""
+    """FBP or FDK [y, x, z] of the views with any weight, rays of weight 0 filled in; None: neither takes them."""
     images, geometry = projection_images(data), projector.geometry
     if rays is not None:
         seen = np.flatnonzero(rays.any(axis=(1, 2)))

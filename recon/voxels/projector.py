@@ -1,4 +1,4 @@
-"""The voxel projector: what the detector would show of a volume, and the exact transpose of that.
+"""The voxel projector: line integrals through a volume, and the exact transpose.
 
 Both directions run on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. Whoever
 applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward` and

@@ -18,13 +18,13 @@ from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
 
-# Rays shorter than this share of the longest, and voxels that subsets see less than this share of the best seen, tell
-# too little: their corrections would be divided by almost nothing.
+# Rays shorter than this share of the longest ray, and voxels with a column sum below this share of the largest, are
+# left out: their corrections would be divided by almost zero.
 _LEAST = 1e-3
 
 
 def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
-    """View indices of each subset: neighbours in angle lie in different subsets, so each looks from all sides."""
+    """View indices of each subset: neighbours in angle are in different subsets, so that each covers all directions."""
     order = np.argsort(np.mod(projector.geometry.angles, projector.geometry.period), kind="stable")
     count = min(subsets, order.size)
     return [order[start::count] for start in range(count)]

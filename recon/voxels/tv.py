@@ -1,4 +1,4 @@
-"""Total variation as a prior of volumes: its proximal step, which starts where the last one ended."""
+"""Total variation as a prior of volumes: its proximal step, with a warm start from the last step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ F32 = NDArray[np.float32]
 
 
 def difference_weights(grid: Grid) -> tuple[float, float, float]:
-    """Weights of the differences along (y, x, z), so that TV is that of a function whatever the voxel's shape."""
+    """Weights of the differences along (y, x, z), so that TV does not depend on the shape of the voxels."""
     return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
 
 

@@ -56,7 +56,7 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
 
 
 def covers_the_circle(angles: ArrayLike) -> bool:
-    """Whether views stand all around, without a missing arc."""
+    """Whether the views cover the full circle, without a missing arc."""
     gaps = _gaps(np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi))[1]
     return gaps.size > 1 and not _leave_an_arc(gaps)
 
