@@ -98,26 +98,26 @@ def simulate(
         scan = scan_of(opened, seed, views, clock.now())
         if out:
             check_output(scan, out)
-        tell = _Teller(fan_out(*sinks), clock, plain=not as_json)
+        output = _Output(fan_out(*sinks), clock, plain=not as_json)
         if explains:
-            _explain(scan, tell)
-        made: dict[str, object] = {}
+            _explain(scan, output)
+        outputs: dict[str, object] = {}
         if truth:
-            made |= _truth(scan, truth, truth_bin, tell)
-        written = _scan(opened, scan, out, tell, fan_out(*sinks)) if out else None
+            outputs |= _truth(scan, truth, truth_bin, output)
+        written = _scan(opened, scan, out, output, fan_out(*sinks)) if out else None
         if written:
-            made |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
+            outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
         if picture and not (written and written.stopped):
             marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
             with named_on_failure(picture), whole_file(picture) as partial:
                 partial.write_bytes(sheet(scan, marked))
-            made |= {"picture": picture}
-            tell("picture", str(picture))
+            outputs |= {"picture": picture}
+            output("picture", str(picture))
         if written and written.stopped:
             raise ScanStopped(
                 f"Stopped after {written.n_frames} of {len(scan)} frames; {out} holds them and is readable."
             )
-        tell.event("done", made)
+        output.event("done", outputs)
 
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
@@ -133,7 +133,7 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
         refuse_existing(path)
 
 
-class _Teller:
+class _Output:
     """Prints results as lines for people, and sends them as events to programs."""
 
     def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
@@ -150,14 +150,14 @@ class _Teller:
         self._sink(Event(name, self._clock.now(), data))
 
 
-def _explain(scan: Scan, tell: _Teller) -> None:
+def _explain(scan: Scan, output: _Output) -> None:
     found, where = frame_cost(scan, time.perf_counter), machine()
     costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
-    tell.event("explain", asdict(found) | {"costs": costs, "machine": where})
-    tell.lines(f"{machine_line(where)}\n\n{cost_table(found)}")
+    output.event("explain", asdict(found) | {"costs": costs, "machine": where})
+    output.lines(f"{machine_line(where)}\n\n{cost_table(found)}")
 
 
-def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[str, object]:
+def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict[str, object]:
     n = binning or binning_of(scan.detector)
     try:
         needed, free = memory_of(scan.detector, n), free_memory()
@@ -165,21 +165,21 @@ def _truth(scan: Scan, path: Path, binning: int | None, tell: _Teller) -> dict[s
         raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
     if free is not None and needed > free:
         raise ConfigError(
-            f"--truth-bin {n}: the truth takes {size(needed)} of memory while it is made, {size(free)} are free; give "
-            "a larger one. Nothing was simulated."
+            f"--truth-bin {n}: the truth takes {size(needed)} of memory, {size(free)} are free. Give a larger "
+            "--truth-bin. Nothing was simulated."
         )
     truth = truth_of(scan.scene.sample, scan.detector, n)
     write_truth(path, truth)
     voxels = " x ".join(map(str, truth.grid.shape))
-    tell("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, for `beamline recon --bin {n}`")
+    output("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, for `beamline recon --bin {n}`")
     return {"truth": path}
 
 
-def _scan(scene: SceneFile, scan: Scan, out: Path, tell: _Teller, sink: Sink) -> Simulated:
+def _scan(scene: SceneFile, scan: Scan, out: Path, output: _Output, sink: Sink) -> Simulated:
     ending = StopOnSignal("Stopping after this frame. Ctrl-C again stops at once.")
     with ending() as stopped, Terminal(sys.stderr) as terminal:
         written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
-    tell("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
+    output("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
     found = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
-    tell("labels", f"{written.labels}  {found or 'no anomaly'}")
+    output("labels", f"{written.labels}  {found or 'no anomaly'}")
     return written

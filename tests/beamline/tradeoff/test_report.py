@@ -12,11 +12,13 @@ from pathlib import Path
 import pytest
 
 from beamline.core.machine import machine
+from beamline.report.html import Picture
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Trial, plan
 from recon.base.method import Depth
 from recon.methods import names
+from tests.beamline.html_page import parsed_page
 
 BASE = Trial("method", "fbp", 10)
 FIT = Trial("method", "r2", 10, settings={"steps": 100, "gaussians": 2000})
@@ -85,6 +87,17 @@ def test_the_page_shows_words_of_others_as_words() -> None:
     assert "a <b>" not in page and "a &lt;b&gt;.h5" in page
     assert f"<strong>{BASE.label}</strong>" in page and f"<strong>{FIT.label}" not in page
     assert "1 of 2 trials" in page
+
+
+def test_the_page_has_every_part_and_requests_nothing() -> None:
+    done = _done(BASE, 2.0, 20.0)
+    table = _table(done, Outcome(FIT, "failed", message="no room"))
+    parsed = parsed_page(to_html(table, [Picture("Quality", "A <caption>", b"\x89PNG")]))
+    text = " ".join("".join(parsed.text).split())
+    assert all(line in text for line in conclusions(table))
+    for part in ("What accuracy costs", "PSNR (dB)", BASE.label, "2.00", "failed: no room", "A <caption>", "a <b>.h5"):
+        assert part in text
+    assert text.count("beamline tradeoff 'a <b>.h5'") == 1
 
 
 def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
