@@ -1,7 +1,8 @@
 """Fuzz for drivers and stand-ins: bytes that a bad line makes of good ones, a wire that sends them, what is allowed.
 
 For a driver: put a `FuzzedWire` before its stand-in, with `plans(samples)` drawn by hypothesis, and run each call
-through `allowed`. For a stand-in: let `told` give it `received(samples)`. How many examples: tests/conftest.py.
+through `allowed`. For a simulated controller: let `replies` send it `received(samples)`. Number of examples:
+tests/conftest.py.
 """
 
 from __future__ import annotations
@@ -98,8 +99,8 @@ class FuzzedWire:
         return b"".join(due)
 
 
-def told(wire: Wire, story: Sequence[tuple[bytes, float]], line_end: bytes) -> Iterator[list[bytes]]:
-    """Gives a stand-in bytes, each followed by a wait in s; the lines that it sent of each, which must be whole."""
+def replies(wire: Wire, story: Sequence[tuple[bytes, float]], line_end: bytes) -> Iterator[list[bytes]]:
+    """Send bytes to a simulated controller, each followed by a wait in s; yields the complete lines sent back."""
     for data, seconds in story:
         wire.receive(data)
         wire.clock.sleep(seconds)

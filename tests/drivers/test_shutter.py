@@ -11,18 +11,18 @@ from simulators.devices.clock import VirtualClock
 
 
 class Line:
-    """An output: `tells` whether it can be read, `stuck` the level that it has whatever it is told."""
+    """An output: `tells` whether it can be read, `stuck` the level that it keeps whatever is set."""
 
     name = "output 1"
 
     def __init__(self, tells: bool = True, stuck: bool | None = None, fails: bool = False) -> None:
         self.level, self.tells, self.stuck, self.fails = False, tells, stuck, fails
-        self.told: list[bool] = []
+        self.levels: list[bool] = []
 
     def set(self, high: bool) -> None:
         if self.fails:
             raise DeviceError("box", "no reply")
-        self.told.append(high)
+        self.levels.append(high)
         self.level = high if self.stuck is None else self.stuck
 
     def get(self) -> bool | None:
@@ -37,16 +37,16 @@ def test_polarity_and_travel(tells: bool, open_high: bool) -> None:
     if not tells:
         assert not shutter.is_open()  # nobody counts on beam that was not asked for
     shutter.open()
-    assert (line.told, shutter.is_open(), clock.now()) == ([open_high], True, 0.25)
+    assert (line.levels, shutter.is_open(), clock.now()) == ([open_high], True, 0.25)
     shutter.open()
-    assert (line.told, clock.now()) == ([open_high], 0.25)
+    assert (line.levels, clock.now()) == ([open_high], 0.25)
     shutter.close()
-    assert (line.told, shutter.is_open(), clock.now()) == ([open_high, not open_high], False, 0.5)
+    assert (line.levels, shutter.is_open(), clock.now()) == ([open_high, not open_high], False, 0.5)
     shutter.close()  # it goes out again
-    assert (line.told[2:], clock.now()) == ([not open_high], 0.75)
+    assert (line.levels[2:], clock.now()) == ([not open_high], 0.75)
 
 
-def test_an_output_that_does_not_hold_is_told() -> None:
+def test_an_output_that_does_not_hold_is_reported() -> None:
     shutter = OutputShutter(Line(stuck=False), VirtualClock(0.0))
     with pytest.raises(DeviceError, match=r"output 1 does not hold.*Asked 'high'\. Answered 'low'.*is not known"):
         shutter.open()
@@ -72,7 +72,7 @@ def test_after_a_failure_nothing_is_believed() -> None:
     assert not shutter.is_open()
     line.fails = False
     shutter.open()
-    assert line.told == [True, True]  # sent again: what the failed close did is not known
+    assert line.levels == [True, True]  # sent again: what the failed close did is not known
 
 
 def test_what_somebody_else_did_is_seen() -> None:
@@ -82,7 +82,7 @@ def test_what_somebody_else_did_is_seen() -> None:
     line.level = False
     assert not shutter.is_open()
     shutter.open()
-    assert line.told == [True, True]
+    assert line.levels == [True, True]
 
 
 @pytest.mark.parametrize("settle", [-1.0, float("nan"), float("inf")])

@@ -23,23 +23,23 @@ from simulators.devices.clock import VirtualClock
 RING = "Ring current: ([-+0-9.eE]+) mA"
 
 
-class Said:
-    """A source that says what a test wants."""
+class FixedText:
+    """A source that always answers with one text."""
 
     request = "READ?"
 
     def __init__(self, text: str) -> None:
-        self.said, self.closed = text, False
+        self.answer, self.closed = text, False
 
     def text(self) -> str:
-        return self.said
+        return self.answer
 
     def close(self) -> None:
         self.closed = True
 
 
 def monitor(text: str, pattern: str = RING, **options: float) -> BeamMonitor:
-    return TextBeamMonitor(Said(text), VirtualClock(7.0), pattern=pattern, unit="mA", **options)
+    return TextBeamMonitor(FixedText(text), VirtualClock(7.0), pattern=pattern, unit="mA", **options)
 
 
 @given(st.floats(-1e30, 1e30), st.sampled_from(["%.6e", "%.4f", "%+.3E", "%r"]))
@@ -96,9 +96,9 @@ def test_a_scale_must_be_one(scale: float) -> None:
 
 
 def test_closing_closes_the_source() -> None:
-    said = Said("")
-    TextBeamMonitor(said, VirtualClock(), pattern="(x)", unit="A").close()
-    assert said.closed
+    source = FixedText("")
+    TextBeamMonitor(source, VirtualClock(), pattern="(x)", unit="A").close()
+    assert source.closed
 
 
 @contextmanager
@@ -150,10 +150,10 @@ def test_a_page(kind: str) -> None:
     assert before - 1 < reading.time < before + 60
 
 
-@pytest.mark.parametrize(("status", "told"), [(404, "404 Not Found"), (503, "503 Service Unavailable")])
-def test_a_page_that_is_an_error(status: int, told: str) -> None:
+@pytest.mark.parametrize(("status", "reason"), [(404, "404 Not Found"), (503, "503 Service Unavailable")])
+def test_a_page_that_is_an_error(status: int, reason: str) -> None:
     """Even where the error's own page holds a number."""
-    with page(status, b"Ring current: 1 mA") as url, pytest.raises(DeviceError, match=f"the server answers {told}"):
+    with page(status, b"Ring current: 1 mA") as url, pytest.raises(DeviceError, match=f"the server answers {reason}"):
         ring(url).reading()
 
 

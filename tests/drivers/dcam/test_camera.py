@@ -303,7 +303,7 @@ def test_unplugged_in_a_scan(camera: DcamCamera, world) -> None:
     world.fault("unplugged")
     with pytest.raises(DcamError, match=r"NOCONNECTION \(0x80000F07\)"):
         camera.next_frame(1.0)
-    camera.disarm()  # that it is gone has been said
+    camera.disarm()  # no second report that the camera is gone
     camera.close()
     camera.close()
 

@@ -15,10 +15,10 @@ TARGET = -20.0
 
 
 def cool(world: World, status: Callable[[float], Cooler], rate: float = 0.5) -> Callable[[float, str], None]:
-    """A sensor that cools from 0 °C at `rate` °C/s; plays its part whenever the driver tells its progress."""
+    """A sensor that cools from 0 °C at `rate` °C/s; it is updated whenever the driver reports its progress."""
     begin = world.clock.now()
 
-    def play(celsius: float, said: str) -> None:
+    def play(celsius: float, text: str) -> None:
         now = max(TARGET, -rate * (world.clock.now() + 1.0 - begin))  # as it will be at the next look
         world.override(Property.SENSORTEMPERATURE, now)
         world.override(Property.SENSORCOOLERSTATUS, status(now))
@@ -27,18 +27,18 @@ def cool(world: World, status: Callable[[float], Cooler], rate: float = 0.5) -> 
     return play
 
 
-def test_it_waits_until_the_cooler_is_ready_and_tells_how_far_it_is(camera: DcamCamera, world: World) -> None:
+def test_it_waits_until_the_cooler_is_ready_and_reports_how_far_it_is(camera: DcamCamera, world: World) -> None:
     play = cool(world, lambda celsius: Cooler.READY if celsius <= TARGET else Cooler.BUSY)
-    told: list[tuple[float, str]] = []
+    reports: list[tuple[float, str]] = []
     began = world.clock.now()
     reached = camera.wait_until_cold(
-        120.0, lambda celsius, status: (told.append((celsius, status)), play(celsius, ""))[1]
+        120.0, lambda celsius, status: (reports.append((celsius, status)), play(celsius, ""))[1]
     )
     assert reached == TARGET
     assert world.clock.now() - began == pytest.approx(39, abs=1.5)
-    assert told[-1] == (TARGET, "ready")
-    assert [status for _, status in told[:-1]] == ["busy"] * (len(told) - 1)
-    assert [celsius for celsius, _ in told] == sorted((celsius for celsius, _ in told), reverse=True)
+    assert reports[-1] == (TARGET, "ready")
+    assert [status for _, status in reports[:-1]] == ["busy"] * (len(reports) - 1)
+    assert [celsius for celsius, _ in reports] == sorted((celsius for celsius, _ in reports), reverse=True)
 
 
 @pytest.mark.parametrize("status", [Cooler.ALWAYS, Cooler.NONE, None])
@@ -49,7 +49,7 @@ def test_a_cooler_that_does_not_say_so_is_done_when_the_temperature_is_steady(
     if status is None:
         world.fault("unsupported", Property.SENSORCOOLERSTATUS)
 
-        def play(celsius: float, said: str, begin: float = world.clock.now()) -> None:
+        def play(celsius: float, text: str, begin: float = world.clock.now()) -> None:
             world.override(Property.SENSORTEMPERATURE, max(TARGET, -0.5 * (world.clock.now() + 1.0 - begin)))
 
     began = world.clock.now()

@@ -55,8 +55,8 @@ def test_an_option_reaches_the_camera_and_one_that_it_ignores_is_noticed(
     with connected(world, **option) as camera:
         assert world.value(prop) == value
         if prop not in (Property.DEFECTCORRECT_MODE, Property.HOTPIXELCORRECT_LEVEL):
-            ((name, said),) = option.items()
-            assert camera.describe()[name] == said
+            ((name, chosen),) = option.items()
+            assert camera.describe()[name] == chosen
     world.reset()
     stuck = world.value(prop) if world.value(prop) != value else value + 1
     world.override(prop, stuck)

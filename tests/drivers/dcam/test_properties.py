@@ -108,11 +108,11 @@ def test_full_frame_timing_is_that_of_the_data_sheet(world, readout: str, trigge
     camera = world.connect()
     settings = CameraSettings(0.02, trigger, readout=readout)
     camera.configure(settings)
-    told, planned = camera.timing, orca_quest.timing(settings, link="coaxpress")
+    reported, planned = camera.timing, orca_quest.timing(settings, link="coaxpress")
     camera.close()
-    assert (told.shape, told.bits) == (planned.shape, planned.bits)
-    assert (told.min_period, told.readout) == pytest.approx((planned.min_period, planned.readout), rel=1e-9)
-    assert told.row_period == pytest.approx(planned.row_period, rel=1e-9)
+    assert (reported.shape, reported.bits) == (planned.shape, planned.bits)
+    assert (reported.min_period, reported.readout) == pytest.approx((planned.min_period, planned.readout), rel=1e-9)
+    assert reported.row_period == pytest.approx(planned.row_period, rel=1e-9)
 
 
 def test_rows_of_a_binned_region_start_two_line_times_apart(camera: DcamCamera) -> None:

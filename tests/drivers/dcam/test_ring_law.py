@@ -40,7 +40,7 @@ def test_every_exposure_is_taken_once_in_order_or_counted_as_lost(fake_library: 
         nonlocal errors
         for _ in range(n):
             before = len(taken)
-            for _ in range(2):  # an overrun is said at most once before a frame comes
+            for _ in range(2):  # an overrun is reported at most once before a frame comes
                 try:
                     taken.append(camera.next_frame(0.0))
                 except DeviceTimeout:

@@ -24,7 +24,7 @@ def assert_speaks(error: BaseException | None, device: str, replied: bool = True
     assert all(getattr(error, part).rstrip(".") in str(error) for part in PARTS if part != "request")
 
 
-def assert_told_once(scanned: Scanned) -> None:
+def assert_reported_once(scanned: Scanned) -> None:
     """The run fails once, with the words of the error that it raises, which is not among the warnings too."""
     assert scanned.error is not None
     assert [event.data["message"] for event in scanned.of("failed")] == [str(scanned.error)]
@@ -36,20 +36,20 @@ def assert_at_rest(rig: Rig, scanned: Scanned) -> None:
     assert not rig.moving
     assert not rig.shutter_open
     assert rig.world.live == 0
-    said = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
-    assert said == ([] if scanned.folder is None else [MESSAGES[State.STOPPING]])
+    messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
+    assert messages == ([] if scanned.folder is None else [MESSAGES[State.STOPPING]])
 
 
 def assert_known_to_be_unsafe(rig: Rig, scanned: Scanned) -> None:
     """The line is gone, so nothing can be done: that is what the run must say."""
     assert rig.world.live == 0
-    said = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
-    assert said == [UNSAFE]
-    told = " ".join([*scanned.warnings, str(scanned.error)])
-    assert "The device may still be doing what it did before" in told
+    messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
+    assert messages == [UNSAFE]
+    text = " ".join([*scanned.warnings, str(scanned.error)])
+    assert "The device may still be doing what it did before" in text
     if rig.shutter_open:
-        assert "shutter: it could not be closed" in told
-        assert "look before anybody goes near the beam" in told
+        assert "shutter: it could not be closed" in text
+        assert "look before anybody goes near the beam" in text
 
 
 def assert_kept(scanned: Scanned, views: list[int] | None = None, invalid: int = 0) -> None:

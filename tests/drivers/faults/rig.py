@@ -72,7 +72,7 @@ class Kind:
     """A controller: how it is configured and built, and what can be seen of it from outside.
 
     Attributes:
-        arming, disarming: requests by which the phases are told apart.
+        arming, disarming: requests by which the phases are distinguished.
         line_end: of what it sends.
         unasked: a line that it (or noise that looks like one) may send without being asked.
         stop: how another program tells it to stop.

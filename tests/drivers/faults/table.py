@@ -26,7 +26,7 @@ class LineFault:
 
     Attributes:
         spoil: the reply as it arrives instead; the same where it is the next one's turn.
-        error: the class of the error; `seen`: words of it, which the page has too.
+        error: the class of the error; `words`: a part of its message, which the page quotes too.
         replied: something arrived, which the error must show.
         phases: of the scan, in which it is tried.
         not_on: controller -> why it cannot happen there.
@@ -36,7 +36,7 @@ class LineFault:
     fault: str
     spoil: Callable[[Rig, bytes], bytes]
     error: type[DeviceError]
-    seen: str
+    words: str
     replied: bool
     phases: tuple[Phase, ...] = (Phase.OPENING, Phase.TURNING)
     not_on: Mapping[str, str] = field(default_factory=dict)
@@ -117,7 +117,7 @@ class MotionFault:
     fault: str
     breaks: Callable[[Rig], None]
     says: Mapping[str, str]
-    seen: str = "it stopped short of"
+    words: str = "it stopped short of"
 
 
 def _stop_after_view_5(rig: Rig) -> None:
@@ -154,7 +154,7 @@ class PulseFault:
 
     fault: str
     breaks: Callable[[Rig], None]
-    seen: str
+    words: str
     missing: tuple[int, ...] = ()
     invalid: int = 0
 
@@ -195,7 +195,7 @@ class CameraFault:
 
     fault: str
     error: type[Exception]
-    seen: str
+    words: str
 
 
 CAMERA: tuple[CameraFault, ...] = (
@@ -210,10 +210,10 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("slow link", LedgerError, "`beamline doctor` looks at its link"),
 )
 
-SEEN: Mapping[str, str] = MappingProxyType(
-    {row.fault: row.seen for row in LINE}
+WORDS: Mapping[str, str] = MappingProxyType(
+    {row.fault: row.words for row in LINE}
     | {UNPLUGGED: PORT_FAILED}
-    | {row.fault: row.seen for row in (*MOTION, *PULSES, *CAMERA)}
+    | {row.fault: row.words for row in (*MOTION, *PULSES, *CAMERA)}
 )
 """Every fault, in the order of docs/faults.md -> words that the operator sees."""
 

@@ -21,8 +21,8 @@ from tests.drivers.faults.aftermath import (
     assert_complete,
     assert_kept,
     assert_next_scan_works,
+    assert_reported_once,
     assert_speaks,
-    assert_told_once,
 )
 from tests.drivers.faults.rig import VIEWS, Rig, Scanned
 from tests.drivers.usb_bus import Bus, Descriptor
@@ -46,7 +46,7 @@ def but(*missing: int) -> list[int]:
 
 def assert_ends_as(fault: str, scanned: Scanned) -> None:
     assert isinstance(scanned.error, ROWS[fault].error), scanned.error
-    assert ROWS[fault].seen in str(scanned.error)
+    assert ROWS[fault].words in str(scanned.error)
 
 
 def missing_views(scanned: Scanned) -> list[int]:
@@ -87,23 +87,23 @@ def calls_of_a_scan(library: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 @pytest.mark.parametrize("call", CALLS)
 def test_an_error_of_the_library(rig: Rig, call: str, calls_of_a_scan: dict[str, int], tmp_path: Path) -> None:
     """At the first, a middle and the last such call of a scan: it ends with that error; or, where it came while frames
-    were waited for, it is told and nothing is lost, or what is lost is named."""
+    were waited for, it is reported and nothing is lost, or what is lost is named."""
     n = calls_of_a_scan[call]
     assert n > 0
     for nth in sorted({1, (n + 1) // 2, n}):
         rig.after_connecting = lambda nth=nth: rig.world.fail(call, Error.FAILREADCAMERA, nth)  # type: ignore[misc]
         scanned = rig.scan(tmp_path)
-        told = [message for message in scanned.warnings if "FAILREADCAMERA" in message]
+        reports = [message for message in scanned.warnings if "FAILREADCAMERA" in message]
         if scanned.error is None or isinstance(scanned.error, LedgerError):
-            assert len(told) == 1 and call in told[0], nth
-            assert_complete(scanned) if scanned.error is None else assert_told_once(scanned)
+            assert len(reports) == 1 and call in reports[0], nth
+            assert_complete(scanned) if scanned.error is None else assert_reported_once(scanned)
         else:
             assert_ends_as("an error of the library", scanned)
             assert isinstance(scanned.error, DcamError)
             assert scanned.error.code == Error.FAILREADCAMERA
             assert scanned.error.request.split()[0] == call
             assert_speaks(scanned.error, "camera")
-            assert told == []
+            assert reports == []
         assert_at_rest(rig, scanned)
         assert_next_scan_works(rig, tmp_path)
 
@@ -124,7 +124,7 @@ def test_frame_lost_in_the_camera(rig: Rig, tmp_path: Path) -> None:
     assert_ends_as("frame lost in the camera", scanned)
     assert missing_views(scanned) == [3, 7]
     assert "2 were exposed" in str(scanned.error)
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, but(3, 7))
     assert_next_scan_works(rig, tmp_path)
@@ -140,7 +140,7 @@ def test_ring_overrun(rig_of: RigOf, tmp_path: Path) -> None:
     assert re.search(r"its ring of 2 frames was overrun and \d frames are lost", warning)
     lost = missing_views(scanned)
     assert lost == list(range(5, 5 + len(lost))) and 2 <= len(lost) <= 4
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, but(*lost))
     assert_next_scan_works(rig, tmp_path)
@@ -151,7 +151,7 @@ def test_camera_unplugged(rig: Rig, tmp_path: Path) -> None:
     scanned = rig.scan(tmp_path)
     assert_ends_as("camera unplugged", scanned)
     assert_speaks(scanned.error, "camera")
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned)
     assert_next_scan_works(rig, tmp_path)
@@ -167,18 +167,18 @@ def test_triggers_planned_too_fast(rig: Rig, tmp_path: Path) -> None:
 
 
 def test_triggers_too_fast(rig: Rig, tmp_path: Path) -> None:
-    """It needs longer than it said, and ignores every second pulse without a word."""
-    said = rig.world.value(Property.TIMING_MINTRIGGERINTERVAL)
+    """It needs longer than it reports, and silently ignores every second pulse."""
+    reported = rig.world.value(Property.TIMING_MINTRIGGERINTERVAL)
     rig.at_frame[0] = lambda: rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, 0.15)
     scanned = rig.scan(tmp_path)
     assert_ends_as("triggers too fast", scanned)
     odd = list(range(1, VIEWS, 2))
     assert missing_views(scanned) == odd
     assert "a longer period_s leaves the camera more time" in str(scanned.error)
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, but(*odd))
-    rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, said)
+    rig.world.override(Property.TIMING_MINTRIGGERINTERVAL, reported)
     assert_next_scan_works(rig, tmp_path)
 
 
@@ -207,7 +207,7 @@ def test_setting_refused(rig: Rig, when: str, tmp_path: Path) -> None:
     if when == "before the scan":
         assert scanned.folder is None
     else:
-        assert_told_once(scanned)
+        assert_reported_once(scanned)
         assert_kept(scanned, [])
     assert_next_scan_works(rig, tmp_path)
 
@@ -222,7 +222,7 @@ def test_slow_link(rig: Rig, tmp_path: Path) -> None:
     scanned = rig.scan(tmp_path)
     assert_ends_as("slow link", scanned)
     assert missing_views(scanned) == odd
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, but(*odd))
     assert_next_scan_works(rig, tmp_path)

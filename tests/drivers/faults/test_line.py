@@ -14,8 +14,8 @@ from tests.drivers.faults.aftermath import (
     assert_kept,
     assert_known_to_be_unsafe,
     assert_next_scan_works,
+    assert_reported_once,
     assert_speaks,
-    assert_told_once,
 )
 from tests.drivers.faults.rig import KINDS, Phase, Rig
 
@@ -58,13 +58,13 @@ def test_one_bad_reply(rig_of: RigOf, row: table.LineFault, kind: str, phase: Ph
         assert scanned.warnings == []
     else:
         assert isinstance(scanned.error, row.error)
-        assert row.seen in str(scanned.error)
+        assert row.words in str(scanned.error)
         assert_speaks(scanned.error, "stage", row.replied)
         if phase is Phase.OPENING:
             assert scanned.folder is None
             assert "Nothing has moved" in str(scanned.error)
         else:
-            assert_told_once(scanned)
+            assert_reported_once(scanned)
             assert_kept(scanned)
             assert "the stage may be turning" in str(scanned.error)
     assert_next_scan_works(rig, tmp_path)
@@ -82,7 +82,7 @@ def test_stage_unplugged(rig_of: RigOf, kind: str, phase: Phase, tmp_path: Path)
         assert scanned.folder is None
         assert_at_rest(rig, scanned)
     else:
-        assert_told_once(scanned)
+        assert_reported_once(scanned)
         assert_known_to_be_unsafe(rig, scanned)
         assert_kept(scanned)
     assert_next_scan_works(rig, tmp_path)
@@ -95,7 +95,7 @@ def test_stage_unplugged_while_it_turns_and_nobody_asks_it(rig_of: RigOf, kind: 
     rig.at_frame[table.FIRST_VIEW + 5] = rig.cable.pull
     scanned = rig.scan(tmp_path)
     assert_speaks(scanned.error, "stage", replied=False)
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_known_to_be_unsafe(rig, scanned)
     assert_kept(scanned, list(range(12)))
     assert_next_scan_works(rig, tmp_path)

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from beamline.scan.run import MESSAGES, UNSAFE, State
-from tests.drivers.faults.table import SEEN
+from tests.drivers.faults.table import WORDS
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
@@ -18,12 +18,12 @@ ROWS = [
 
 
 def test_rows_are_those_of_the_table() -> None:
-    assert [row[0] for row in ROWS] == list(SEEN)
+    assert [row[0] for row in ROWS] == list(WORDS)
 
 
 def test_every_row_says_what_is_seen_what_was_done_and_what_to_do() -> None:
     for fault, seen, done, advice in ROWS:
-        assert SEEN[fault] in seen, fault
+        assert WORDS[fault] in seen, fault
         assert done and advice, fault
 
 

@@ -15,8 +15,8 @@ from tests.drivers.faults.aftermath import (
     assert_at_rest,
     assert_kept,
     assert_next_scan_works,
+    assert_reported_once,
     assert_speaks,
-    assert_told_once,
 )
 from tests.drivers.faults.rig import KINDS, VIEWS, Rig
 
@@ -31,9 +31,9 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     row.breaks(rig)
     scanned = rig.scan(tmp_path)
     assert_speaks(scanned.error, "stage")
-    assert re.search(rf"{row.seen} 38\.0000 deg.*It stands at 2[1-5]\.", str(scanned.error))
+    assert re.search(rf"{row.words} 38\.0000 deg.*It stands at 2[1-5]\.", str(scanned.error))
     assert re.search(row.says[kind], str(scanned.error))
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert scanned.warnings == []
     assert_at_rest(rig, scanned)
     assert_kept(scanned)
@@ -51,9 +51,9 @@ def test_a_stage_that_stops_early_in_a_step_scan(
     row.breaks(rig)
     scanned = rig.scan(tmp_path, "scan.mode=step")
     assert_speaks(scanned.error, "stage")
-    assert f"{row.seen} 22.0000 deg" in str(scanned.error)
+    assert f"{row.words} 22.0000 deg" in str(scanned.error)
     assert re.search(row.says[kind], str(scanned.error))
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, list(range(6)))
     assert_next_scan_works(rig, tmp_path)
@@ -68,10 +68,10 @@ def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     row.breaks(rig)
     scanned = rig.scan(tmp_path)
     assert isinstance(scanned.error, LedgerError)
-    assert row.seen in str(scanned.error)
+    assert row.words in str(scanned.error)
     assert "Repeat these views, or reconstruct without them" in str(scanned.error)
     assert [index - table.FIRST_VIEW for index in scanned.error.missing] == list(row.missing)
-    assert_told_once(scanned)
+    assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, [view for view in range(VIEWS) if view not in row.missing], row.invalid)
     assert_next_scan_works(rig, tmp_path)

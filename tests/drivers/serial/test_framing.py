@@ -28,7 +28,7 @@ class Script:
     def __init__(self, *replies: bytes, end: bytes = b"\n") -> None:
         self.clock = VirtualClock(start=0.0)
         self.heard: list[bytes] = []
-        self.said: list[bytes] = []
+        self.sent: list[bytes] = []
         self.waiting = b""
         self._replies, self._end = list(replies), end
 
@@ -42,7 +42,7 @@ class Script:
     def transmit(self) -> bytes:
         data, self.waiting = self.waiting, b""
         if data:
-            self.said.append(data)
+            self.sent.append(data)
         return data
 
 
@@ -217,7 +217,7 @@ def test_the_transcript_has_every_byte_and_when_it_went(
     line.close()
     entries = read_transcript(path)
     assert b"".join(data for _, mark, data in entries if mark == ">") == b"".join(wire.heard)
-    assert b"".join(data for _, mark, data in entries if mark == "<") == b"".join(wire.said)
+    assert b"".join(data for _, mark, data in entries if mark == "<") == b"".join(wire.sent)
     times = [time for time, _, _ in entries]
     assert times == sorted(times)
     assert all(3.0 <= time <= wire.clock.now() + 1e-6 for time in times)

@@ -261,8 +261,8 @@ def test_a_device_that_stays_silent_is_told_with_the_request_that_it_first_misse
         ask(line, 1)
     with pytest.raises(DeviceTimeout) as error:
         ask(line, 2)
-    said = [entry.split(" (")[0] for entry in error.value.wire.split(", ")]
-    assert said == ["> N?1", "! out of step: probing", "> ID?"]
+    lines = [entry.split(" (")[0] for entry in error.value.wire.split(", ")]
+    assert lines == ["> N?1", "! out of step: probing", "> ID?"]
 
 
 def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
@@ -271,10 +271,10 @@ def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
         ask(line, n)
     with pytest.raises(DeviceError, match="does not have the form") as error:
         ask(line, 9)
-    told = error.value.wire.split(", ")
-    assert len(told) == RECENT_LINES
-    assert told[0].startswith("> N?7 ")
-    assert told[-1].startswith("< " + "x" * 40 + "... (")
+    lines = error.value.wire.split(", ")
+    assert len(lines) == RECENT_LINES
+    assert lines[0].startswith("> N?7 ")
+    assert lines[-1].startswith("< " + "x" * 40 + "... (")
     assert len(error.value.wire) < 300
 
 

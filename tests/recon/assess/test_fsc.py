@@ -32,7 +32,7 @@ def test_a_volume_agrees_with_itself_whatever_its_gain_and_offset(
     mask = soft_cylinder(shape) if masked else None
     found = fourier_shell_correlation(volume, 3e-4 * volume + 7, 0.5, mask)
     np.testing.assert_allclose(found.correlation, 1, atol=1e-5)
-    assert found.resolution_mm == pytest.approx(1.0)  # two voxels: nothing finer can be told
+    assert found.resolution_mm == pytest.approx(1.0)  # two voxels: nothing finer can be resolved
     np.testing.assert_allclose(fourier_shell_correlation(volume, -volume, 0.5, mask).correlation, -1, atol=1e-5)
 
 
@@ -41,7 +41,7 @@ def test_a_volume_agrees_with_itself_whatever_its_gain_and_offset(
 def test_white_noise_scatters_about_zero_by_what_is_said(
     rng: np.random.Generator, shape: tuple[int, int, int], masked: bool
 ) -> None:
-    """The mean of (correlation² x independent) is 1; under a mask shells hold more than is said, by at most twice."""
+    """The mean of (correlation² x independent) is 1; under a mask shells hold more than stated, at most twice."""
     mask = soft_cylinder(shape) if masked else None
     scores = []
     for _ in range(12):
@@ -131,7 +131,7 @@ def test_the_soft_cylinder() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "options", "said"),
+    ("first", "second", "options", "message"),
     [
         (np.zeros((4, 4, 4)), np.zeros((4, 4, 5)), {}, "one shape"),
         (np.zeros((4, 4)), np.zeros((4, 4)), {}, "one shape"),
@@ -143,9 +143,9 @@ def test_the_soft_cylinder() -> None:
     ],
 )
 def test_what_cannot_be_compared(
-    first: NDArray[np.float64], second: NDArray[np.float64], options: dict[str, object], said: str
+    first: NDArray[np.float64], second: NDArray[np.float64], options: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         fourier_shell_correlation(first, second, **options)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="0 to 1"):
         soft_cylinder((4, 4, 4), 2)

@@ -34,7 +34,7 @@ BUDGETS = st.floats(0.1, 1e5)
 
 
 def _cost(choice: Choice, speeds: Speeds) -> float:
-    """What a choice takes by the speeds it was made from, written out once more."""
+    """Time that a choice takes at the given speeds, computed independently."""
     time = speeds.fbp / choice.binning**3
     if choice.fits:
         ratios = [(c, choice.binning // c.binning) for c in CURVES if c.binning == min(choice.binning, 2)]
@@ -122,7 +122,7 @@ def test_a_fit_is_told_what_fits_of_other_lengths_gained(steps: int, seconds: fl
     if found.measurable:
         most = max(found.seconds / seconds, 0) + 1
         assert most <= 10 + 1e-9
-        # A curve of the middle does what was said of it: a dB more after so many times the steps.
+        # The middle curve gains a dB after that many times the steps.
         curves = [c for c in CURVES if c.binning == 1]
         inside = [c for c in curves if c.points[0][0] <= steps and steps * most <= c.points[-1][0]]
         gains = [c.gain(steps * most) - c.gain(steps) for c in inside]

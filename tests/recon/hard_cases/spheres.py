@@ -1,4 +1,4 @@
-"""Spheres with sharp edges and their exact projections: data that no Gaussian has made."""
+"""Spheres with sharp edges and their exact projections: data that Gaussians cannot represent exactly."""
 
 from __future__ import annotations
 

@@ -31,11 +31,11 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettin
     data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
     weights = (rng.random(data.shape) > 0.1).astype(np.float32)
     problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
-    state, told = fit.init(g, 11, 1.5, backend), []
+    state, records = fit.init(g, 11, 1.5, backend), []
     fit.run_steps(
-        state, problem, settings, 5, lambda s: told.append((s.n, float(s.loss), float(s.residual))) is not None
+        state, problem, settings, 5, lambda s: records.append((s.n, float(s.loss), float(s.residual))) is not None
     )
-    return state, [*told, fit.misfit_of(state, problem, settings)]
+    return state, [*records, fit.misfit_of(state, problem, settings)]
 
 
 @pytest.mark.parametrize(
@@ -52,9 +52,11 @@ def test_a_fit_is_the_same_on_both_backends(make: object, changes: dict, random_
     settings = FitSettings(
         truncation=Truncation(9.0, 1e-12), policy=policy, tv_size=5, pace=10.0, smallest=0.8, **changes
     )
-    (ours, said), (theirs, told) = (_fit(backend, g, geometry, settings) for backend in (Cpu(), backend_for("cuda")))
-    assert len({n for n, *_ in said[:-1]}) > 1  # density control changed the model
-    np.testing.assert_allclose(np.hstack(told), np.hstack(said), rtol=2e-5)
+    (ours, our_records), (theirs, their_records) = (
+        _fit(backend, g, geometry, settings) for backend in (Cpu(), backend_for("cuda"))
+    )
+    assert len({n for n, *_ in our_records[:-1]}) > 1  # density control changed the model
+    np.testing.assert_allclose(np.hstack(their_records), np.hstack(our_records), rtol=2e-5)
     device = backend_for("cuda")
     for name in NAMES:
         a, b = ours.parameters[name], device.numpy(theirs.parameters[name])

@@ -7,7 +7,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drivers.fuzz import received, told
+from tests.drivers.fuzz import received, replies
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 COMMANDS = [
@@ -21,7 +21,7 @@ COMMANDS = [
 @given(st.lists(st.tuples(received(COMMANDS), st.floats(0.0, 3.0)), max_size=12))
 def test_fuzz_whatever_it_receives_it_answers_on(story: list[tuple[bytes, float]]) -> None:
     rig = Rig(low=-30.0, high=30.0)
-    for _ in told(rig.controller, story, b"\n"):
+    for _ in replies(rig.controller, story, b"\n"):
         assert abs(math.degrees(rig.line.angle_at(rig.clock.now()))) <= 30.0
     rig.say("", "")
     assert rig.say("CSV?") == "2.0"

@@ -8,7 +8,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drivers.fuzz import received, told
+from tests.drivers.fuzz import received, replies
 from tests.simulators.pm16c_host import Wire
 
 COMMANDS = [
@@ -27,7 +27,7 @@ REPLY = rb"[\x20-\x7e]+"
 def test_fuzz_whatever_it_receives_it_answers_on(story: list[tuple[bytes, float]]) -> None:
     wire = Wire()
     begun = time.perf_counter()
-    for lines in told(wire.box, story, b"\r\n"):
+    for lines in replies(wire.box, story, b"\r\n"):
         assert all(re.fullmatch(REPLY, line) for line in lines)
     wire.box.receive(b"\r\n")
     wire.box.transmit()

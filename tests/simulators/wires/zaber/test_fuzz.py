@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drivers.fuzz import received, told
+from tests.drivers.fuzz import received, replies
 from tests.drivers.zaber_rig import Rig
 
 COMMANDS = [
@@ -23,7 +23,7 @@ COMMANDS = [
 @given(st.lists(st.tuples(received(COMMANDS), st.floats(0.0, 3.0)), max_size=12))
 def test_fuzz_whatever_it_receives_it_answers_on(story: list[tuple[bytes, float]]) -> None:
     rig = Rig()
-    for _ in told(rig.controller, story, b"\r\n"):
+    for _ in replies(rig.controller, story, b"\r\n"):
         pass
     rig.controller.receive(b"\n")
     rig.controller.transmit()
