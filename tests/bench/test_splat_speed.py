@@ -115,7 +115,7 @@ def _scatter(table: torch.Tensor, side: int) -> torch.Tensor:
 
 
 @pytest.mark.bench
-def test_projection_against_the_machine_and_the_scatter_twin() -> None:
+def test_projection_against_the_machine_and_the_scatter_reference() -> None:
     _, table, pairs = _table(N, SIDE)
     image, layers = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE)
     slope, room = np.random.default_rng(1).normal(size=image.shape).astype(np.float32), np.empty((N, 6), np.float32)
@@ -138,12 +138,12 @@ def test_projection_against_the_machine_and_the_scatter_twin() -> None:
         leaf.grad = None
         _scatter(leaf, SIDE).backward(torch.from_numpy(slope))
 
-    twin = _times(there_and_back, 5)
+    reference = _times(there_and_back, 5)
     _line("render + moments", (total,) * 4)
-    _line("scatter twin, with autograd", twin, f"{twin[0] / total:.0f} x as long")
+    _line("scatter reference, with autograd", reference, f"{reference[0] / total:.0f} x as long")
     render(table, image, layers)
     np.testing.assert_allclose(image, _scatter(leaf, SIDE).detach().numpy(), atol=0.01 * float(image.max()))
-    assert twin[0] > 10 * total
+    assert reference[0] > 10 * total
 
 
 @pytest.mark.bench
