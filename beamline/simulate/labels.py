@@ -18,7 +18,7 @@ Region = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class Run:
+class LabelledRun:
     """One anomaly in consecutive frames.
 
     Attributes:
@@ -45,18 +45,18 @@ class LabelLog:
     def add(self, frame: int, labels: Sequence[Label]) -> None:
         self._frames.extend((frame, label) for label in labels)
 
-    def runs(self, n_frames: float = math.inf) -> tuple[Run, ...]:
+    def runs(self, n_frames: float = math.inf) -> tuple[LabelledRun, ...]:
         """Runs in the order of their first frames, of the first `n_frames` only."""
-        open_runs: dict[tuple[str, int], Run] = {}
-        done: list[Run] = []
+        open_runs: dict[tuple[str, int], LabelledRun] = {}
+        done: list[LabelledRun] = []
         for frame, label in (entry for entry in self._frames if entry[0] < n_frames):
             body = label.kind, label.which
             run = open_runs.get(body)
             if run is not None and run.last == frame - 1:
-                open_runs[body] = Run(run.kind, run.first, (*run.regions, label.region))
+                open_runs[body] = LabelledRun(run.kind, run.first, (*run.regions, label.region))
                 continue
             done += [run] if run is not None else []
-            open_runs[body] = Run(label.kind, frame, (label.region,))
+            open_runs[body] = LabelledRun(label.kind, frame, (label.region,))
         return tuple(sorted([*done, *open_runs.values()], key=lambda run: (run.first, run.kind)))
 
 
@@ -65,7 +65,7 @@ def labels_path(scan: Path) -> Path:
     return scan.with_suffix(".labels.json")
 
 
-def write_labels(path: Path, runs: Sequence[Run], n_frames: int) -> None:
+def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None:
     """Write the labels, also where there are none. The file is complete or absent.
 
     Raises:
@@ -83,10 +83,10 @@ def write_labels(path: Path, runs: Sequence[Run], n_frames: int) -> None:
         partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
-def read_labels(path: Path) -> tuple[Run, ...]:
+def read_labels(path: Path) -> tuple[LabelledRun, ...]:
     """The labels of a file from `write_labels`."""
     content = json.loads(path.read_text(encoding="utf-8"))
     return tuple(
-        Run(entry["kind"], entry["first_frame"], tuple(tuple(region) for region in entry["regions"]))
+        LabelledRun(entry["kind"], entry["first_frame"], tuple(tuple(region) for region in entry["regions"]))
         for entry in content["anomalies"]
     )

@@ -17,7 +17,7 @@ from beamline.core.text import size
 from beamline.storage.volume_file import read_volume
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
-from simulators.scenes.explain import Explained, explain
+from simulators.scenes.explain import FrameCost, explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
 from simulators.scenes.settings import MOST_FRAMES
@@ -106,12 +106,12 @@ def exposure_errors(scene: str) -> Iterator[None]:
         raise ConfigError(f"{scene} cannot be exposed: {error}.") from error
 
 
-def frame_cost(scan: Scan, now: Callable[[], float]) -> Explained:
+def frame_cost(scan: Scan, now: Callable[[], float]) -> FrameCost:
     """The cost of the view in the middle of the scan, where an anomaly is likeliest."""
     return explain(scan.scene, scan.frame(len(scan) - 1 - scan.views // 2).shot, now)
 
 
-def cost_table(found: Explained) -> str:
+def cost_table(found: FrameCost) -> str:
     """A line for each step, in order, and the effects that the scene does not name."""
     lines = [f"{'step':<22}{'acts on':<15}{'ms/frame':>9}{'memory':>10}  what happens"]
     for cost in found.costs:

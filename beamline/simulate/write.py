@@ -17,7 +17,7 @@ from beamline.core.files import refuse_existing
 from beamline.core.text import size
 from beamline.monitor.digest import digest
 from beamline.plan.limits import ROOM
-from beamline.simulate.labels import LabelLog, Run, labels_path, write_labels
+from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
 from beamline.simulate.scene_file import SceneFile
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import Clock
@@ -25,7 +25,7 @@ from drivers.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from simulators.effects.anomaly import Label
 from simulators.scenes.expose import expose
-from simulators.scenes.shots import Planned, Scan
+from simulators.scenes.shots import PlannedFrame, Scan
 
 PREVIEW_BIN = 4
 REPORT_EVERY = 0.1  # s of real time between `frame` events
@@ -38,7 +38,7 @@ class Simulated:
     path: Path
     labels: Path
     n_frames: int
-    runs: tuple[Run, ...]
+    runs: tuple[LabelledRun, ...]
     seconds: float
     stopped: bool
 
@@ -97,7 +97,7 @@ def write_scan(
     return Simulated(out, labels, n, runs, time.monotonic() - start, n < len(scan))
 
 
-def _write(scan: Scan, planned: Planned, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:
+def _write(scan: Scan, planned: PlannedFrame, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:
     shot = planned.shot
     counts = expose(scan.scene, shot)
     angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan

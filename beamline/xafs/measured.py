@@ -29,14 +29,14 @@ _KEV = {"keV": 1.0, "eV": 1e-3}
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class AbsorptionTable:
     """Energies in keV and absorption of a file, each [n]."""
 
     energies: Reals
     absorption: Reals
 
 
-def read_table(path: Path, unit: str | None) -> Table:
+def read_table(path: Path, unit: str | None) -> AbsorptionTable:
     """Two columns of text, energy and absorption, separated by commas, semicolons, tabs or blanks; lines that begin
     with a letter, # or % are skipped. With another separator the comma may be the decimal point.
 
@@ -60,7 +60,7 @@ def read_table(path: Path, unit: str | None) -> Table:
             raise DataError(f"{path}, line {number}: {line.strip()!r} is not an energy and an absorption.") from None
         rows.append((energy, absorption))
     values = np.array(rows, dtype=np.float64).reshape(-1, 2)
-    return Table(_in_kev(path, values[:, 0], unit), _finite(path, "absorption", values[:, 1]))
+    return AbsorptionTable(_in_kev(path, values[:, 0], unit), _finite(path, "absorption", values[:, 1]))
 
 
 def _fields(line: str) -> list[str]:
@@ -107,7 +107,7 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
                 f"{path}: {energies[np.argmin(rises)]:.9g} keV occurs more than once; average the values of "
                 "each energy. Nothing was written."
             )
-        if isinstance(source, Table):
+        if isinstance(source, AbsorptionTable):
             if options.region or options.around:
                 raise ConfigError(f"{path} has no frames, so that regions do not apply. Nothing was written.")
             yield Curve(energies, source.absorption[kept], unit="as in the file")
@@ -139,7 +139,7 @@ def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
 
 
 @contextmanager
-def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[Table | Radiographs]:
+def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[AbsorptionTable | Radiographs]:
     """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col] beside `flats`
     ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]).
 
@@ -156,7 +156,7 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
     with hdf5.open_hdf5(path) as file:
         energies = _energies(path, file, unit)
         if (mu := _numbers(path, file, "mu")) is not None:
-            yield Table(energies, _finite(path, "mu", _like(path, "mu", mu, energies)))
+            yield AbsorptionTable(energies, _finite(path, "mu", _like(path, "mu", mu, energies)))
             return
         frames, flats = _needed(path, file, "frames"), _numbers(path, file, "flats")
         if frames.ndim != 3 or frames.shape[0] != energies.size or 0 in frames.shape[1:]:

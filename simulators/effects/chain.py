@@ -16,7 +16,7 @@ from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Moments, Shot
 
-Watch: TypeAlias = Callable[[str], AbstractContextManager[object]]
+StepHook: TypeAlias = Callable[[str], AbstractContextManager[object]]
 """A context that is entered with the name of each step of an exposure, to measure its cost."""
 
 
@@ -114,11 +114,11 @@ class Chain:
                 pose = effect.pose(pose, times, shot)
         return pose
 
-    def apply(self, domain: Domain, image: Image, shot: Shot, watch: Watch = nullcontext) -> Image:
+    def apply(self, domain: Domain, image: Image, shot: Shot, on_step: StepHook = nullcontext) -> Image:
         """The image after the effects of one domain."""
         for effect in self.effects:
             if effect.domain == domain and isinstance(effect, ImageEffect):
-                with watch(effect.name):
+                with on_step(effect.name):
                     image = effect.apply(image, shot)
         return image
 

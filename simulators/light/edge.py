@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Reals = NDArray[np.float64]
-Table = Callable[[Reals], Reals]
+MassAttenuation = Callable[[Reals], Reals]
 """Mass attenuation in cm²/g at energies in keV, as tabulated."""
 
 NEAR, FAR = 60.0, 150.0
@@ -64,7 +64,9 @@ and Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most 
 one sample; and every monochromator has an offset of about an eV."""
 
 
-def near_edge(energies: Reals, table: Table, edge: float, level_width: float, shape: KEdge, charge: float) -> Reals:
+def near_edge(
+    energies: Reals, table: MassAttenuation, edge: float, level_width: float, shape: KEdge, charge: float
+) -> Reals:
     """Mass attenuation in cm²/g with the near-edge structure, float64 [energy].
 
     Args:
@@ -97,7 +99,7 @@ def profile(from_line: Reals, level_width: float, shape: KEdge) -> Reals:
     return step + shape.height / (1 + (from_line / (shape.width / 2)) ** 2)
 
 
-def _power_law(table: Table, edge: float, near: float, far: float) -> Table:
+def _power_law(table: MassAttenuation, edge: float, near: float, far: float) -> MassAttenuation:
     """A E^b through the table at two distances (eV) from the edge."""
     x = np.array([edge + near * 1e-3, edge + far * 1e-3])
     y = table(x)

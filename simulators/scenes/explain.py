@@ -51,7 +51,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Explained:
+class FrameCost:
     """Cost of a frame of a scene.
 
     Attributes:
@@ -65,7 +65,7 @@ class Explained:
     unused: tuple[tuple[str, str], ...]
 
 
-def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explained:
+def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCost:
     """Compute the frame `repeats` times in each variant, after one round that is not counted (it compiles).
 
     Args:
@@ -89,7 +89,7 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> Explain
             costs.append(_cost(name, seconds[name], sizes[name]))
     named = {effect.name for effect in scene.chain.effects}
     left = tuple((name, entry.summary) for name, entry in CATALOGUE.items() if name not in named)
-    return Explained(tuple(costs), statistics.median(each.whole[-1] for each in rounds) * 1e3, left)
+    return FrameCost(tuple(costs), statistics.median(each.whole[-1] for each in rounds) * 1e3, left)
 
 
 def _cost(name: str, seconds: float, size: int) -> Cost:

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.chain import Watch
+from simulators.effects.chain import StepHook
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.sensor import digitise, largest_count
@@ -19,28 +19,28 @@ from simulators.samples.sample import Counted
 from simulators.scenes.scene import Scene
 
 
-def expose(scene: Scene, shot: Shot, watch: Watch = nullcontext) -> NDArray[np.uint16]:
+def expose(scene: Scene, shot: Shot, on_step: StepHook = nullcontext) -> NDArray[np.uint16]:
     """One frame, counts uint16 [row, col].
 
     Args:
         shot: the conditions; the same shot gives the same frame.
-        watch: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
+        on_step: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
             or "ideal", where there are no effects and the sample computes the same counts in one step.
     """
     chain = scene.chain
     if not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):
-        with watch("ideal"):
+        with on_step("ideal"):
             return _ideal(scene, scene.sample, shot)
     if shot.beam:
-        photons = _photons(scene, shot, watch)
-        electrons = chain.apply(Domain.PHOTONS, photons, shot, watch)
+        photons = _photons(scene, shot, on_step)
+        electrons = chain.apply(Domain.PHOTONS, photons, shot, on_step)
     else:
         electrons = np.zeros(shot.detector.shape)
-    electrons = chain.apply(Domain.ELECTRONS, electrons, shot, watch)
-    with watch("digitise"):
+    electrons = chain.apply(Domain.ELECTRONS, electrons, shot, on_step)
+    with on_step("digitise"):
         electrons /= shot.conversion
-    counts = chain.apply(Domain.COUNTS, electrons, shot, watch)
-    with watch("digitise"):
+    counts = chain.apply(Domain.COUNTS, electrons, shot, on_step)
+    with on_step("digitise"):
         return digitise(counts, largest_count(shot.readout, shot.binning))
 
 
@@ -61,18 +61,18 @@ def _open_beam(scene: Scene, shot: Shot) -> float:
     return scene.beam.photons_per_s * shot.exposure * shot.binning**2
 
 
-def _photons(scene: Scene, shot: Shot, watch: Watch) -> Image:
+def _photons(scene: Scene, shot: Shot, on_step: StepHook) -> Image:
     """Photons behind the sample, averaged over the moments of the effects of motion; float64 [row, col]."""
     open_beam = _open_beam(scene, shot)
     if not shot.sample:
-        with watch("beer_lambert"):
+        with on_step("beer_lambert"):
             return np.full(shot.detector.shape, open_beam)
     if not scene.chain.moves:
         angle = np.full(shot.detector.shape[0], shot.angle)
-        return _transmission(scene, shot, angle, np.zeros_like(angle), open_beam, watch)
+        return _transmission(scene, shot, angle, np.zeros_like(angle), open_beam, on_step)
     moments = scene.chain.moments(shot)
     parts = (
-        _transmission(scene, shot, _row_angles(times, shot), times, weight * open_beam, watch)
+        _transmission(scene, shot, _row_angles(times, shot), times, weight * open_beam, on_step)
         for times, weight in zip(moments.times, moments.weights, strict=True)
     )
     photons = next(parts)
@@ -82,14 +82,19 @@ def _photons(scene: Scene, shot: Shot, watch: Watch) -> Image:
 
 
 def _transmission(
-    scene: Scene, shot: Shot, angles: NDArray[np.float64], times: NDArray[np.float64], open_beam: float, watch: Watch
+    scene: Scene,
+    shot: Shot,
+    angles: NDArray[np.float64],
+    times: NDArray[np.float64],
+    open_beam: float,
+    on_step: StepHook,
 ) -> Image:
     """open_beam x exp(-line integral) with the sample's pose at one moment of each row."""
     pose = scene.chain.pose(Pose(angles), times, shot)
-    with watch("line_integrals"):
+    with on_step("line_integrals"):
         depth = scene.sample.line_integrals(pose, shot.detector)
-    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot.later(float(times[0])), watch)
-    with watch("beer_lambert"):
+    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot.later(float(times[0])), on_step)
+    with on_step("beer_lambert"):
         return _transmitted(depth, open_beam)
 
 

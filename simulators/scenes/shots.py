@@ -15,7 +15,7 @@ from simulators.scenes.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
+class PlannedFrame:
     """A frame of a scan, computed alone and in any order by `expose(scene, shot)`."""
 
     kind: FrameKind
@@ -77,7 +77,7 @@ class Scan:
         """Radians at the trigger of a view."""
         return math.radians(self.scene.scan.range_deg) * view / self.views
 
-    def frame(self, number: int) -> Planned:
+    def frame(self, number: int) -> PlannedFrame:
         """Frame `number` of 0 ... len - 1.
 
         Raises:
@@ -110,9 +110,9 @@ class Scan:
             frame=number,
             view=max(view, 0),
         )
-        return Planned(kind, shot)
+        return PlannedFrame(kind, shot)
 
-    def __iter__(self) -> Iterator[Planned]:
+    def __iter__(self) -> Iterator[PlannedFrame]:
         return (self.frame(number) for number in range(len(self)))
 
     def _stage(self, time: float, angle: float, turns: bool) -> AngleAt:

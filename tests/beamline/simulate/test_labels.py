@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.simulate.labels import LabelLog, Run, labels_path, read_labels, write_labels
+from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, read_labels, write_labels
 from simulators.effects.anomaly import Label
 
 A, B, C = (0, 4, 0, 4), (1, 5, 1, 5), (2, 6, 2, 6)
@@ -21,7 +21,7 @@ def test_consecutive_frames_of_a_kind_are_one_run() -> None:
     ):
         log.add(frame, labels)
     runs = log.runs()
-    assert runs == (Run("ghost", 1, (A, B)), Run("jump", 2, (C,)), Run("ghost", 4, (C,)))
+    assert runs == (LabelledRun("ghost", 1, (A, B)), LabelledRun("jump", 2, (C,)), LabelledRun("ghost", 4, (C,)))
     assert [run.last for run in runs] == [2, 2, 4]
 
 
@@ -30,13 +30,13 @@ def test_each_of_several_of_a_kind_has_a_run_of_its_own() -> None:
     log.add(0, [Label("floaters", A)])
     log.add(1, [Label("floaters", B), Label("floaters", C, 1)])
     log.add(2, [Label("floaters", A, 1)])
-    assert log.runs() == (Run("floaters", 0, (A, B)), Run("floaters", 1, (C, A)))
+    assert log.runs() == (LabelledRun("floaters", 0, (A, B)), LabelledRun("floaters", 1, (C, A)))
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     path = labels_path(tmp_path / "scan.h5")
     assert path.name == "scan.labels.json"
-    runs = (Run("ghost", 1, (A, B)),)
+    runs = (LabelledRun("ghost", 1, (A, B)),)
     write_labels(path, runs, n_frames=9)
     assert read_labels(path) == runs
     content = json.loads(path.read_text(encoding="utf-8"))

@@ -17,7 +17,7 @@ from beamline.cli.main import main
 from beamline.core.events import Event
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS
 from beamline.monitor.digest import digest
-from beamline.simulate.labels import Run, write_labels
+from beamline.simulate.labels import LabelledRun, write_labels
 from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -138,7 +138,7 @@ def test_truth_file(tmp_path: Path) -> None:
 
 
 def test_labels(tmp_path: Path) -> None:
-    write_labels(tmp_path / "s.labels.json", [Run("floaters", 2, ((0, 1, 2, 3),))], 9)
+    write_labels(tmp_path / "s.labels.json", [LabelledRun("floaters", 2, ((0, 1, 2, 3),))], 9)
     labels = json.loads((tmp_path / "s.labels.json").read_text(encoding="utf-8"))
     found = {*labels, *(f"anomalies.{key}" for key in labels["anomalies"][0])}
     assert unmatched(found, names("Labels")) == (set(), set())
@@ -148,7 +148,7 @@ def test_run_folder_and_events_of_a_scan(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
     assert ran.folder is not None
     found = {path.name for path in ran.folder.iterdir()}
-    assert unmatched(found, names("Run folder")) == (set(), NOT_OF_EVERY_RUN)
+    assert unmatched(found, names("LabelledRun folder")) == (set(), NOT_OF_EVERY_RUN)
     events = [json.loads(line) for line in (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
     assert {"state", "run_started", "frame", "flag", "scan_done", "done"} <= {event["event"] for event in events}
     assert_on_the_page(events)

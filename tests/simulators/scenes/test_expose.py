@@ -87,14 +87,14 @@ def test_deep_shadow_and_amplified_light() -> None:
 def test_the_steps_that_were_taken_are_told() -> None:
     steps: list[str] = []
 
-    def watch(step: str) -> AbstractContextManager[None]:
+    def on_step(step: str) -> AbstractContextManager[None]:
         steps.append(step)
         return nullcontext()
 
-    expose(_scene(ALL), shots.shot(), watch)
+    expose(_scene(ALL), shots.shot(), on_step)
     assert steps == ["ideal"]
     steps.clear()
-    expose(_scene(_Plain(ALL)), shots.shot(), watch)
+    expose(_scene(_Plain(ALL)), shots.shot(), on_step)
     assert steps == ["line_integrals", "beer_lambert", "digitise", "digitise"]
 
 

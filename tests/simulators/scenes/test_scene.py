@@ -43,14 +43,14 @@ def test_a_scene_pays_only_for_what_it_names() -> None:
     """Where no motion is named nobody asks for the stage (_never), and no step is taken that is not named."""
     steps: list[str] = []
 
-    def watch(step: str) -> AbstractContextManager[None]:
+    def on_step(step: str) -> AbstractContextManager[None]:
         steps.append(step)
         return nullcontext()
 
     expose(
         shots.scene({"kind": "beam_profile", "sigma": [1, 1]}, {"kind": "ring_current", "lifetime": 9.0}),
         shots.shot(),
-        watch,
+        on_step,
     )
     assert [step for step in steps if step in CATALOGUE] == ["beam_profile", "ring_current"]
 
