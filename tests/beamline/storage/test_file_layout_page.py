@@ -148,7 +148,7 @@ def test_run_folder_and_events_of_a_scan(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
     assert ran.folder is not None
     found = {path.name for path in ran.folder.iterdir()}
-    assert unmatched(found, names("LabelledRun folder")) == (set(), NOT_OF_EVERY_RUN)
+    assert unmatched(found, names("Run folder")) == (set(), NOT_OF_EVERY_RUN)
     events = [json.loads(line) for line in (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
     assert {"state", "run_started", "frame", "flag", "scan_done", "done"} <= {event["event"] for event in events}
     assert_on_the_page(events)
