@@ -44,6 +44,7 @@ def reconstruct_file(
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     check_device(options.device)
+    _refuse_foreign(options)
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:
@@ -98,6 +99,18 @@ def check_device(device: str) -> None:
         backend_for(device)
     except (ImportError, RuntimeError, ValueError) as error:
         raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
+
+
+def _refuse_foreign(options: ReconOptions) -> None:
+    """Raises ConfigError for options that the method would silently ignore."""
+    given = {
+        "a quality preset": options.quality is not None,
+        "a time budget": options.budget is not None,
+        "checkpoints": options.checkpoints.wanted,
+    }
+    foreign = [name for name, wanted in given.items() if wanted]
+    if foreign and not isinstance(options.method, R2):
+        raise ConfigError(f"{options.method.name} does not take {' and '.join(foreign)}: they are for {R2.name}.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -350,6 +350,22 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
     assert by_name(method).label in (tmp_path / "out.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"quality": "best"}, "a quality preset"),
+        ({"budget": 1.0}, "a time budget"),
+        ({"checkpoints": CheckpointOptions(Path("fit.h5"))}, "checkpoints"),
+    ],
+)
+def test_an_option_that_the_method_would_ignore_is_refused(
+    tmp_path: Path, changes: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"fbp does not take {said}: they are for r2"):
+        reconstruct_file(_options(tmp_path, **changes), lambda e: None, SystemClock())
+    assert _names(tmp_path) == {"scan.h5"}
+
+
 def test_a_device_that_is_not_there_is_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--device abacus"):
         reconstruct_file(_options(tmp_path, **FIT, device="abacus"), lambda e: None, SystemClock())
