@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
-from beamline.storage.readers import dxchange, nxtomo, tiff_series, tiff_stack
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
 from beamline.storage.readers.overlay import Overlay
@@ -20,13 +20,14 @@ from beamline.storage.readers.tiff_series import TiffSeries
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
-FORMATS: tuple[Format, ...] = (
-    tiff_series.FORMAT,
-    tiff_stack.FORMAT,
-    nxtomo.FORMAT,
-    dxchange.FORMAT,
+REGISTRY = (  # modules in this folder, asked in this order
+    "tiff_series",
+    "tiff_stack",
+    "nxtomo",
+    "dxchange",
 )
-"""The registry: every format that is read, asked in this order."""
+FORMATS: tuple[Format, ...] = tuple(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY)
+"""Every format that is read; adding one takes its file in this folder and its line in REGISTRY."""
 
 Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [frame, row, col]
 

@@ -1,0 +1,292 @@
+"""What an extension costs: a dummy of each kind, added to a copy of the project, works with its own files and one line
+in a registry.
+
+The copy holds the packages and nothing else. For each kind, the files outside the dummy's own that had to change are
+counted, and the lines in them; without these lines the dummy is unknown.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("beamline", "recon", "drivers", "simulators", "configs")
+
+
+@dataclass(frozen=True)
+class Extension:
+    """A dummy.
+
+    Attributes:
+        files: its own, by path.
+        lines: the registries: path, the line above, and the line that is added.
+        proof: a program that ends with 0 only where the dummy works.
+    """
+
+    files: Mapping[str, str]
+    lines: tuple[tuple[str, str, str], ...]
+    proof: str
+
+
+METHOD = Extension(
+    {
+        "recon/voxels/methods/grey.py": """
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from recon.base.method import MethodResult, Traits, TrialSettings
+from recon.base.volume import Volume
+
+
+@dataclass(frozen=True)
+class Grey:
+    name: ClassVar[str] = "grey"
+    label: ClassVar[str] = "Grey"
+    colour: ClassVar[str] = "grey"
+    traits: ClassVar[Traits] = Traits(direct=True)
+    iterations: int = 1
+    shade: float = 0.5
+
+    def run(self, problem, control):
+        return MethodResult(Volume(np.full(problem.grid.shape, self.shade, np.float32), problem.grid), {})
+
+    def toy(self):
+        return self
+
+    @classmethod
+    def trials(cls, gaussians, depth):
+        return [TrialSettings("method"), TrialSettings("shade", {"shade": 0.7})]
+
+    def work(self, n_views, binning):
+        return 1.0
+"""
+    },
+    (
+        (
+            "recon/methods.py",
+            '    "os-sirt-tv": Entry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),',
+            '    "grey": Entry("recon.voxels.methods.grey", "Grey"),',
+        ),
+    ),
+    """
+import numpy as np
+import recon
+from click.testing import CliRunner
+from beamline.cli.method_options import takers
+from beamline.cli.recon import recon as command
+from beamline.cli.tradeoff import tradeoff
+from beamline.reconstruct.recon_report import label_of
+from beamline.tradeoff.figures import pareto_plot
+from beamline.tradeoff.trials import plan
+from recon import methods
+
+views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))
+for method in ("grey", recon.Grey()):
+    assert (recon.reconstruct(data, views, method).volume.data == 0.5).all()
+white = methods.build(methods.by_name("grey"), {"shade": 1.0})
+assert (recon.reconstruct(data, views, white).volume.data == 1).all()
+trials = plan(("grey", "fbp"), 60, 1000, "quick")
+labels = {t.label for t in trials if t.method == "grey"}
+assert labels == {"grey, 60 views", "grey, 30 views", "grey, 60 views, shade 0.7"}, labels
+assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
+for offered in (command, tradeoff):
+    assert "grey" in CliRunner().invoke(offered, ["--help"]).output
+assert "grey" in takers("iterations") and "grey" not in takers("tv_weight")
+assert label_of("grey") == "Grey"
+""",
+)
+
+CHECK = Extension(
+    {
+        "beamline/monitor/dummy.py": '''
+"""A check that flags every second frame."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look
+
+
+@dataclass(frozen=True)
+class Dummy:
+    name: ClassVar[str] = "dummy"
+    bit: ClassVar[int] = 11
+    unit: ClassVar[str] = "frames"
+    meaning: ClassVar[str] = "the frame is one of a pair"
+    every: Annotated[int, Field(ge=2, description="frames between two flags")] = 3
+
+    def start(self):
+        return 0
+
+    def look(self, state, frame, digest, context):
+        if (state + 1) % self.every:
+            return Look(state + 1)
+        return Look(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
+'''
+    },
+    (("beamline/monitor/checks.py", '    "dark": "Dark",', '    "dummy": "Dummy",'),),
+    """
+from beamline.config.load import config_folder, load
+from beamline.core.errors import ConfigError
+from beamline.scan.run import run_scan
+from beamline.storage.describe import describe
+import h5py
+from pathlib import Path
+
+words = ["simulation.clock=virtual", "scan.angles.views=6", "devices.camera.roi=[1140, 2008, 24, 80]"]
+words += ["scan.darks.count=2", "scan.flats.count=2", "scan.flats.at=start", "scan.period_s=2", "scan.mode=step"]
+path = config_folder() / "demo.yaml"
+try:
+    load(path, ["monitor.dummy.every=1"], {})
+except ConfigError as error:
+    refused = str(error)
+config, flags = load(path, [*words, "monitor.dummy.every=2"], {}), []
+sinks = [lambda event: flags.append(event.data.get("check"))]
+result = run_scan(config, Path("runs"), sinks)
+with h5py.File(result.path) as file:
+    legend = file["entry/frame_log/flag_legend"]
+    row = list(legend["name"].asstr()[()]).index("dummy")
+    said = [int(legend[name][row]) for name in ("bit", "alarm_bit")]
+    said += [legend[name].asstr()[row] for name in ("unit", "meaning")]
+    bits = [int(b) & (1 << 11 | 1 << 27) for b in file["entry/frame_log/flags"][()]]
+info = describe(result.path)["attributes"]["flags"]
+assert "monitor.dummy.every is 1; expected a whole number >= 2" in refused
+assert result.flags["dummy"] == 5 and "dummy" in flags
+assert said == [11, 27, "frames", "the frame is one of a pair"]
+assert bits == [0, 1 << 11 | 1 << 27] * 5
+assert "dummy 5" in info
+""",
+)
+
+EFFECT = Extension(
+    {
+        "simulators/effects/half.py": """
+from dataclasses import dataclass
+from typing import ClassVar
+
+from simulators.frame.domain import Domain
+
+
+@dataclass(frozen=True)
+class Half:
+    factor: float = 0.5
+    name: ClassVar[str] = "half"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def apply(self, image, shot):
+        image *= self.factor
+        return image
+"""
+    },
+    (
+        (
+            "simulators/effects/catalogue.py",
+            '        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),',
+            '        "half": Entry(Domain.PHOTONS, "half of the light"),',
+        ),
+    ),
+    """
+import numpy as np
+from tests.simulators import shots
+from tests.simulators.effects.on_demand import shot
+from simulators.scenes.expose import expose
+
+whole, half = (expose(shots.scene(*effects, flux=4000.0), shot(1)) for effects in ((), ({"kind": "half"},)))
+assert whole.mean() > 100
+np.testing.assert_allclose(half, whole / 2, atol=1)
+""",
+)
+
+READER = Extension(
+    {
+        "beamline/storage/readers/npy_stack.py": """
+import numpy as np
+
+from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
+from drivers.frame import FrameKind
+
+
+class NpyStack(ScanReader):
+    format = "npy_stack"
+
+    def __init__(self, path):
+        self.path, self._data = path, np.load(path, allow_pickle=False)
+        n, *shape = self._data.shape
+        self.shape, self.dtype, self.facts = tuple(shape), self._data.dtype, {}
+        self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
+        self.angles = self.exposures = np.full(n, np.nan)
+
+    def read(self, frames, rows=WHOLE):
+        return self._data[frame_indices(frames, len(self._data)), rows]
+
+    def close(self):
+        pass
+
+
+FORMAT = Format("an .npy stack", lambda path, opening: path.suffix == ".npy", lambda path, opening: NpyStack(path))
+"""
+    },
+    (
+        (
+            "beamline/storage/readers/open.py",
+            '    "dxchange",',
+            '    "npy_stack",',
+        ),
+    ),
+    """
+import numpy as np
+from beamline.storage.describe import describe
+from beamline.storage.readers.open import SourceOptions, open_scan
+
+data = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
+np.save("scan.npy", data)
+with open_scan(SourceOptions("scan.npy", angles=[0.0, 1.0])) as source:
+    np.testing.assert_array_equal(source.read([1], slice(1, 3)), data[1:, 1:3])
+    assert [frame.angle for frame in source.frames()] == [0, 1] and source.refresh() == 2
+assert describe("scan.npy")["format"] == "npy_stack"
+""",
+)
+
+EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER}
+
+
+@pytest.mark.parametrize("kind", EXTENSIONS)
+def test_an_extension_is_its_own_files_and_one_line_of_each_registry(kind: str, tmp_path: Path) -> None:
+    extension = EXTENSIONS[kind]
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, text in extension.files.items():
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    assert _run(extension.proof, tmp_path).returncode != 0  # nobody knows it yet
+    for name, above, line in extension.lines:
+        path = tmp_path / name
+        text = path.read_text(encoding="utf-8")
+        assert text.count(above + "\n") == 1, f"{name} has no line {above!r}"
+        path.write_text(text.replace(above + "\n", f"{above}\n{line}\n"), encoding="utf-8")
+    done = _run(extension.proof, tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert len(extension.lines) == (2 if kind == "stage" else 1)  # a stage: its driver's, and its simulated wire's
+    assert all("\n" not in line for *_, line in extension.lines)
+
+
+def _run(proof: str, copy: Path) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join(map(str, (copy, ROOT)))  # the tests' helpers come from the checkout
+    head = f"import beamline\nassert beamline.__file__.startswith({str(copy)!r}), beamline.__file__\n"
+    environment = os.environ | {"PYTHONPATH": path, "NUMBA_DISABLE_JIT": "1"}  # nothing here is worth compiling
+    command = [sys.executable, "-c", head + proof]
+    return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=200, check=False)
