@@ -1,4 +1,4 @@
-"""Views held out: kept from the fit, handed to it all the same, so that its record says how it does on unseen data."""
+"""Views held out: chosen out of a scan's views, and handed to `recon.reconstruct` beside the views that it uses."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from beamline.core.errors import ConfigError
 from beamline.projections.prepare import PreparedProjections
 from recon.base.geometry import Geometry
 
-_EVERY = 10  # one of so many views is kept back where all of them were chosen
-
 F32 = NDArray[np.float32]
 Views = tuple[F32, Geometry]
 
 
 def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
-    """Views to fit and views to judge by as one set for `recon.reconstruct`, and the numbers of the latter in it.
+    """Views used and views held out as one set, and the numbers of the views held out in it.
 
-    The two share everything but their angles.
+    The two geometries differ in nothing but their angles.
     """
     if held_out is None:
         return projections, geometry, []
@@ -29,19 +27,25 @@ def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) 
     return np.concatenate((projections, data)), together, list(range(geometry.n_views, together.n_views))
 
 
-def keep_back(prepared: PreparedProjections) -> PreparedProjections:
-    """The same views with every tenth held out, where none is yet.
+def hold_out(prepared: PreparedProjections, share: int, *, most: int | None = None, advice: str) -> PreparedProjections:
+    """One of `share` views held out, evenly spread; unchanged where the selection already left some out.
+
+    Args:
+        most: number of views held out at most.
+        advice: how to do without, for the error.
 
     Raises:
-        ConfigError: fewer than three views.
+        ConfigError: fewer than two views would be left.
     """
     if prepared.held_out is not None:
         return prepared
     n, geometry, projections = prepared.geometry.n_views, prepared.geometry, prepared.projections
-    if n < 3:
-        raise ConfigError(f"{n} views leave none to hold out; choose more with --views, or leave out --early-stop.")
-    # Not the first and last: a view next to nothing is no fair question.
-    held = np.arange(min(_EVERY, n) // 2, n, _EVERY)
+    count = max(1, n // share)
+    count = count if most is None else min(count, most)
+    if n - count < 2:
+        raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
+    # Neither the first nor the last: they have a neighbour on one side only.
+    held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     used = np.setdiff1d(np.arange(n), held)
     return replace(
         prepared,

@@ -12,7 +12,7 @@ import recon
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch, StopScope, never_stopped
-from beamline.projections.held_out import keep_back, with_held_out
+from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import fit_origin
@@ -28,6 +28,8 @@ from recon.splatting.backend import backend_for
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
+
+_HELD_OUT_SHARE = 10  # one of so many views is held out for --early-stop
 
 
 def reconstruct_file(
@@ -60,7 +62,7 @@ def reconstruct_file(
         prepared = prepare_projections(source, options.selection, warn)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
-        prepared = keep_back(prepared)
+        prepared = hold_out(prepared, _HELD_OUT_SHARE, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))

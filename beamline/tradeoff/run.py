@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.files import named_on_failure
 from beamline.core.machine import machine
+from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
@@ -133,17 +132,9 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
     Raises:
         ConfigError: too few views to hold some out.
     """
-    projections, geometry = prepared.projections.data, prepared.geometry
-    if truth is not None or prepared.held_out is not None:
-        return Data(projections, geometry, prepared.held_out, truth)
-    n = geometry.n_views
-    n_held_out = min(_HELD_OUT_VIEWS, max(1, n // _HELD_OUT_SHARE))
-    if n - n_held_out < 2:
-        raise ConfigError(f"{n} views are too few to hold some out. Choose more with --views, or give --truth.")
-    # Neither the first nor the last: they have a neighbour on one side only.
-    held = np.unique((np.arange(n_held_out) + 0.5) * n // n_held_out).astype(np.int64)
-    used = np.setdiff1d(np.arange(n), held)
-    return Data(projections[used], geometry.select(used), (projections[held], geometry.select(held)), None)
+    if truth is None:
+        prepared = hold_out(prepared, _HELD_OUT_SHARE, most=_HELD_OUT_VIEWS, advice="give --truth")
+    return Data(prepared.projections.data, prepared.geometry, prepared.held_out, truth)
 
 
 def _each(

@@ -1,4 +1,4 @@
-"""Views held out: of the scan, not of the fit; one set for the reconstructor, told apart by number."""
+"""Views held out: evenly spread, none where the selection left some out, and one set for the reconstructor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections.held_out import keep_back, with_held_out
+from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
@@ -24,9 +24,13 @@ def _prepared(tmp_path: Path, views: str, angles: np.ndarray = ANGLES) -> Prepar
         return prepare_projections(source, Selection(views=views, axis_col=scan.axis_col), lambda said: None)
 
 
-def test_every_tenth_view_is_kept_back_where_all_were_chosen(tmp_path: Path) -> None:
+def _every_tenth(prepared: PreparedProjections) -> PreparedProjections:
+    return hold_out(prepared, 10, advice="leave out --early-stop")
+
+
+def test_every_tenth_view_is_held_out_where_all_were_chosen(tmp_path: Path) -> None:
     everything = _prepared(tmp_path, "all")
-    kept = keep_back(everything)
+    kept = _every_tenth(everything)
     assert kept.held_out is not None
     np.testing.assert_allclose(np.degrees(kept.held_out[1].angles), [30, 90, 150])
     np.testing.assert_array_equal(kept.held_out[0], everything.projections.data[[5, 15, 25]])
@@ -39,20 +43,26 @@ def test_every_tenth_view_is_kept_back_where_all_were_chosen(tmp_path: Path) -> 
 
 def test_a_selection_that_left_some_out_is_not_cut_further(tmp_path: Path) -> None:
     prepared = _prepared(tmp_path, "fixed:20")
-    assert keep_back(prepared) is prepared
+    assert _every_tenth(prepared) is prepared
 
 
 @pytest.mark.parametrize("n", [3, 4, 9])
 def test_few_views_still_leave_one(tmp_path: Path, n: int) -> None:
-    kept = keep_back(_prepared(tmp_path, "all", np.linspace(0, 3, n)))
+    kept = _every_tenth(_prepared(tmp_path, "all", np.linspace(0, 3, n)))
     assert kept.held_out is not None
     assert (kept.geometry.n_views, kept.held_out[1].n_views) == (n - 1, 1)
+
+
+def test_no_more_than_the_most_are_held_out_and_neither_the_first_nor_the_last(tmp_path: Path) -> None:
+    held = hold_out(_prepared(tmp_path, "all"), 2, most=4, advice="").held_out
+    assert held is not None
+    np.testing.assert_allclose(np.degrees(held[1].angles), [18, 66, 108, 156])
 
 
 def test_two_views_leave_none(tmp_path: Path) -> None:
     prepared = _prepared(tmp_path, "all", np.array([0.0, 1.5]))
     with pytest.raises(ConfigError, match="--early-stop"):
-        keep_back(prepared)
+        _every_tenth(prepared)
 
 
 def test_one_set_for_the_reconstructor(tmp_path: Path) -> None:
