@@ -135,8 +135,30 @@ class TriggerOutput(Protocol):
         ...
 
 
+class DigitalOutput(Protocol):
+    """One output line of some controller."""
+
+    name: str
+
+    def set(self, high: bool) -> None:
+        """Put the line to high or low. Raises DeviceError where the controller does not take it."""
+        ...
+
+    def get(self) -> bool | None:
+        """The line is high, as the controller says; None where it does not tell."""
+        ...
+
+
 class RotationStage(Motion, TriggerOutput, Protocol):
     """A rotation stage with a position-synchronised trigger output."""
+
+    def digital_output(self, number: int) -> DigitalOutput:
+        """Another output of the stage's controller, such as one that opens a shutter.
+
+        Raises:
+            DeviceRefused: the controller has none that can be set, or it is the one of the trigger pulses.
+        """
+        ...
 
     def describe(self) -> dict[str, str | int | float]:
         """Identity and settings for the file's metadata."""

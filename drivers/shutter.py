@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
-
-
-class DigitalOutput(Protocol):
-    """One output line of some controller."""
-
-    name: str
-
-    def set(self, high: bool) -> None:
-        """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
-        ...
-
-    def get(self) -> bool | None:
-        """Whether the line is high; None if the controller cannot read it back."""
-        ...
+from drivers.protocols import DigitalOutput
 
 
 class OutputShutter:

@@ -55,7 +55,7 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
                 f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; expected "
                 f"{' | '.join(map(str, fit))}, or scan.mode: step",
             )
-    width = stage.pulse_width_s
+    width = stage.settings.wiring.pulse_width
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (
             ("devices", "camera", "trigger_active"),

@@ -7,10 +7,11 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
 
 from beamline.config.section import Section
-from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, StageConfig
+from beamline.config.stages import StageConfig
 from drivers.beam_monitors.page import url_problem
 from drivers.beam_monitors.reading import pattern_problem
 from drivers.beam_monitors.serial import PATTERN, QUERY
+from drivers.stages.registry import STAGES
 
 Roi = Annotated[
     tuple[
@@ -80,7 +81,7 @@ class Simple(Section):
 
 
 class StageOutputShutter(Section):
-    """A shutter on a digital output of the stage's controller (pi_gcs and zaber; the PM16C has no such output)."""
+    """A shutter on a digital output of the stage's controller, where that has outputs that can be set."""
 
     kind: Literal["stage_output"]
     output: PositiveInt
@@ -167,7 +168,7 @@ class DeviceSection(Section):
 
     @model_validator(mode="after")
     def _edges_agree(self) -> Self:
-        camera, high = self.camera, self.stage.active_high
+        camera, high = self.camera, self.stage.settings.wiring.active_high
         if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
             raise ValueError(
                 f"stage.active_high {str(high).lower()} does not go with camera.trigger_polarity "
@@ -178,15 +179,15 @@ class DeviceSection(Section):
 
     @model_validator(mode="after")
     def _output_is_free(self) -> Self:
-        stage, shutter = self.stage, self.shutter
+        taken, shutter = self.stage.settings.pulse_output, self.shutter
         if not isinstance(shutter, StageOutputShutter):
             return self
-        if isinstance(stage, PM16CStageConfig):
+        if taken is None:
+            with_outputs = [kind for kind, settings in STAGES.items() if settings.pulse_output is not None]
             raise ValueError(
-                "the PM16C has no digital output for a shutter; set shutter.kind: manual, or use the output of another "
-                "controller (stage.kind pi_gcs or zaber)"
+                f"a {self.stage.kind} stage has no digital output for a shutter; set shutter.kind: manual, or use the "
+                f"output of another controller (stage.kind {' or '.join(with_outputs)})"
             )
-        taken = stage.trigger_line if isinstance(stage, PiGcsStageConfig) else stage.output
         if shutter.output == taken:
             raise ValueError(f"shutter.output {taken} is the output that the stage's trigger pulses come from")
         return self
@@ -194,12 +195,12 @@ class DeviceSection(Section):
     def simulated_or_not(self) -> dict[str, bool]:
         """Each device that can be simulated, and whether it is."""
         stage, shutter = self.stage.simulated, self.shutter.kind
-        said = {
+        simulated = {
             "stage": stage,
             "camera": self.camera.kind == "simulated_orca",
             "shutter": shutter == "simulated" or (shutter == "stage_output" and stage),
             "sample_mover": self.sample_mover.kind == "simulated",
         }
         if isinstance(self.beam_monitor, ElectrometerConfig):
-            said["beam_monitor"] = self.beam_monitor.simulated
-        return said
+            simulated["beam_monitor"] = self.beam_monitor.simulated
+        return simulated

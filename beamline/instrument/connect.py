@@ -6,7 +6,6 @@ that names a simulator.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.instrument.cameras import make_camera, wait_until_cold
 from beamline.instrument.operator import ask_operator
 from beamline.instrument.simulated import Simulated, clock_of, scene_of, simulated_devices
-from beamline.instrument.stages import make_stage, output_shutter, stage_limits
 from drivers import orca_quest
 from drivers.clock import Clock, SystemClock
 from drivers.manual import Ask, ManualSampleMover, ManualShutter
@@ -34,6 +32,8 @@ from drivers.protocols import (
     StageLimits,
     TriggerSource,
 )
+from drivers.shutter import OutputShutter
+from drivers.stages.travel import Travel
 
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
@@ -107,7 +107,8 @@ def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[Rotation
         with connect(config, clock) as instrument:
             yield instrument.devices.stage
         return
-    with closing(make_stage(config.devices.stage, config.devices.stage.port, clock or SystemClock())) as stage:
+    chosen = config.devices.stage
+    with closing(chosen.settings.connect(chosen.port, clock or SystemClock())) as stage:
         yield stage
 
 
@@ -122,20 +123,16 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     Raises:
         ConfigError: settings that a device would refuse, or a scene that is wrong.
     """
-    stage = config.devices.stage
+    limits = config.devices.stage.settings.limits()
     if config.simulation is not None:
         scene_of(config)
-    try:
-        limits = stage_limits(stage)
-    except ValueError as error:
-        raise ConfigError(f"devices.stage: {error}. Nothing was started.") from None
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     link = config.devices.camera.link if isinstance(config.devices.camera, DcamOrca) else "usb3"
     try:
         timing = orca_quest.timing(settings, link)
     except ValueError as error:
         raise ConfigError(f"devices.camera: {error}. Nothing was started.") from None
-    return limits, timing, lambda angle: round(angle * stage.counts_per_turn / (2 * math.pi))
+    return limits, timing, Travel("stage", limits).to_counts
 
 
 def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
@@ -148,7 +145,7 @@ def _instrument(config: Config, clock: Clock, ask: Ask, heed: Callable[[], None]
     chosen, wanted = config.devices.camera, config.devices.shutter
     if not isinstance(chosen, DcamOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
-    stage = make_stage(config.devices.stage, config.devices.stage.port, clock)
+    stage = config.devices.stage.settings.connect(config.devices.stage.port, clock)
     opened.callback(stage.close)
     camera = make_camera(chosen, clock)
     opened.callback(camera.close)
@@ -156,5 +153,6 @@ def _instrument(config: Config, clock: Clock, ask: Ask, heed: Callable[[], None]
         wait_until_cold(camera, chosen.cool_s, clock, heed)
     shutter: Shutter = ManualShutter(ask)
     if isinstance(wanted, StageOutputShutter):
-        shutter = output_shutter(config.devices.stage, wanted, stage, clock)
+        output = stage.digital_output(wanted.output)
+        shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
     return Devices(stage, camera, shutter, ManualSampleMover(ask))

@@ -14,21 +14,18 @@ from uuid import uuid4
 from beamline.config.devices import StageOutputShutter
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import Simulation, Speed
-from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, StageConfig, ZaberStageConfig
 from beamline.core.errors import ConfigError
-from beamline.instrument.stages import make_stage, output_shutter
 from drivers import orca_quest
 from drivers.clock import Clock, SystemClock
 from drivers.protocols import Devices, Shutter
+from drivers.shutter import OutputShutter
 
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
     from simulators.devices.camera import SimulatedOrcaQuest
     from simulators.devices.shutter import BeamGate
-    from simulators.devices.trigger_line import TriggerLine
     from simulators.effects.anomaly import Label
     from simulators.scenes.scene import Scene
-    from simulators.wires.wire import Wire
 
 
 @dataclass(frozen=True)
@@ -58,85 +55,36 @@ def simulated_devices(
         opened: takes what closes them.
 
     Raises:
-        ConfigError: the scene is wrong, or the simulated controller has no such output.
+        ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
     from simulators.devices.camera import SimulatedOrcaQuest
     from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter, WiredShutter
     from simulators.devices.trigger_line import TriggerLine
+    from simulators.wires.registry import WIRES
     from simulators.wires.serial_url import register
 
     scene = scene_of(config)
     line = TriggerLine(clock)
-    settings, wanted = config.devices.stage, config.devices.shutter
+    chosen, wanted = config.devices.stage, config.devices.shutter
     try:
-        wire, high = _wire(settings, clock, line)
-    except LookupError as error:
-        key = "output" if isinstance(settings, ZaberStageConfig) else "trigger_line"
-        raise ConfigError(
-            f"devices.stage.{key}: the simulated {settings.kind} controller has no such digital output; set 1 for a "
-            "simulation. Nothing was started."
-        ) from error
+        controller = WIRES[chosen.kind].matching(chosen.settings).controller(clock, line)
+    except ValueError as error:
+        raise ConfigError(f"devices.stage.{error}. Nothing was started.") from error
     # A name of its own for every connection: two in one process must not share a controller.
-    stage = make_stage(settings, register(f"{settings.kind}-{uuid4().hex}", wire), clock)
+    stage = chosen.settings.connect(register(f"{chosen.kind}-{uuid4().hex}", controller), clock)
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
     blade: BeamGate = shutter
     if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
-        output = wanted.output
-        shutter = output_shutter(settings, wanted, stage, clock)
-        blade = WiredShutter(lambda: high(output), wanted.open_high)
+        number, output = wanted.output, stage.digital_output(wanted.output)
+        shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
+        blade = WiredShutter(lambda: controller.output_is_high(number), wanted.open_high)
     sample = SimulatedSampleMover()
     pitch = config.optics.pixel_size_um * 1e-3
     camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
     opened.callback(camera.close)
     known = Simulated(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
     return Devices(stage, camera, shutter, sample), known
-
-
-def _wire(config: StageConfig, clock: Clock, line: TriggerLine) -> tuple[Wire, Callable[[int], bool]]:
-    """The simulated controller, built as the configuration says of the real one, and the levels of its outputs."""
-    counts = config.counts_per_turn
-    match config:
-        case PM16CStageConfig():
-            from simulators.wires.pm16c.wire import PM16CController
-
-            at_start = config.first_pulse == "at_start"
-            pm16c = PM16CController(
-                clock, line, channel=config.channel, counts_per_turn=counts, fires_at_start=at_start
-            )
-            return pm16c, lambda number: False
-        case PiGcsStageConfig():
-            from simulators.wires.pi_gcs.axis import Build
-            from simulators.wires.pi_gcs.trigger import FirstPulse
-            from simulators.wires.pi_gcs.wire import PiGcsController
-
-            build = Build(
-                counts_per_turn=counts,
-                low=config.low_deg - 1,
-                high=config.high_deg + 1,
-                first_pulse=FirstPulse(config.first_pulse),
-                pulse_width=config.firmware_pulse_s,
-                rising=config.active_high,
-                max_velocity=config.max_speed_deg_s,
-                max_acceleration=config.acceleration_deg_s2,
-            )
-            pi = PiGcsController(clock, line, axis=config.axis, output=config.trigger_line, build=build)
-            return pi, lambda number: pi.box.levels.get(number, False)
-        case ZaberStageConfig():
-            from simulators.wires.zaber.wire import ZaberController
-
-            zaber = ZaberController(
-                clock,
-                line,
-                counts_per_turn=counts,
-                output=config.output,
-                active_high=config.active_high,
-                address=config.device,
-                can_schedule=not config.toggle,
-                can_chain=config.chained,
-                fires_when_enabled=config.fires_when_enabled,
-            )
-            return zaber, lambda number: bool(zaber.device.triggers.outputs[number - 1])
 
 
 def scene_of(config: Config) -> Scene:

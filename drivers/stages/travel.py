@@ -9,34 +9,8 @@ from fractions import Fraction
 from drivers.errors import DeviceRefused, DeviceTimeout
 from drivers.protocols import StageLimits, TriggerTrain
 
-FARTHEST = 1e9
-"""rad."""
-MOST = 2.0**53
-"""counts that a float still tells apart."""
 ROUNDING = 1e-6
 """counts by which a spacing may be missed: floats give no better where speeds are written in degrees."""
-
-
-def check_figures(
-    counts_per_turn: int, max_speed: float, acceleration: float, low: float, high: float, pulse_spacing: float
-) -> None:
-    """The figures configured for a stage: counts for 2π, rad/s, rad/s², rad, and s between pulses.
-
-    Raises:
-        ValueError: figures that no stage can have.
-    """
-    if counts_per_turn < 1:
-        raise ValueError(f"a turn cannot have {counts_per_turn} counts")
-    per_radian = counts_per_turn / (2 * math.pi)
-    for meaning, rate in (("speed", max_speed), ("acceleration", acceleration)):
-        if not 0 < rate * per_radian < MOST:
-            raise ValueError(f"{rate:g} rad is no {meaning} that a stage can have")
-    if not -FARTHEST <= low < high <= FARTHEST:
-        raise ValueError(f"from {math.degrees(low):g} to {math.degrees(high):g} deg there is no room to move")
-    if not (high - low) * per_radian < MOST:
-        raise ValueError(f"{(high - low) * per_radian:g} counts are more than can be told apart")
-    if not 0 <= pulse_spacing * max_speed * per_radian < MOST:
-        raise ValueError(f"pulses cannot be {pulse_spacing:g} s apart")
 
 
 def counts_in(seconds: float, limits: StageLimits) -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 from drivers.clock import Clock
+from simulators.devices.trigger_line import TriggerLine
 
 
 class Wire(Protocol):
@@ -19,4 +20,29 @@ class Wire(Protocol):
 
     def transmit(self) -> bytes:
         """Bytes sent by now and not taken yet."""
+        ...
+
+
+class Controller(Wire, Protocol):
+    """A simulated controller of a stage."""
+
+    def output_is_high(self, number: int) -> bool:
+        """The level of a digital output; False where there is none of that number."""
+        ...
+
+
+class Build(Protocol):
+    """How a simulated controller is built, and its faults: a frozen dataclass in each controller's folder."""
+
+    @classmethod
+    def matching(cls, settings: Any) -> Self:
+        """The one that a driver with these settings, of its own stage, expects.
+
+        Raises:
+            ValueError: the name of a setting, and what the stand-in lacks for it.
+        """
+        ...
+
+    def controller(self, clock: Clock, line: TriggerLine) -> Controller:
+        """The controller with its trigger output wired to `line`, which also learns the sample's true angle."""
         ...

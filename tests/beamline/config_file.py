@@ -18,7 +18,7 @@ scan:
   exposure_s: 0.01
   period_s: 5e-2
 devices:
-  stage: {kind: pm16c, port: "sim://pm16c", counts_per_turn: 3600, max_speed_deg_s: 30, acceleration_deg_s2: 60}
+  stage: {kind: pm16c, port: "sim://pm16c", counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60}
   camera: {kind: simulated_orca, roi: [0, 0, 8, 8]}
   shutter: {kind: simulated}
   sample_mover: {kind: simulated}

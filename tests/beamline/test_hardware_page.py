@@ -13,12 +13,12 @@ from pydantic import BaseModel
 from beamline.cli.main import main
 from beamline.config.devices import DcamOrca, StageOutputShutter
 from beamline.config.load import config_folder, load
-from beamline.config.stages import PiGcsStageConfig, PM16CStageConfig, ZaberStageConfig
+from beamline.config.stages import STAGE_SECTIONS
 from beamline.scan.preflight import dry_run
 
 TEXT = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 DEVICES: dict[str, tuple[type[BaseModel], ...]] = {
-    "stage": (PM16CStageConfig, PiGcsStageConfig, ZaberStageConfig),
+    "stage": tuple(STAGE_SECTIONS.values()),
     "camera": (DcamOrca,),
     "shutter": (StageOutputShutter,),
 }

@@ -6,12 +6,15 @@ import itertools
 import math
 from typing import Any
 
+from drivers.clock import Clock
+from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.pm16c.wire import PM16CBuild
 from simulators.wires.serial_url import register
 from tests.drivers.stage_bench import StageBench
+from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())
 COUNTS = 90_000
@@ -26,7 +29,7 @@ class Rig:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
         settings = {"channel": 11, "counts_per_turn": COUNTS} | faults
-        self.controller = PM16CController(self.clock, self.line, **settings)
+        self.controller = flat(PM16CBuild, **settings).controller(self.clock, self.line)
         self.url = register(next(NAMES), self)
         self._lost = b"nothing"
 
@@ -37,11 +40,10 @@ class Rig:
     def transmit(self) -> bytes:
         return self.controller.transmit()
 
-    def open(self, **settings: Any) -> PM16CStage:
+    def open(self, clock: Clock | None = None, **settings: Any) -> PM16CStage:
         usual: dict[str, Any] = {
             "channel": 11,
             "counts_per_turn": COUNTS,
-            "clock": self.clock,
             "max_speed": math.radians(30),
             "acceleration": math.radians(60),
             "low": math.radians(-5),
@@ -49,7 +51,7 @@ class Rig:
             "home": 0.0,
             "home_speed": min(math.radians(15), settings.get("max_speed", 1.0)),
         }
-        return PM16CStage(self.url, **(usual | settings))
+        return PM16CStage(self.url, flat(PM16CSettings, **(usual | settings)), clock or self.clock)
 
     def bench(self, **settings: Any) -> StageBench:
         return StageBench(self.open(**settings), self.clock, self.line)

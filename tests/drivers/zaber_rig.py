@@ -6,12 +6,15 @@ import itertools
 import math
 from typing import Any
 
+from drivers.clock import Clock
+from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.stage import ZaberStage
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import register
-from simulators.wires.zaber.wire import ZaberController
+from simulators.wires.zaber.wire import ZaberBuild
 from tests.drivers.stage_bench import StageBench
+from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"zaber-test-{number}" for number in itertools.count())
 COUNTS = 360_000
@@ -20,16 +23,14 @@ REPLIES_TO_OPEN = 16
 two triggers and the output: faults count replies from power-on."""
 
 
-def settings_of(**settings: Any) -> dict[str, Any]:
-    """The usual settings of the driver with some changed."""
-    usual: dict[str, Any] = {
-        "counts_per_turn": COUNTS,
-        "max_speed": math.radians(30),
-        "acceleration": math.radians(60),
-        "low": math.radians(-5),
-        "high": math.radians(100),
-    }
-    return usual | settings
+USUAL: dict[str, Any] = {
+    "counts_per_turn": COUNTS,
+    "max_speed": math.radians(30),
+    "acceleration": math.radians(60),
+    "low": math.radians(-5),
+    "high": math.radians(100),
+}
+"""Of the driver's settings."""
 
 
 class Rig:
@@ -39,7 +40,8 @@ class Rig:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
         self.sent: list[str] = []
-        self.controller = ZaberController(self.clock, self.line, **({"counts_per_turn": COUNTS} | settings))
+        build = flat(ZaberBuild, **({"counts_per_turn": COUNTS} | settings))
+        self.controller = build.controller(self.clock, self.line)
         self.url = register(next(NAMES), self)
         self._lost = b"nothing"
 
@@ -51,8 +53,8 @@ class Rig:
     def transmit(self) -> bytes:
         return self.controller.transmit()
 
-    def open(self, **settings: Any) -> ZaberStage:
-        return ZaberStage(self.url, **({"clock": self.clock} | settings_of(**settings)))
+    def open(self, clock: Clock | None = None, **settings: Any) -> ZaberStage:
+        return ZaberStage(self.url, flat(ZaberSettings, **(USUAL | settings)), clock or self.clock)
 
     def bench(self, **settings: Any) -> StageBench:
         return StageBench(self.open(**settings), self.clock, self.line)

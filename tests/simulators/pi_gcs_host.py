@@ -7,8 +7,8 @@ from typing import Any
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.pi_gcs.axis import Build
-from simulators.wires.pi_gcs.wire import PiGcsController
+from simulators.wires.pi_gcs.wire import PiGcsBuild
+from tests.drivers.stages.flat_settings import flat
 from tests.simulators.cable import emitted
 
 TURN = 360_000
@@ -23,8 +23,8 @@ class Wire:
     def __init__(self, *, settings: dict[str, Any] | None = None, **build: Any) -> None:
         self.clock = VirtualClock(start=0.0)
         self.line = TriggerLine(self.clock)
-        specimen = Build(**({"counts_per_turn": TURN} | build))
-        self.box = PiGcsController(self.clock, self.line, build=specimen, **(settings or {}))
+        built = flat(PiGcsBuild, **({"counts_per_turn": TURN} | (settings or {}) | build))
+        self.box = built.controller(self.clock, self.line)
         self.tell("SVO 1 1", f"VEL 1 {VELOCITY}", f"ACC 1 {ACCELERATION}", f"DEC 1 {ACCELERATION}")
 
     def tell(self, *commands: str) -> None:

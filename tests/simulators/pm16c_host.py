@@ -6,7 +6,8 @@ import math
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.pm16c.wire import PM16CBuild
+from tests.drivers.stages.flat_settings import flat
 from tests.simulators.cable import emitted
 
 TURN = 360_000
@@ -21,7 +22,7 @@ class Wire:
     def __init__(self, **faults: object) -> None:
         self.clock = VirtualClock(start=0.0)
         self.line = TriggerLine(self.clock)
-        self.box = PM16CController(self.clock, self.line, counts_per_turn=TURN, **faults)  # type: ignore[arg-type]
+        self.box = flat(PM16CBuild, counts_per_turn=TURN, **faults).controller(self.clock, self.line)
         self.tell("REM", f"SPDH0{SPEED}", "RTE0024", "TMGM02")
 
     def tell(self, *commands: str) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber.wire import ZaberController
+from simulators.wires.zaber.wire import ZaberBuild
+from tests.drivers.stages.flat_settings import flat
 from tests.simulators.cable import emitted
 
 TURN = 360_000
@@ -23,7 +24,7 @@ class Wire:
     def __init__(self, **settings: Any) -> None:
         self.clock = VirtualClock(start=0.0)
         self.line = TriggerLine(self.clock)
-        self.box = ZaberController(self.clock, self.line, **({"counts_per_turn": TURN} | settings))
+        self.box = flat(ZaberBuild, **({"counts_per_turn": TURN} | settings)).controller(self.clock, self.line)
         self.tell(f"/1 1 set maxspeed {NATIVE_SPEED}", f"/1 1 set accel {NATIVE_ACCELERATION}")
 
     @property

@@ -12,6 +12,7 @@ from fractions import Fraction
 from drivers.errors import DeviceRefused
 from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
+from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.train import TriggerWindow
 
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
@@ -34,9 +35,9 @@ class AxisStatus:
 class PiGcsAxis:
     """Raises (in all methods) what `GcsLine` raises, and DeviceRefused where it must stand and does not."""
 
-    def __init__(self, line: GcsLine, *, axis: str, trigger_line: int, counts_per_turn: int, name: str) -> None:
-        self._line, self._name, self._axis, self._output = line, name, axis, trigger_line
-        self._counts_per_turn = counts_per_turn
+    def __init__(self, line: GcsLine, settings: PiGcsSettings, name: str) -> None:
+        self._line, self._name, self._axis, self._output = line, name, settings.axis, settings.trigger_line
+        self._counts_per_turn = settings.figures.counts_per_turn
         self._bit = 0
         self.last_move = ""
         """The command of the last move or search, for errors."""

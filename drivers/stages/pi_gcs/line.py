@@ -8,13 +8,13 @@ from __future__ import annotations
 import re
 import threading
 from fractions import Fraction
-from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line import Probe, SerialLine
 from drivers.serial.line_reader import Framing
 from drivers.stages.pi_gcs.errors import REFUSALS, advice, meaning
+from drivers.stages.settings import Wiring
 
 FRAMING = Framing(command_end=b"\n", line_end=b"\n", continued=" ")
 PROBE = Probe("CSV?", r"\d+\.\d+")
@@ -47,17 +47,7 @@ class GcsLine:
         DeviceTimeout: no reply.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        axis: str,
-        name: str,
-        clock: Clock,
-        timeout: float,
-        baudrate: int,
-        transcript: Path | None,
-    ) -> None:
+    def __init__(self, url: str, axis: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.fault = 0
         self.commanded = False
         """A move was begun: what is said of a failure depends on it."""
@@ -68,10 +58,10 @@ class GcsLine:
             device=name,
             probe=PROBE,
             clock=clock,
-            timeout=timeout,
-            baudrate=baudrate,
+            timeout=wiring.timeout,
+            baudrate=wiring.baudrate,
             framing=FRAMING,
-            transcript=transcript,
+            transcript=wiring.transcript,
         )
 
     def set(self, command: str) -> None:
@@ -164,3 +154,20 @@ class GcsLine:
 
     def _state(self) -> str:
         return "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
+
+
+class GcsOutput:
+    """Implements `drivers.protocols.DigitalOutput` on the line of a stage that is open.
+
+    `DIO?` tells the inputs [from memory: of GCS controllers in general], so that an output cannot be read back.
+    """
+
+    def __init__(self, line: GcsLine, number: int, name: str) -> None:
+        self.name = name
+        self._line, self._number = line, number
+
+    def set(self, high: bool) -> None:
+        self._line.set(f"DIO {self._number} {int(high)}")
+
+    def get(self) -> None:
+        return None

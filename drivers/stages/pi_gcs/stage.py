@@ -10,18 +10,15 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
-from pathlib import Path
-from typing import Literal
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.pi_gcs.axis import AxisStatus, PiGcsAxis
-from drivers.stages.pi_gcs.digital import GcsOutput
 from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
-from drivers.stages.pi_gcs.limits import FIRMWARE_PULSE, SLOWEST, limits_of
-from drivers.stages.pi_gcs.line import GcsLine
-from drivers.stages.pi_gcs.train import FirstPulse, is_spent_by, window_of
+from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
+from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
+from drivers.stages.pi_gcs.train import is_spent_by, window_of
 from drivers.stages.standing import POLL, longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel
@@ -36,82 +33,25 @@ class PiGcsStage:
 
     Args:
         url: what pyserial opens.
-        axis: identifier as SAI? lists it.
-        trigger_line: digital output that the pulses come from.
-        counts_per_turn: encoder counts for 2π.
-        timeout: s for a reply.
-        max_speed, acceleration: rad/s, rad/s².
-        low, high: soft limits in radians, within the controller's own.
-        baudrate: as set on the controller; nominal over USB.
-        pulse_width: must be None: the firmware has one.
-        active_high: polarity of the pulses. That CTO parameter 7 is 1 for it is taken from memory.
-        transcript: file to which every byte on the wire is appended; None keeps none.
-        reference: how `start_home` finds the reference: by its switch, or the negative or positive limit switch.
-        first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
-        firmware_pulse: s that the firmware holds a pulse; trains must leave as long between two.
-        tolerance: counts from the target within which a move has arrived (a servo holds to a few counts, never one).
-        settle: s after a move in which the controller may still bring the axis on target.
 
     Raises:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        axis: str = "1",
-        trigger_line: int = 1,
-        counts_per_turn: int,
-        clock: Clock,
-        timeout: float = 1.0,
-        max_speed: float,
-        acceleration: float,
-        low: float,
-        high: float,
-        name: str = "stage",
-        baudrate: int = 115_200,
-        pulse_width: float | None = None,
-        active_high: bool = True,
-        transcript: Path | None = None,
-        reference: Literal["FRF", "FNL", "FPL"] = "FRF",
-        first_pulse: FirstPulse | str = FirstPulse.AT_THRESHOLD,
-        firmware_pulse: float = FIRMWARE_PULSE,
-        tolerance: int = 10,
-        settle: float = 1.0,
-    ) -> None:
+    def __init__(self, url: str, settings: PiGcsSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
-        self._clock, self._url, self._axis_name, self._trigger_line = clock, url, axis, trigger_line
-        self._reference, self._active_high = reference, active_high
-        self._tolerance, self._settle = tolerance, settle
-        if pulse_width is not None:
-            raise DeviceRefused(
-                name,
-                f"its firmware fixes the width of trigger pulses, so {pulse_width:g} s cannot be set",
-                expected="no pulse_width",
-                advice="Leave it out; make pulses longer by a pulse stretcher, or let the camera trigger on edges",
-                state="Nothing was sent",
-            )
-        try:
-            self._first_pulse = FirstPulse(first_pulse)
-            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse, firmware_pulse)
-            self._travel = Travel(name, limits)
-        except ValueError as problem:
-            raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        self._per_radian = Fraction(counts_per_turn) / Fraction(2 * math.pi)
+        self._clock, self._url, self._settings = clock, url, settings
+        self._travel = Travel(name, settings.limits())
+        self._per_radian = Fraction(settings.figures.counts_per_turn) / Fraction(2 * math.pi)
         self._target: int | None = None
         self._homing = False
         self._stops = Stops(name, self._send_stop)
         self._stops_before = 0
         self._train: TriggerTrain | None = None
-        self._line = GcsLine(
-            url, axis=axis, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
-        )
-        self._axis = PiGcsAxis(
-            self._line, axis=axis, trigger_line=trigger_line, counts_per_turn=counts_per_turn, name=name
-        )
+        self._line = GcsLine(url, settings.axis, settings.wiring, clock, name)
+        self._axis = PiGcsAxis(self._line, settings, name)
         try:
-            self._identity = self._axis.open(Fraction(acceleration) * self._per_radian)
+            self._identity = self._axis.open(Fraction(settings.figures.acceleration) * self._per_radian)
             self._travel.refuse_narrower(*self._axis.own_limits(), advice="widen the travel range in the controller")
         except BaseException:
             self.close()
@@ -157,7 +97,7 @@ class PiGcsStage:
         with self._begin("the reference move"):
             self._axis.standing("a reference move")
             self._train, self._target, self._homing = None, None, False
-            self._axis.search_reference(self._reference)
+            self._axis.search_reference(self._settings.reference.command)
             self._homing = True
 
     def moving(self) -> bool:
@@ -185,13 +125,13 @@ class PiGcsStage:
     def arm(self, train: TriggerTrain) -> None:
         self._travel.refuse_train(train)
         try:
-            window = window_of(train, self._first_pulse)
+            window = window_of(train, self._settings.first_pulse)
         except ValueError as problem:
             raise self._travel.cannot_emit(train, f": {problem}") from problem
         self._axis.standing("arming")
         self._travel.refuse_late_arming(train, self._axis.counts(), window.start)
         self._train = None
-        self._axis.arm(window, self._active_high)
+        self._axis.arm(window, self._settings.wiring.active_high)
         self._train = train
 
     def disarm(self) -> None:
@@ -218,10 +158,10 @@ class PiGcsStage:
             "model": "PI GCS 2.0",
             "identity": self._identity,
             "port": self._url,
-            "axis": self._axis_name,
-            "trigger_output": f"digital output {self._trigger_line}",
-            "trigger_polarity": "active high" if self._active_high else "active low",
-            "first_pulse": self._first_pulse.value,
+            "axis": self._settings.axis,
+            "trigger_output": f"digital output {self._settings.trigger_line}",
+            "trigger_polarity": "active high" if self._settings.wiring.active_high else "active low",
+            "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
             **self._travel.described(),
         }
@@ -232,7 +172,7 @@ class PiGcsStage:
         Raises:
             DeviceRefused: it is the one of the trigger pulses.
         """
-        if number == self._trigger_line:
+        if number == self._settings.trigger_line:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
         return GcsOutput(self._line, number, f"{self.name} output {number}")
 
@@ -258,12 +198,12 @@ class PiGcsStage:
 
     def _until_settled(self, target: int) -> None:
         """Let the servo bring it on target, where it is near it."""
-        deadline = self._clock.now() + self._settle
+        deadline = self._clock.now() + self._settings.settle
         while self._clock.now() < deadline and not self._axis.on_target() and not self._away(self._axis.counts()):
             self._clock.sleep(POLL)
 
     def _away(self, counts: int) -> bool:
-        return self._target is not None and abs(counts - self._target) > self._tolerance
+        return self._target is not None and abs(counts - self._target) > self._settings.tolerance
 
     def _fault(self, status: AxisStatus) -> str:
         """Why the last move ended early, or what stands, in words; "" for nothing."""

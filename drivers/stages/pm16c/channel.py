@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.stages.pm16c.line import PM16CLine
 from drivers.stages.pm16c.train import TriggerPoints
+from drivers.stages.settings import Wiring
 
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)
 """Firmware."""
-MAX_SPEED = 5_000_000
-"""pulses/s."""
-MAX_COUNT = 2_147_483_647
-"""Of positions, trigger points and limits, either way."""
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
@@ -50,14 +46,12 @@ class PM16CChannel:
         DeviceRefused: the controller is in LOCAL, or its motors move.
     """
 
-    def __init__(
-        self, url: str, *, channel: int, name: str, clock: Clock, timeout: float, baudrate: int, transcript: Path | None
-    ) -> None:
+    def __init__(self, url: str, channel: int, wiring: Wiring, clock: Clock, name: str) -> None:
         self._name, self._digit = name, f"{channel:X}"
         self.last_move = ""
         """The command of the last move or search, for errors."""
         self._restore_local = False
-        self._line = PM16CLine(url, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript)
+        self._line = PM16CLine(url, wiring, clock, name)
 
     def open(self, rate_code: int) -> str:
         """Go to REMOTE, take position controller A without a train, set the acceleration; the firmware's version."""

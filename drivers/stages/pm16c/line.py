@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import TypeVar
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.serial.line import Probe, SerialLine
+from drivers.stages.settings import Wiring
 
 PROBE = Probe("STQ?", r"[RL][0-4]")
 STOPPED_NOTE = r"STOP[0-9A-F]"
@@ -29,9 +29,7 @@ class PM16CLine:
     DeviceError: a reply or a read-back is not what it must be. DeviceTimeout: no reply.
     """
 
-    def __init__(
-        self, url: str, *, name: str, clock: Clock, timeout: float, baudrate: int, transcript: Path | None
-    ) -> None:
+    def __init__(self, url: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.commanded = False
         """A move was begun: what is said of a failure depends on it."""
         self._name, self._clock = name, clock
@@ -40,10 +38,10 @@ class PM16CLine:
             device=name,
             probe=PROBE,
             clock=clock,
-            timeout=timeout,
-            baudrate=baudrate,
+            timeout=wiring.timeout,
+            baudrate=wiring.baudrate,
             unsolicited=STOPPED_NOTE,
-            transcript=transcript,
+            transcript=wiring.transcript,
         )
 
     def send(self, command: str) -> None:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pm16c.channel import MAX_COUNT, ChannelStatus, PM16CChannel
+from drivers.protocols import DigitalOutput, StageLimits, StageStatus, TriggerTrain
+from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 from drivers.stages.pm16c.home import HomeSearch
-from drivers.stages.pm16c.limits import limits_of
-from drivers.stages.pm16c.rates import steepest_code
-from drivers.stages.pm16c.train import MODES, FirstPulse, PulseWidths, points_of
+from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.pm16c.train import MODES, points_of
 from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel
@@ -31,71 +29,24 @@ class PM16CStage:
 
     Args:
         url: what pyserial opens; the controller's LAN port is "socket://host:7777".
-        channel: motor channel 0..15.
-        counts_per_turn: pulses for 2π.
-        timeout: s for a reply.
-        max_speed, acceleration: rad/s, rad/s²; the acceleration becomes one that the controller has, see `limits`.
-        low, high: soft limits in radians.
-        baudrate: as set on the controller's panel.
-        pulse_width: s, one of the four that the output has; None takes for each train the widest that fits.
-        active_high: must be True; the output has no other polarity.
-        first_pulse: where the firmware puts the first pulse; that it is the start point is from memory.
-        home: angle of the home switch in radians; None where the stage has none: then a search is refused.
-        home_speed: rad/s for the search; None is a tenth of `max_speed`.
-        transcript: file to which every byte on the wire is appended; None keeps none.
 
     Raises:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        channel: int = 0,
-        counts_per_turn: int,
-        clock: Clock,
-        timeout: float = 1.0,
-        max_speed: float,
-        acceleration: float,
-        low: float,
-        high: float,
-        name: str = "stage",
-        baudrate: int = 9600,
-        pulse_width: float | None = None,
-        active_high: bool = True,
-        first_pulse: FirstPulse | str = FirstPulse.AT_START,
-        home: float | None = None,
-        home_speed: float | None = None,
-        transcript: Path | None = None,
-    ) -> None:
+    def __init__(self, url: str, settings: PM16CSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
-        self._clock, self._url, self._number = clock, url, channel
-        if not 0 <= channel <= 15:
-            raise DeviceRefused(name, f"there is no channel {channel}", expected="0 to 15", state="Nothing was sent")
-        if not active_high:
-            raise DeviceRefused(
-                name, "its trigger output cannot be inverted", expected="active_high", state="Nothing was sent"
-            )
-        try:
-            self._first_pulse = FirstPulse(first_pulse)
-            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, self._first_pulse, pulse_width)
-            self._travel = Travel(name, limits)
-            self._widths = PulseWidths(pulse_width)
-            self._home = self._home_count(home)
-        except ValueError as problem:
-            raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        self._fastest = round(max_speed * counts_per_turn / (2 * math.pi))
-        self._home_pps = self._pps(limits.max_speed / 10 if home_speed is None else home_speed)
+        self._clock, self._url, self._settings = clock, url, settings
+        self._travel = Travel(name, settings.limits())
+        self._fastest = settings.fastest
+        self._home = None if settings.home is None else self._travel.to_counts(settings.home)
         self._target: int | None = None
         self._search: HomeSearch | None = None
         self._closed = False
         self._stops = Stops(name, self._send_stop)
-        self._channel = PM16CChannel(
-            url, channel=channel, name=name, clock=clock, timeout=timeout, baudrate=baudrate, transcript=transcript
-        )
+        self._channel = PM16CChannel(url, settings.channel, settings.wiring, clock, name)
         try:
-            self._version = self._channel.open(steepest_code(limits.acceleration * counts_per_turn / (2 * math.pi)))
+            self._version = self._channel.open(settings.rate_code)
             if (own := self._channel.own_limits()) is not None:
                 self._travel.refuse_narrower(*own, advice="widen the limits on the controller's panel")
         except BaseException:
@@ -132,7 +83,7 @@ class PM16CStage:
             )
         search = HomeSearch(self._channel, self.name, self._home)
         with self._stops.none_while("the search"):
-            search.begin(self._home_pps)
+            search.begin(self._settings.search_rate)
         self._target, self._search = self._home, search
 
     def status(self) -> StageStatus:
@@ -169,9 +120,9 @@ class PM16CStage:
 
     def arm(self, train: TriggerTrain) -> None:
         self._travel.refuse_train(train)
-        points, counts = points_of(train, self._first_pulse), self._channel.standing("arming").counts
+        points, counts = points_of(train, self._settings.first_pulse), self._channel.standing("arming").counts
         self._travel.refuse_late_arming(train, counts, points.start)
-        self._channel.arm(MODES[self._widths.widest_for(train, self.limits)], points)
+        self._channel.arm(MODES[self._settings.widths.widest_for(train, self.limits)], points)
 
     def disarm(self) -> None:
         self._channel.disarm()
@@ -196,11 +147,11 @@ class PM16CStage:
             "model": "Tsuji PM16C-04XD(L)",
             "firmware": self._version,
             "port": self._url,
-            "channel": self._number,
+            "channel": self._settings.channel,
             "trigger_output": "TP0",
-            "pulse_width_s": self._widths.chosen or "the widest that fits",
+            "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
-            "first_pulse": self._first_pulse.value,
+            "first_pulse": self._settings.first_pulse.value,
             **self._travel.described(),
         }
 
@@ -216,12 +167,14 @@ class PM16CStage:
             search.cancel()
         return self._channel.emergency_stop() if hard else self._channel.slow_stop()
 
-    def _home_count(self, home: float | None) -> int | None:
-        if home is None:
-            return None
-        if not abs(home) <= self.to_angle(MAX_COUNT):
-            raise ValueError(f"the home switch cannot be at {home:g} rad")
-        return self.to_counts(home)
+    def digital_output(self, number: int) -> DigitalOutput:
+        """As `drivers.protocols.RotationStage` has it: the controller has none that can be set."""
+        raise DeviceRefused(
+            self.name,
+            f"the controller has no digital output {number} to set",
+            advice="Set shutter.kind: manual, or use the output of another controller",
+            state="Nothing was sent",
+        )
 
     def _pps(self, speed: float) -> int:
         """Pulses/s for rad/s."""

@@ -9,7 +9,6 @@ import contextlib
 import itertools
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceRefused
@@ -24,6 +23,7 @@ from drivers.stages.zaber.packet import (
     reply_form,
     reply_of,
 )
+from drivers.stages.zaber.settings import ZaberSettings
 
 PROBE_ID, STOP_ID, IDS = 98, 99, 98
 """Ordinary commands count their ids from 0 to 97."""
@@ -78,20 +78,10 @@ class ZaberAxis:
         DeviceTimeout: no reply.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        device: int,
-        axis: int,
-        name: str,
-        clock: Clock,
-        timeout: float,
-        baudrate: int,
-        transcript: Path | None,
-    ) -> None:
-        self.number = axis
-        self._name, self._device, self._axis, self._clock = name, device, axis, clock
+    def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str) -> None:
+        device, wiring = settings.device, settings.wiring
+        self.number = settings.axis
+        self._name, self._device, self._axis, self._clock = name, device, settings.axis, clock
         self._ids = itertools.cycle(range(IDS))
         self._must_have_checksum = False
         self._commanded = False
@@ -104,11 +94,11 @@ class ZaberAxis:
             device=name,
             probe=Probe(encode(device, 0, PROBE_ID, ""), reply_form(device, 0, PROBE_ID, TEXT)),
             clock=clock,
-            timeout=timeout,
-            baudrate=baudrate,
+            timeout=wiring.timeout,
+            baudrate=wiring.baudrate,
             unsolicited=passed_over_form(STOP_ID),
             check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
-            transcript=transcript,
+            transcript=wiring.transcript,
         )
 
     def open(self) -> Identity:

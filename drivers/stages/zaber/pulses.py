@@ -73,14 +73,14 @@ class ZaberPulses:
         train = self._train
         if train is None or train.interval * (target - counts) >= 0 or not begun(self.settings, self._shown()):
             return
-        if self.settings.chained and self.remaining() == train.n:
+        if self.settings.triggers.chained and self.remaining() == train.n:
             self.arm(train, counts, _nowhere)
         else:
             self.disarm()
 
     def _shown(self) -> str:
         """What `trigger show` tells, for this many triggers at least."""
-        needed = max(self.settings.starter, self.settings.repeater)
+        needed = max(self.settings.triggers.starter, self.settings.triggers.repeater)
         return self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").data
 
 
@@ -89,7 +89,7 @@ def _nowhere(counts: int) -> None:
 
 
 class ZaberOutput:
-    """A digital output of a device whose stage is open. Implements `drivers.shutter.DigitalOutput`."""
+    """A digital output of a device whose stage is open. Implements `drivers.protocols.DigitalOutput`."""
 
     def __init__(self, axis: ZaberAxis, number: int, name: str) -> None:
         self.name = name

@@ -1,7 +1,7 @@
 """Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
 
 Positions are commanded microsteps unless `measured`. What is known of the firmware from memory only is a setting:
-`speed_unit` here, the rest in `drivers.stages.zaber.train.PulseSettings`.
+`speed_unit` and `drivers.stages.zaber.train.TriggerUse`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import replace
-from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
@@ -18,10 +17,9 @@ from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import AxisStatus, ZaberAxis
-from drivers.stages.zaber.limits import SPEED_UNIT, limits_of, native_limits
 from drivers.stages.zaber.packet import meaning_of
 from drivers.stages.zaber.pulses import ZaberOutput, ZaberPulses
-from drivers.stages.zaber.train import PulseSettings, pulses_of
+from drivers.stages.zaber.settings import ZaberSettings
 
 STANDING_IN_PLACE = 10.0
 """s beyond twice the time of a short move after which it has failed."""
@@ -32,79 +30,28 @@ class ZaberStage:
     train away and leaves speed, acceleration and checksums as they were found.
 
     `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
-    move against a train under way ends the train: the controller counts distance both ways. With `pulses.chained` false
-    `arm` itself turns the stage to one step before the first pulse and waits; it then speeds up over the first pulses.
+    move against a train under way ends the train: the controller counts distance both ways. Where triggers are not
+    `chained`, `arm` itself turns the stage to one step before the first pulse and waits; it then speeds up over the
+    first pulses.
 
     Args:
         url: what pyserial opens; a controller's LAN port is "socket://host:55550".
-        device, axis: address in the chain, axis of the device.
-        output: digital output of the pulses, from 1.
-        counts_per_turn: microsteps for 2π; must be the device's own limit.cycle.dist.
-        timeout: s for a reply.
-        max_speed, acceleration: rad/s, rad/s²; the acceleration becomes one that the controller has, see `limits`.
-        low, high: soft limits in radians.
-        pulse_width: s, whole milliseconds; None is 1 ms, or half an interval where `toggle`.
-        active_high: the output rests low.
-        toggle: fires toggle the output (for firmware without `schedule`); intervals must then be even.
-        speed_unit: see `SPEED_UNIT` [memory: the vendor's long-standing convention].
-        pulses: what else of the triggers can be chosen; output, width and polarity are those given here.
-        transcript: file to which every byte on the wire is appended; None keeps none.
 
     Raises:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        device: int = 1,
-        axis: int = 1,
-        output: int = 1,
-        counts_per_turn: int,
-        clock: Clock,
-        timeout: float = 1.0,
-        max_speed: float,
-        acceleration: float,
-        low: float,
-        high: float,
-        name: str = "stage",
-        baudrate: int = 115_200,
-        pulse_width: float | None = None,
-        active_high: bool = True,
-        toggle: bool = False,
-        speed_unit: float = SPEED_UNIT,
-        pulses: PulseSettings | None = None,
-        transcript: Path | None = None,
-    ) -> None:
+    def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
-        self._clock, self._url, self._where = clock, url, (device, axis)
-        self._speed_unit = speed_unit
-        try:
-            if not (1 <= device <= 99 and 1 <= axis <= 9):
-                raise ValueError(f"device {device}, axis {axis} do not exist; they are 1 to 99 and 1 to 9")
-            rest = pulses or PulseSettings()
-            chosen = pulses_of(rest, output=output, width=pulse_width, active_high=active_high, toggle=toggle)
-            limits = limits_of(counts_per_turn, max_speed, acceleration, low, high, chosen, speed_unit)
-            self._fastest, steepest = native_limits(counts_per_turn, max_speed, acceleration, speed_unit)
-        except ValueError as problem:
-            raise DeviceRefused(name, str(problem), state="Nothing was sent") from problem
-        self._travel = Travel(name, limits)
+        self._clock, self._url, self._settings = clock, url, settings
+        self._fastest, steepest = settings.native_limits
+        self._travel = Travel(name, settings.limits())
         self._target: int | None = None
         self._homing = False
         self._closed = False
         self._stops = Stops(name, self._send_stop)
-        self._axis = ZaberAxis(
-            url,
-            device=device,
-            axis=axis,
-            name=name,
-            clock=clock,
-            timeout=timeout,
-            baudrate=baudrate,
-            transcript=transcript,
-        )
-        self._pulses = ZaberPulses(self._axis, chosen, name)
+        self._axis = ZaberAxis(url, settings, clock, name)
+        self._pulses = ZaberPulses(self._axis, settings.pulses, name)
         try:
             self._identity = self._axis.open()
             self._check_turn_and_travel()
@@ -114,7 +61,7 @@ class ZaberStage:
         except BaseException:
             self.close()
             raise
-        self._travel = Travel(name, replace(limits, trigger_output=self._identity.has_triggers))
+        self._travel = Travel(name, replace(settings.limits(), trigger_output=self._identity.has_triggers))
 
     @property
     def limits(self) -> StageLimits:
@@ -140,7 +87,7 @@ class ZaberStage:
     def _start_move(self, angle: float, speed: float, stops: int) -> None:
         """`stops`: their number before; one that comes from then on wins."""
         target = self._travel.target(angle)
-        per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._speed_unit
+        per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._settings.speed_unit
         native = round(speed * per_radian) if 0 < speed < 2 * self.limits.max_speed else 0
         if not 1 <= native <= self._fastest:
             raise DeviceRefused(
@@ -238,16 +185,16 @@ class ZaberStage:
         self._send_stop(hard=True)
 
     def describe(self) -> dict[str, str | int | float]:
-        pulses, (device, axis) = self._pulses.settings, self._where
+        pulses = self._pulses.settings
         return {
             "model": f"Zaber device {self._identity.number}",
             "serial": self._identity.serial,
             "firmware": self._identity.firmware,
             "port": self._url,
-            "device": device,
-            "axis": axis,
+            "device": self._settings.device,
+            "axis": self._settings.axis,
             "trigger_output": f"digital output {pulses.output}",
-            "trigger_position": "encoder" if pulses.measured else "commanded",
+            "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
             **self._travel.described(),

@@ -8,12 +8,46 @@ stands within that step already, the starter gives the first pulse itself. Where
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 from drivers.protocols import TriggerTrain
+from drivers.stages.settings import key
 
 SHORTEST = 1e-3
 """s between two fires of a trigger that firmware is trusted to keep up with [memory: it looks about this often]."""
+
+
+@dataclass(frozen=True)
+class TriggerUse:
+    """How the device's triggers are used; what its firmware does is from memory.
+
+    Attributes:
+        measured: distance and position by the encoder, not as commanded [its unit from memory: microsteps, too].
+        chained: an action may enable another trigger [from memory].
+        fires_when_enabled: a distance trigger fires at the very point of enabling, not first one distance on [memory
+            has it not].
+        starter, repeater: numbers of the two triggers used.
+        shortest: s that two fires must be apart at full speed.
+
+    Raises:
+        ValueError: triggers that cannot work together.
+    """
+
+    measured: bool = key(False, "Pulses by the encoder, not by the commanded position.")
+    chained: bool = key(
+        True,
+        "An action may enable another trigger; false: arming turns the stage to one step before the first pulse.",
+    )
+    fires_when_enabled: bool = key(False, "A distance trigger fires where it is enabled, too.")
+    starter: int = key(1, gt=0)
+    repeater: int = key(2, "The numbers of the two triggers used.", gt=0)
+    shortest: float = key(SHORTEST, "Between two fires at full speed.", unit="s", gt=0)
+
+    def __post_init__(self) -> None:
+        if self.fires_when_enabled and not self.chained:
+            raise ValueError("a trigger that fires when enabled needs another one to enable it: chained")
+        if self.starter == self.repeater or min(self.starter, self.repeater) < 1:
+            raise ValueError("starter and repeater are two different triggers, they count from 1")
 
 
 @dataclass(frozen=True)
@@ -25,31 +59,18 @@ class PulseSettings:
         width: s, whole ms: the output is set and a schedule resets it. None: fires toggle it, every second one is a
             pulse; then intervals must be even.
         active_high: the output rests low.
-        measured: distance and position by the encoder, not as commanded [its unit from memory: microsteps, too].
-        chained: an action may enable another trigger [from memory].
-        fires_when_enabled: a distance trigger fires at the very point of enabling, not first one distance on [memory
-            has it not].
-        starter, repeater: numbers of the two triggers used.
-        shortest: s that two fires must be apart at full speed.
     """
 
     output: int = 1
     width: float | None = 1e-3
     active_high: bool = True
-    measured: bool = False
-    chained: bool = True
-    fires_when_enabled: bool = False
-    starter: int = 1
-    repeater: int = 2
-    shortest: float = SHORTEST
+    triggers: TriggerUse = field(default=TriggerUse())
 
     def __post_init__(self) -> None:
         if self.width is not None and not (self.width > 0 and abs(self.width * 1000 - self.milliseconds) < 1e-6):
             raise ValueError(f"a pulse width of {self.width:g} s is not possible; it is whole milliseconds, 1 or more")
-        if self.fires_when_enabled and not self.chained:
-            raise ValueError("a trigger that fires when enabled needs another one to enable it: chained")
-        if self.starter == self.repeater or min(self.starter, self.repeater, self.output) < 1:
-            raise ValueError("starter and repeater are two different triggers, they and outputs count from 1")
+        if self.output < 1:
+            raise ValueError(f"there is no output {self.output}; outputs count from 1")
 
     @property
     def milliseconds(self) -> int:
@@ -58,7 +79,7 @@ class PulseSettings:
     @property
     def spacing(self) -> float:
         """s that pulses must be apart at full speed; the output then rests as long as it is set."""
-        return 2 * self.shortest if self.width is None else max(self.shortest, 2 * self.width)
+        return 2 * self.triggers.shortest if self.width is None else max(self.triggers.shortest, 2 * self.width)
 
     @property
     def rest(self) -> str:
@@ -68,7 +89,7 @@ class PulseSettings:
     @property
     def disable(self) -> tuple[str, str]:
         """The starter first, for it enables the repeater."""
-        return f"trigger {self.starter} disable", f"trigger {self.repeater} disable"
+        return f"trigger {self.triggers.starter} disable", f"trigger {self.triggers.repeater} disable"
 
     @property
     def pulse(self) -> str:
@@ -77,20 +98,6 @@ class PulseSettings:
             return f"io set do {self.output} t"
         on, off = int(self.active_high), int(not self.active_high)
         return f"io set do {self.output} {on} schedule {self.milliseconds} {off}"
-
-
-def pulses_of(
-    rest: PulseSettings, *, output: int, width: float | None, active_high: bool, toggle: bool
-) -> PulseSettings:
-    """What was chosen of the output (`width` None: 1 ms, or half an interval where fires toggle it) with the `rest`.
-
-    Raises:
-        ValueError: no output can be so.
-    """
-    if toggle and width is not None:
-        raise ValueError("a toggled output has no pulse width of its own; choose a width or toggle, not both")
-    made = None if toggle else PulseSettings.width if width is None else width
-    return replace(rest, output=output, width=made, active_high=active_high)
 
 
 @dataclass(frozen=True)
@@ -117,12 +124,12 @@ def step_of(settings: PulseSettings, train: TriggerTrain) -> int:
 def set_up(settings: PulseSettings, train: TriggerTrain, axis: int, counts: int) -> TriggerSetup:
     """The triggers for a train that can be emitted, with the stage standing at `counts`, before the first pulse."""
     sign, step = (1 if train.interval > 0 else -1), step_of(settings, train)
-    starter, repeater = f"trigger {settings.starter}", f"trigger {settings.repeater}"
-    distance, position = ("encoder dist", "encoder.pos") if settings.measured else ("dist", "pos")
+    starter, repeater = f"trigger {settings.triggers.starter}", f"trigger {settings.triggers.repeater}"
+    distance, position = ("encoder dist", "encoder.pos") if settings.triggers.measured else ("dist", "pos")
     before = train.start - sign * step
     fires = 2 * train.n if settings.width is None else train.n
     by_starter = False
-    if settings.fires_when_enabled:
+    if settings.triggers.fires_when_enabled:
         begin = train.start
     elif sign * (before - counts) > 0:
         begin = before
@@ -135,7 +142,7 @@ def set_up(settings: PulseSettings, train: TriggerTrain, axis: int, counts: int)
         f"{repeater} action a {settings.pulse}",
         f"{repeater} action b none",
     ]
-    if not settings.chained:
+    if not settings.triggers.chained:
         fires += by_starter
         return TriggerSetup(tuple(commands), f"{repeater} enable {fires}", before)
     commands += [
@@ -148,7 +155,7 @@ def set_up(settings: PulseSettings, train: TriggerTrain, axis: int, counts: int)
 
 def begun(settings: PulseSettings, shown: str) -> bool:
     """Distance is being counted, as `trigger show` tells."""
-    return not settings.chained or _state(shown, settings.starter) == "d"
+    return not settings.triggers.chained or _state(shown, settings.triggers.starter) == "d"
 
 
 def remaining(settings: PulseSettings, train: TriggerTrain, shown: str) -> int:
@@ -159,7 +166,7 @@ def remaining(settings: PulseSettings, train: TriggerTrain, shown: str) -> int:
     """
     if not begun(settings, shown):
         return train.n
-    left = _state(shown, settings.repeater)
+    left = _state(shown, settings.triggers.repeater)
     fires = int(left) if left.isdigit() else 0
     return fires // 2 if settings.width is None else fires
 

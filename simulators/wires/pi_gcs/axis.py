@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from drivers.clock import Clock
 from simulators.devices.motion import Phase, TrapezoidMove
@@ -30,7 +30,7 @@ class GcsError(Exception):
 
 
 @dataclass(frozen=True)
-class Build:
+class AxisBuild:
     """How this specimen is built, and its faults.
 
     Attributes:
@@ -48,6 +48,9 @@ class Build:
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
         stall_at: a move that would pass this true count ends there with error 1024 and the servo off.
         switch_at: a move that would pass this true count ends there by a limit switch, the servo on.
+
+    Raises:
+        ValueError: a turn without counts.
     """
 
     counts_per_turn: int = 360_000
@@ -65,15 +68,19 @@ class Build:
     settle: float = 0.02
     max_velocity: float = 720.0
     max_acceleration: float = 10_000.0
-    lost: Set[int] = field(default_factory=frozenset)
+    lost: Set[int] = frozenset()
     stall_at: int | None = None
     switch_at: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.counts_per_turn < 1:
+            raise ValueError(f"a turn cannot have {self.counts_per_turn} counts")
 
 
 class GcsAxis:
     """Not safe from several threads. `line` is the cable in the output that has the settings `wired`."""
 
-    def __init__(self, clock: Clock, line: TriggerLine, build: Build, wired: Output) -> None:
+    def __init__(self, clock: Clock, line: TriggerLine, build: AxisBuild, wired: Output) -> None:
         self.build = build
         self.per_degree = build.counts_per_turn / 360.0
         self.error = 0

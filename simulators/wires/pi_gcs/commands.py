@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from simulators.wires.pi_gcs.axis import Build, GcsAxis, GcsError
+from simulators.wires.pi_gcs.axis import AxisBuild, GcsAxis, GcsError
 from simulators.wires.pi_gcs.output import Output
 
 IDENTITY = "(c)2026 Physik Instrumente (PI) GmbH & Co. KG, C-863.12-SIMULATED, 0, 1.2.1.0"
@@ -98,7 +98,7 @@ def _switch(act: Callable[[PiGcsBox, bool], None]) -> Action:
     return do
 
 
-def _rate(attribute: str, highest: Callable[[Build], float], error: int = 17) -> Action:
+def _rate(attribute: str, highest: Callable[[AxisBuild], float], error: int = 17) -> Action:
     """A velocity or acceleration in degrees, above 0."""
 
     def do(box: PiGcsBox, arguments: list[str]) -> None:

@@ -7,16 +7,20 @@ wins). An unknown query is not answered either. Of a reply of several lines all 
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Set
-from dataclasses import replace
+from dataclasses import dataclass, field
+from typing import Self
 
 from drivers.clock import Clock
+from drivers.stages.pi_gcs.settings import PiGcsSettings
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.axis import Build, GcsAxis, GcsError
+from simulators.wires.pi_gcs.axis import AxisBuild, GcsAxis, GcsError
 from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
 from simulators.wires.pi_gcs.output import Output
+from simulators.wires.pi_gcs.trigger import FirstPulse
 
 OUTPUTS = 4
 LONGEST_LINE = 256
@@ -24,44 +28,79 @@ LONGEST_LINE = 256
 Spoil = Callable[[int, bytes], bytes]
 
 
+def _as_sent(number: int, reply: bytes) -> bytes:
+    return reply
+
+
+def _degrees(angle: float) -> float:
+    """As the driver writes it: with 12 decimals."""
+    return round(math.degrees(angle), 12)
+
+
+@dataclass(frozen=True)
+class PiGcsBuild:
+    """How the controller is built, and its faults.
+
+    Attributes:
+        axis: its identifier.
+        output: the digital output that the trigger cable is in, from 1.
+        latency: s until a reply is there.
+        unknown: commands (like "ACC" or "TMN?") that this model does not know.
+        spoil: what becomes of a reply on its way: its number since power-on and its bytes -> the bytes that arrive.
+        specimen: the axis, and its faults.
+
+    Raises:
+        ValueError: there is no such output.
+    """
+
+    axis: str = "1"
+    output: int = 1
+    latency: float = 0.0
+    unknown: Set[str] = frozenset()
+    spoil: Spoil = _as_sent
+    specimen: AxisBuild = field(default=AxisBuild())
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.output <= OUTPUTS:
+            raise ValueError(f"there is no digital output {self.output}; there are 1 to {OUTPUTS}")
+
+    @classmethod
+    def matching(cls, settings: PiGcsSettings) -> Self:
+        figures = settings.figures
+        if settings.trigger_line > OUTPUTS:
+            raise ValueError(
+                f"trigger_line: the simulated controller has no digital output {settings.trigger_line}; it has 1 to "
+                f"{OUTPUTS}"
+            )
+        specimen = AxisBuild(
+            counts_per_turn=figures.counts_per_turn,
+            low=_degrees(figures.low) - 1,
+            high=_degrees(figures.high) + 1,
+            first_pulse=FirstPulse(settings.first_pulse),
+            pulse_width=settings.firmware_pulse,
+            rising=settings.wiring.active_high,
+            max_velocity=_degrees(figures.max_speed),
+            max_acceleration=_degrees(figures.acceleration),
+        )
+        return cls(settings.axis, settings.trigger_line, specimen=specimen)
+
+    def controller(self, clock: Clock, line: TriggerLine) -> PiGcsController:
+        return PiGcsController(clock, line, self)
+
+
 class PiGcsController:
     """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
 
     Args:
-        line: the cable in output `output` (1 to 4); it also learns the sample's true angle.
-        axis: its identifier.
-        build: how the specimen is built, and its faults; `counts_per_turn` and `referenced` here go before.
-        latency: s until a reply is there.
-        unknown: commands (like "ACC" or "TMN?") that this model does not know.
-        spoil: what becomes of a reply on its way: its number since power-on and its bytes -> the bytes that arrive.
+        line: the cable in the build's output; it also learns the sample's true angle.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        line: TriggerLine,
-        *,
-        axis: str = "1",
-        output: int = 1,
-        counts_per_turn: int | None = None,
-        referenced: bool | None = None,
-        build: Build | None = None,
-        latency: float = 0.0,
-        unknown: Set[str] = frozenset(),
-        spoil: Spoil = lambda number, reply: reply,
-    ) -> None:
-        build = build or Build()
-        if counts_per_turn is not None:
-            build = replace(build, counts_per_turn=counts_per_turn)
-        if referenced is not None:
-            build = replace(build, referenced=referenced)
-        if build.counts_per_turn < 1:
-            raise ValueError(f"a turn cannot have {build.counts_per_turn} counts")
+    def __init__(self, clock: Clock, line: TriggerLine, build: PiGcsBuild) -> None:
         self.clock = clock
         self.replies = 0
-        outputs = {number: Output(axis=axis) for number in range(1, OUTPUTS + 1)}
-        self.box = PiGcsBox(axis, GcsAxis(clock, line, build, outputs[output]), outputs)
-        self._latency, self._unknown, self._spoil = latency, unknown, spoil
+        outputs = {number: Output(axis=build.axis) for number in range(1, OUTPUTS + 1)}
+        self.box = PiGcsBox(build.axis, GcsAxis(clock, line, build.specimen, outputs[build.output]), outputs)
+        self._latency, self._unknown, self._spoil = build.latency, build.unknown, build.spoil
         self._in = bytearray()
         self._out: deque[tuple[float, bytes]] = deque()
         self._lock = threading.RLock()
@@ -86,6 +125,9 @@ class PiGcsController:
             while self._out and self._out[0][0] <= self.clock.now():
                 taken += self._out.popleft()[1]
             return bytes(taken)
+
+    def output_is_high(self, number: int) -> bool:
+        return self.box.levels.get(number, False)
 
     def _do_line(self, line: bytes) -> None:
         words = line.decode("cp1252", errors="replace").split()

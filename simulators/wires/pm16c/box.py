@@ -8,6 +8,7 @@ and does nothing more.
 from __future__ import annotations
 
 from collections.abc import Callable, Set
+from dataclasses import dataclass
 from enum import IntFlag
 
 from drivers.clock import Clock
@@ -15,6 +16,7 @@ from simulators.devices.motor import Output, PulseMotor, TriggerSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.home import HomeSwitch
 
+VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
 MAX_PULSES = 200_000
@@ -84,38 +86,53 @@ class Channel:
         return 0b11 | (0b100 if gaining > 0 else 0) | (0b1000 if gaining < 0 else 0)
 
 
+@dataclass(frozen=True)
+class BoxBuild:
+    """How the box is built and what is plugged into it.
+
+    Attributes:
+        channel: the motor that turns the sample; the others turn nothing.
+        counts_per_turn: its pulses for 2π.
+        home_at: where its home switch is, in pulses since power-on; None plugs none in.
+        version: what it says of its firmware.
+        lost: trigger pulses (from 0, since power-on) that never reach the line.
+        stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
+            interlock or a limit switch.
+        fires_at_start: a train's start point itself gives a pulse [from memory: it does].
+
+    Raises:
+        ValueError: there is no such channel.
+    """
+
+    channel: int = 0
+    counts_per_turn: int = 360_000
+    home_at: int | None = 0
+    version: str = VERSION
+    lost: Set[int] = frozenset()
+    stall_at: int | None = None
+    switch_at: int | None = None
+    fires_at_start: bool = True
+
+    def __post_init__(self) -> None:
+        if self.channel not in range(16):
+            raise ValueError(f"there is no channel {self.channel}; there are 0 to 15")
+
+
 class PM16CBox:
     """State and actions; methods take the channel as the hex digit of the protocol. Not safe from several threads.
 
     Args:
-        channel: the motor that turns the sample; the others turn nothing.
         line: what the TP0 connector, the output of position controller A, is wired to.
-        home_at: where its home switch is, in pulses since power-on; None plugs none in.
-        lost, stall_at, switch_at, fires_at_start: of the sample's motor, see `PulseMotor`.
-        version: what it says of its firmware.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        line: TriggerLine,
-        *,
-        channel: int,
-        counts_per_turn: int,
-        lost: Set[int],
-        stall_at: int | None,
-        switch_at: int | None,
-        home_at: int | None,
-        version: str,
-        fires_at_start: bool,
-    ) -> None:
-        self.clock, self.version = clock, version
+    def __init__(self, clock: Clock, line: TriggerLine, build: BoxBuild) -> None:
+        self.clock, self.version = clock, build.version
         self.remote = False
         self.errors = Error(0)
         self.mapped = "0123"
-        sample = f"{channel:X}"
+        sample, turn = f"{build.channel:X}", build.counts_per_turn
         self.channels = {
-            name: Channel(PulseMotor(clock, _unplugged, counts_per_turn=counts_per_turn)) for name in "0123456789ABCDEF"
+            name: Channel(PulseMotor(clock, _unplugged, counts_per_turn=turn)) for name in "0123456789ABCDEF"
         }
 
         def tp0() -> TriggerLine | None:
@@ -124,13 +141,13 @@ class PM16CBox:
         self.sample = PulseMotor(
             clock,
             tp0,
-            counts_per_turn=counts_per_turn,
-            lost=lost,
-            stall_at=stall_at,
-            switch_at=switch_at,
-            fires_at_start=fires_at_start,
+            counts_per_turn=turn,
+            lost=build.lost,
+            stall_at=build.stall_at,
+            switch_at=build.switch_at,
+            fires_at_start=build.fires_at_start,
         )
-        self.channels[sample] = Channel(self.sample, home_at)
+        self.channels[sample] = Channel(self.sample, build.home_at)
 
     def moving(self) -> int:
         """How many motors move."""

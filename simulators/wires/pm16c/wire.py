@@ -9,14 +9,15 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Set
-from dataclasses import replace
-from typing import TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Self, TypeVar
 
 from drivers.clock import Clock
+from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.pm16c.train import FirstPulse
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.box import MODES, Error, PM16CBox, Refused
+from simulators.wires.pm16c.box import MODES, BoxBuild, Error, PM16CBox, Refused
 
-VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
 END = b"\r\n"
 LONGEST_LINE = 256
 ERROR_TEXT = {Error.COMMAND: "COMMAND ERROR", Error.BUSY: "MCC06 BUSY ERROR", Error.BAD_ABS: "BAD ABS COMMAND"}
@@ -106,55 +107,40 @@ REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
 )
 
 
+@dataclass(frozen=True)
+class PM16CBuild:
+    """How the controller is built, and its faults.
+
+    Attributes:
+        box: what stands behind the wire.
+        silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
+    """
+
+    box: BoxBuild = field(default=BoxBuild())
+    silent: Set[int] = frozenset()
+    garbled: Set[int] = frozenset()
+
+    @classmethod
+    def matching(cls, settings: PM16CSettings) -> Self:
+        at_start = settings.first_pulse is FirstPulse.AT_START
+        return cls(BoxBuild(settings.channel, settings.figures.counts_per_turn, fires_at_start=at_start))
+
+    def controller(self, clock: Clock, line: TriggerLine) -> PM16CController:
+        return PM16CController(clock, line, self)
+
+
 class PM16CController:
     """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
 
     Args:
         line: what the TP0 connector (position controller A) is wired to; it also learns the sample's true angle.
-        channel: the motor that turns the sample.
-        counts_per_turn: its pulses for 2π.
-        home_at: where the sample's home switch is, in pulses since power-on; None plugs none in.
-        lost: trigger pulses (from 0, since power-on) that never reach the line.
-        stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
-            interlock or a limit switch.
-        version: what it says of its firmware.
-        fires_at_start: a train's start point itself gives a pulse [from memory: it does].
-        silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        line: TriggerLine,
-        *,
-        channel: int = 0,
-        counts_per_turn: int = 360_000,
-        home_at: int | None = 0,
-        lost: Set[int] = frozenset(),
-        stall_at: int | None = None,
-        switch_at: int | None = None,
-        version: str = VERSION,
-        fires_at_start: bool = True,
-        silent: Set[int] = frozenset(),
-        garbled: Set[int] = frozenset(),
-    ) -> None:
-        if channel not in range(16):
-            raise ValueError(f"there is no channel {channel}; there are 0 to 15")
+    def __init__(self, clock: Clock, line: TriggerLine, build: PM16CBuild) -> None:
         self.clock = clock
         self.queries = 0
-        self.box = PM16CBox(
-            clock,
-            line,
-            channel=channel,
-            counts_per_turn=counts_per_turn,
-            lost=lost,
-            stall_at=stall_at,
-            switch_at=switch_at,
-            home_at=home_at,
-            version=version,
-            fires_at_start=fires_at_start,
-        )
-        self._silent, self._garbled = silent, garbled
+        self.box = PM16CBox(clock, line, build.box)
+        self._silent, self._garbled = build.silent, build.garbled
         self._in, self._out = bytearray(), bytearray()
         self._lock = threading.RLock()
         line.attach_angle(self._angle_at)
@@ -177,6 +163,10 @@ class PM16CController:
             out = bytes(self._out)
             self._out.clear()
             return out
+
+    def output_is_high(self, number: int) -> bool:
+        """It has no outputs that can be set."""
+        return False
 
     def _do(self, line: bytes) -> None:
         text = line.decode("ascii", errors="replace")

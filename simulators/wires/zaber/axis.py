@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 from simulators.devices.motion import TrapezoidMove
@@ -28,41 +29,44 @@ class Rejected(Exception):  # noqa: N818 - not an error of this program
         self.reason = reason
 
 
+@dataclass(frozen=True)
+class AxisBuild:
+    """How the axis is built, and its faults.
+
+    Attributes:
+        counts_per_turn: microsteps for 2π of true angle.
+        low, high: its own travel limits in microsteps.
+        homed: it knows its reference since power-on; without it stands WR.
+        stall_at: a move that would pass this count stops there (FS), as when something blocks it.
+        switch_at: a move that would pass this count runs into a limit there (WL, FE).
+    """
+
+    counts_per_turn: int = 384_000
+    low: int = -2_000_000_000
+    high: int = 2_000_000_000
+    homed: bool = True
+    stall_at: int | None = None
+    switch_at: int | None = None
+
+
 class ZaberAxis:
     """One axis. Times are s on the device's clock, positions whole microsteps.
 
-    Args:
-        counts_per_turn: microsteps for 2π of true angle.
-        low, high: its own travel limits.
-        homed: it knows its reference since power-on.
-        stall_at: a move that would pass this count stops there (FS), as when something blocks it.
-        switch_at: a move that would pass this count runs into a limit there (WL, FE).
-
-    Both may be changed while it stands, as by a person who clears the way.
+    `stall_at` and `switch_at` may be changed while it stands, as by a person who clears the way.
     """
 
-    def __init__(
-        self,
-        now: float,
-        *,
-        counts_per_turn: int,
-        low: int,
-        high: int,
-        homed: bool,
-        stall_at: int | None,
-        switch_at: int | None,
-    ) -> None:
+    def __init__(self, now: float, build: AxisBuild) -> None:
         self.settings: dict[str, int] = {
-            "maxspeed": round(counts_per_turn / 36 * SPEED_UNIT),
+            "maxspeed": round(build.counts_per_turn / 36 * SPEED_UNIT),
             "motion.accelonly": 100,
             "motion.decelonly": 100,
-            "limit.min": low,
-            "limit.max": high,
+            "limit.min": build.low,
+            "limit.max": build.high,
         }
-        self.homed, self.enabled = homed, True
+        self.homed, self.enabled = build.homed, True
         self.flags: set[str] = set()
-        self.stall_at, self.switch_at = stall_at, switch_at
-        self._angle_of_count = 2 * math.pi / counts_per_turn
+        self.stall_at, self.switch_at = build.stall_at, build.switch_at
+        self._angle_of_count = 2 * math.pi / build.counts_per_turn
         self._moves = deque([TrapezoidMove(now, 0.0, 0.0, ())], maxlen=MOVES_REMEMBERED)
         self._at_end: Callable[[], None] | None = None
 

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence, Set
+from dataclasses import dataclass, field
 
 from drivers.clock import Clock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber.axis import SPEED_UNIT, Rejected, ZaberAxis
+from simulators.wires.zaber.axis import SPEED_UNIT, AxisBuild, Rejected, ZaberAxis
 from simulators.wires.zaber.conditions import INPUTS, OUTPUTS, is_output, number_in
 from simulators.wires.zaber.triggers import ACTIONS, TRIGGERS, Edge, Triggers
 
@@ -20,57 +21,60 @@ WRITABLE = {"maxspeed", "motion.accelonly", "motion.decelonly", "limit.min", "li
 NOTHING = "0"
 
 
-class ZaberDevice:
-    """State and actions of the device; `do` raises Rejected with the device's reason. Not safe from several threads.
+@dataclass(frozen=True)
+class DeviceBuild:
+    """How the device is built, and its faults.
 
-    Args: see `simulators.wires.zaber.wire.ZaberController`.
+    Attributes:
+        output: digital output (from 1) that is wired to the line.
+        active_high: which edge of that output the camera takes for a pulse.
+        firmware: version; triggers came with 7.06.
+        can_schedule: it knows `io set do N V schedule MS W`; can_chain: an action may enable another trigger.
+        identity: the name of the setting with the device's identity number: "device.id" or "deviceid".
+        latency: s from a trigger's condition to its actions.
+        fires_when_enabled: a distance trigger fires where it is enabled, too.
+        lost: trigger pulses (from 0, since power-on) that never reach the line.
+
+    Raises:
+        ValueError: there is no such output.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        line: TriggerLine,
-        *,
-        counts_per_turn: int,
-        output: int,
-        active_high: bool,
-        firmware: str,
-        can_schedule: bool,
-        can_chain: bool,
-        identity: str,
-        low: int,
-        high: int,
-        homed: bool,
-        stall_at: int | None,
-        switch_at: int | None,
-        latency: float,
-        fires_when_enabled: bool,
-        lost: Set[int],
-    ) -> None:
-        now = clock.now()
-        self.axis = ZaberAxis(
-            now,
-            counts_per_turn=counts_per_turn,
-            low=low,
-            high=high,
-            homed=homed,
-            stall_at=stall_at,
-            switch_at=switch_at,
-        )
-        self.triggers = Triggers(self.axis.move, self.axis.settings, latency, fires_when_enabled, now)
+    output: int = 1
+    active_high: bool = True
+    firmware: str = "7.38"
+    can_schedule: bool = True
+    can_chain: bool = True
+    identity: str = "device.id"
+    latency: float = 0.0
+    fires_when_enabled: bool = False
+    lost: Set[int] = frozenset()
+    axis: AxisBuild = field(default=AxisBuild())
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.output <= OUTPUTS:
+            raise ValueError(f"there is no digital output {self.output}; there are 1 to {OUTPUTS}")
+
+
+class ZaberDevice:
+    """State and actions of the device; `do` raises Rejected with the device's reason. Not safe from several threads."""
+
+    def __init__(self, clock: Clock, line: TriggerLine, build: DeviceBuild) -> None:
+        now, counts_per_turn = clock.now(), build.axis.counts_per_turn
+        self.axis = ZaberAxis(now, build.axis)
+        self.triggers = Triggers(self.axis.move, self.axis.settings, build.latency, build.fires_when_enabled, now)
         self.alerts, self.checksums = False, False
-        self._clock, self._line, self._lost = clock, line, lost
-        self._output, self._active = output - 1, int(active_high)
+        self._clock, self._line, self._lost = clock, line, build.lost
+        self._output, self._active = build.output - 1, int(build.active_high)
         self.triggers.outputs[self._output] = 1 - self._active
-        self._can_schedule, self._can_chain = can_schedule, can_chain
-        self._has_triggers = tuple(map(int, firmware.split("."))) >= (7, 6)
+        self._can_schedule, self._can_chain = build.can_schedule, build.can_chain
+        self._has_triggers = tuple(map(int, build.firmware.split("."))) >= (7, 6)
         self._angle_of_count = 2 * math.pi / counts_per_turn
         self._sent: set[Pulse] = set()
         self._looked, self._counted = 0, 0  # edges that happened and were looked at; pulses among them
         self._fixed: dict[str, str] = {
-            identity: "50952",
+            build.identity: "50952",
             "system.serial": "123456",
-            "version": firmware,
+            "version": build.firmware,
             "version.build": "1",
             "system.axiscount": "1",
             "device.hw.modified": "0",

@@ -7,13 +7,17 @@ from what the vendor's own library sends and accepts; where that tells nothing, 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Self
 
 from drivers.clock import Clock
+from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.axis import Rejected
-from simulators.wires.zaber.device import NOTHING, ZaberDevice
+from simulators.wires.zaber.axis import AxisBuild, Rejected
+from simulators.wires.zaber.conditions import OUTPUTS
+from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
 from simulators.wires.zaber.packets import Command, Malformed, PacketReader, frame
 
 
@@ -29,74 +33,54 @@ class Fault(StrEnum):
     AGAIN = "the device asks to repeat"
 
 
+@dataclass(frozen=True)
+class ZaberBuild:
+    """How the controller is built, and its faults.
+
+    Attributes:
+        address: of the device in the chain.
+        faults: reply (from 0, since power-on) -> what happens to it.
+        echo: the line sends the host its own bytes back.
+        device: what stands behind the wire.
+    """
+
+    address: int = 1
+    faults: Mapping[int, Fault] = field(default_factory=dict)
+    echo: bool = False
+    device: DeviceBuild = field(default=DeviceBuild())
+
+    @classmethod
+    def matching(cls, settings: ZaberSettings) -> Self:
+        if settings.output > OUTPUTS:
+            raise ValueError(
+                f"output: the simulated controller has no digital output {settings.output}; it has 1 to {OUTPUTS}"
+            )
+        device = DeviceBuild(
+            output=settings.output,
+            active_high=settings.wiring.active_high,
+            can_schedule=not settings.toggle,
+            can_chain=settings.triggers.chained,
+            fires_when_enabled=settings.triggers.fires_when_enabled,
+            axis=AxisBuild(settings.figures.counts_per_turn),
+        )
+        return cls(settings.device, device=device)
+
+    def controller(self, clock: Clock, line: TriggerLine) -> ZaberController:
+        return ZaberController(clock, line, self)
+
+
 class ZaberController:
     """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
 
     Args:
-        line: what digital output `output` (from 1) is wired to; it also learns the sample's true angle.
-        counts_per_turn: microsteps for 2π.
-        active_high: which edge of that output the camera takes for a pulse.
-        address: of the device in the chain.
-        firmware: version; triggers came with 7.06.
-        can_schedule: it knows `io set do N V schedule MS W`; can_chain: an action may enable another trigger.
-        identity: the name of the setting with the device's identity number: "device.id" or "deviceid".
-        low, high: travel limits in microsteps.
-        homed: it knows its reference; without it stands WR.
-        stall_at, switch_at: counts at which a move that would pass ends: stalled (FS), at a limit switch (WL, FE).
-        latency: s from a trigger's condition to its actions.
-        fires_when_enabled: a distance trigger fires where it is enabled, too.
-        lost: trigger pulses (from 0, since power-on) that never reach the line.
-        faults: reply (from 0, since power-on) -> what happens to it.
-        echo: the line sends the host its own bytes back.
+        line: what the build's digital output is wired to; it also learns the sample's true angle.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        line: TriggerLine,
-        *,
-        counts_per_turn: int = 384_000,
-        output: int = 1,
-        active_high: bool = True,
-        address: int = 1,
-        firmware: str = "7.38",
-        can_schedule: bool = True,
-        can_chain: bool = True,
-        identity: str = "device.id",
-        low: int = -2_000_000_000,
-        high: int = 2_000_000_000,
-        homed: bool = True,
-        stall_at: int | None = None,
-        switch_at: int | None = None,
-        latency: float = 0.0,
-        fires_when_enabled: bool = False,
-        lost: Set[int] = frozenset(),
-        faults: Mapping[int, Fault] | None = None,
-        echo: bool = False,
-    ) -> None:
+    def __init__(self, clock: Clock, line: TriggerLine, build: ZaberBuild) -> None:
         self.clock = clock
         self.replies = 0
-        self.device = ZaberDevice(
-            clock,
-            line,
-            counts_per_turn=counts_per_turn,
-            output=output,
-            active_high=active_high,
-            firmware=firmware,
-            can_schedule=can_schedule,
-            can_chain=can_chain,
-            identity=identity,
-            low=low,
-            high=high,
-            homed=homed,
-            stall_at=stall_at,
-            switch_at=switch_at,
-            latency=latency,
-            fires_when_enabled=fires_when_enabled,
-            lost=lost,
-        )
-        self._address, self._echo = address, echo
-        self._faults: Mapping[int, Fault] = {} if faults is None else faults
+        self.device = ZaberDevice(clock, line, build.device)
+        self._address, self._echo, self._faults = build.address, build.echo, build.faults
         self._reader = PacketReader()
         self._out = bytearray()
         self._lock = threading.RLock()
@@ -120,6 +104,10 @@ class ZaberController:
             out = bytes(self._out)
             self._out.clear()
             return out
+
+    def output_is_high(self, number: int) -> bool:
+        outputs = self.device.triggers.outputs
+        return 1 <= number <= len(outputs) and bool(outputs[number - 1])
 
     def alert(self) -> None:
         """Send an alert that nobody asked for."""

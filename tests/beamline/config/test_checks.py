@@ -64,7 +64,8 @@ def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
         load(path, level)
     with pytest.raises(ConfigError, match=r"pulse_width_s \(0\.001\)"):
         load(path, level, "devices.stage.pulse_width_s=0.001")
-    load(path, level, "devices.stage.pulse_width_s=0.05")
+    zaber = "{kind: zaber, port: COM3, counts_per_turn: 384000, max_speed_deg_s: 30, acceleration_deg_s2: 60}"
+    load(path, level, f"devices.stage={zaber}", "devices.stage.pulse_width_s=0.05")
 
 
 def test_what_a_controller_cannot_is_refused_at_once(tmp_path: Path) -> None:

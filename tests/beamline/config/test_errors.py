@@ -74,7 +74,8 @@ FAULTS = {
     ),
     "an output that the PM16C has not": (
         ("shutter: {kind: simulated}", "shutter: {kind: stage_output, output: 2}"),
-        "my.yaml:6: devices: the PM16C has no digital output for a shutter; set shutter.kind: manual",
+        "my.yaml:6: devices: a pm16c stage has no digital output for a shutter; set shutter.kind: manual, or use the "
+        "output of another controller (stage.kind pi_gcs or zaber)",
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),

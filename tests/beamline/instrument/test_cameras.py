@@ -12,6 +12,7 @@ import pytest
 from beamline.core.stop import ScanAborted
 from beamline.instrument import connect as devices
 from drivers.dcam.options import DcamOptions
+from drivers.stages.pm16c.settings import PM16CSettings
 from tests.beamline.ball_scan import shipped
 from tests.beamline.closable import Closable
 
@@ -33,7 +34,7 @@ def test_every_camera_option_reaches_the_driver(
             progress(-19.5, "busy")
 
     made: list[Camera] = []
-    monkeypatch.setattr(devices, "make_stage", lambda *args: Closable())
+    monkeypatch.setattr(PM16CSettings, "connect", lambda *args: Closable())
     monkeypatch.setattr("drivers.dcam.camera.DcamCamera", Camera)
     said = {
         "library": "/opt/libdcamapi.so",
@@ -76,7 +77,7 @@ def test_a_stop_ends_the_wait_for_a_cold_sensor(monkeypatch: pytest.MonkeyPatch)
             raise ScanAborted("Interrupted")
 
     camera = Camera()
-    monkeypatch.setattr(devices, "make_stage", lambda *args: stage)
+    monkeypatch.setattr(PM16CSettings, "connect", lambda *args: stage)
     monkeypatch.setattr(devices, "make_camera", lambda *args: camera)
     with pytest.raises(ScanAborted):
         devices.connect(shipped("instrument", "devices.camera.cool_s=900"), heed=heed)

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
-from beamline.instrument.stages import output_of
 from beamline.scan.preflight import dry_run
 from drivers.errors import DeviceRefused
 from tests.beamline.ball_scan import COMMON, STAGES, small
@@ -24,10 +22,10 @@ def test_a_shutter_never_sits_on_the_trigger_output(kind: str) -> None:
         devices.connect(settings) as instrument,
         pytest.raises(DeviceRefused, match=f"output {taken} gives the trigger"),
     ):
-        output_of(settings.devices.stage, instrument.devices.stage, taken)
+        instrument.devices.stage.digital_output(taken)
     pm16c = small()
-    with devices.connect(pm16c) as instrument, pytest.raises(ConfigError, match="has no digital output"):
-        output_of(pm16c.devices.stage, instrument.devices.stage, 1)
+    with devices.connect(pm16c) as instrument, pytest.raises(DeviceRefused, match="no digital output 1"):
+        instrument.devices.stage.digital_output(1)
 
 
 def test_a_stage_keeps_a_transcript_where_it_is_asked_to(tmp_path: Path) -> None:

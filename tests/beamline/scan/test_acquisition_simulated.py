@@ -17,13 +17,15 @@ from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, Devices, TriggerSource
-from drivers.stages.pm16c.stage import PM16CStage
+from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.settings import StageFigures
 from simulators.devices.camera import SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
 from simulators.scenes.scene import load_scene
-from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.pm16c.box import BoxBuild
+from simulators.wires.pm16c.wire import PM16CBuild
 from simulators.wires.serial_url import register
 
 N = 24
@@ -41,16 +43,9 @@ class FaultyInstrument:
     def __init__(self, pulses_lost: set[int], ignored: set[int], lost: set[int]) -> None:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
-        box = PM16CController(self.clock, self.line, counts_per_turn=36000, lost=pulses_lost)
-        self.stage = PM16CStage(
-            register(f"acquire-{uuid4().hex}", box),
-            counts_per_turn=36000,
-            clock=self.clock,
-            max_speed=math.radians(60),
-            acceleration=math.radians(60),
-            low=math.radians(-90),
-            high=math.radians(270),
-        )
+        box = PM16CBuild(BoxBuild(counts_per_turn=36000, lost=pulses_lost)).controller(self.clock, self.line)
+        figures = StageFigures(36000, math.radians(60), math.radians(60), math.radians(-90), math.radians(270))
+        self.stage = PM16CSettings(figures).connect(register(f"acquire-{uuid4().hex}", box), self.clock)
         self.shutter, self.sample = SimulatedShutter(), SimulatedSampleMover()
         self.camera = SimulatedOrcaQuest(
             load_scene(SCENE), self.line, self.clock, 0, self.shutter, self.sample, lost=lost, ignored=ignored

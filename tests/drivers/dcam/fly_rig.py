@@ -9,17 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Set
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 from uuid import uuid4
 
 from beamline.instrument.connect import Instrument
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
 from drivers.protocols import Devices
-from drivers.stages.pm16c.stage import PM16CStage
+from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.settings import StageFigures
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.pm16c.box import BoxBuild
+from simulators.wires.pm16c.wire import PM16CBuild
 from simulators.wires.serial_url import register
 from tests.drivers.dcam.fake import World
 
@@ -46,16 +48,10 @@ class FlyRig:
         self.world, self.clock = world, world.clock
         self.line = TriggerLine(self.clock)
         world.plug(self.line)
-        box = PM16CController(self.clock, self.line, counts_per_turn=COUNTS, lost=lost_pulses, stall_at=stall_at)
-        settings: dict[str, Any] = {
-            "max_speed": math.radians(30),
-            "acceleration": math.radians(60),
-            "low": math.radians(-5),
-            "high": math.radians(365),
-        }
-        self.stage = PM16CStage(
-            register(f"fly-{uuid4().hex}", box), counts_per_turn=COUNTS, clock=self.clock, **settings
-        )
+        build = PM16CBuild(BoxBuild(counts_per_turn=COUNTS, lost=lost_pulses, stall_at=stall_at))
+        box = build.controller(self.clock, self.line)
+        figures = StageFigures(COUNTS, math.radians(30), math.radians(60))
+        self.stage = PM16CSettings(figures).connect(register(f"fly-{uuid4().hex}", box), self.clock)
         self.camera: DcamCamera = world.connect(options)
 
     def connected(self) -> Instrument:

@@ -31,11 +31,12 @@ from beamline.storage.readers.open import open_scan
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.pi_gcs.wire import PiGcsController
-from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
+from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
 from simulators.wires.serial_url import register
-from simulators.wires.zaber.wire import ZaberController
+from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers.dcam.fake import World
+from tests.drivers.stages.flat_settings import flat
 
 COUNTS = 360_000
 SENSOR = (16, 16)
@@ -111,7 +112,7 @@ def _alert(controller: ZaberController) -> bytes:
 KINDS = {
     "pm16c": Kind(
         stage="kind: pm16c",
-        build=partial(PM16CController, counts_per_turn=COUNTS),
+        build=flat(PM16CBuild, counts_per_turn=COUNTS).controller,
         moving=lambda box: box.box.sample.moving(),
         levels=None,
         arming=rb"TMGI\?0",
@@ -123,7 +124,7 @@ KINDS = {
     ),
     "pi_gcs": Kind(
         stage='kind: pi_gcs, axis: "1", trigger_line: 1',
-        build=partial(PiGcsController, counts_per_turn=COUNTS),
+        build=flat(PiGcsBuild, counts_per_turn=COUNTS).controller,
         moving=lambda box: box.box.axis.moving(),
         levels=lambda box, output: box.box.levels.get(output, False),
         arming=rb"CTO\? 1 8",
@@ -135,7 +136,7 @@ KINDS = {
     ),
     "zaber": Kind(
         stage="kind: zaber, output: 1",
-        build=partial(ZaberController, counts_per_turn=COUNTS),
+        build=flat(ZaberBuild, counts_per_turn=COUNTS).controller,
         moving=lambda box: box.device.axis.moving(box.clock.now()),
         levels=lambda box, output: bool(box.device.triggers.outputs[output - 1]),
         arming=rb"/1 0 \d\d trigger 2 when",

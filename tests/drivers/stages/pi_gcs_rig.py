@@ -7,13 +7,15 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from drivers.clock import Clock
+from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.axis import Build
-from simulators.wires.pi_gcs.wire import PiGcsController
+from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
 from simulators.wires.serial_url import register
 from tests.drivers.stage_bench import StageBench
+from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"pi-gcs-test-{number}" for number in itertools.count())
 COUNTS = 90_000
@@ -27,13 +29,13 @@ USUAL: dict[str, Any] = {
     "low": math.radians(-5),
     "high": math.radians(100),
 }
-"""Of the driver's constructor."""
+"""Of the driver's settings."""
 
 
 def controller(clock: Any, line: TriggerLine, *, wire: dict[str, Any] | None = None, **build: Any) -> PiGcsController:
     """With the cable in output 2."""
-    specimen = Build(**({"counts_per_turn": COUNTS} | build))
-    return PiGcsController(clock, line, **({"output": 2, "build": specimen, "latency": LATENCY} | (wire or {})))
+    usual = {"output": 2, "latency": LATENCY, "counts_per_turn": COUNTS}
+    return flat(PiGcsBuild, **(usual | (wire or {}) | build)).controller(clock, line)
 
 
 class Rig:
@@ -62,8 +64,8 @@ class Rig:
         unasked, self.unasked = bytes(self.unasked), bytearray()
         return unasked + self.controller.transmit()
 
-    def open(self, **settings: Any) -> PiGcsStage:
-        return PiGcsStage(self.url, **(USUAL | {"clock": self.clock} | settings))
+    def open(self, clock: Clock | None = None, **settings: Any) -> PiGcsStage:
+        return PiGcsStage(self.url, flat(PiGcsSettings, **(USUAL | settings)), clock or self.clock)
 
     def bench(self, **settings: Any) -> StageBench:
         return StageBench(self.open(**settings), self.clock, self.line)

@@ -14,19 +14,20 @@ from typing import Any
 import pytest
 
 from drivers.clock import Clock, SystemClock
-from drivers.protocols import RotationStage
-from drivers.stages.pi_gcs.stage import PiGcsStage
-from drivers.stages.pm16c.stage import PM16CStage
-from drivers.stages.zaber.stage import ZaberStage
+from drivers.stages.pi_gcs.settings import PiGcsSettings
+from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.settings import StageSettings
+from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.clock import ScaledClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
 from simulators.wires.serial_url import register
 from simulators.wires.wire import Wire
-from simulators.wires.zaber.wire import ZaberController
+from simulators.wires.zaber.wire import ZaberBuild, ZaberController
+from tests.drivers import zaber_rig
 from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages import pi_gcs_rig
-from tests.drivers.zaber_rig import settings_of
+from tests.drivers.stages.flat_settings import flat
 from tests.simulators.wires.transports import serve_pty, serve_tcp
 
 FAST = math.radians(60)
@@ -55,8 +56,8 @@ class Kind:
     """A driver and its stand-in.
 
     Attributes:
-        stage: the driver.
-        usual: what its constructor needs beside url and clock.
+        settings: of the driver.
+        usual: values of them.
         wire: makes the stand-in.
         unreferenced: settings of the stand-in that has not found its reference yet, where there is such a state.
         homed: what it says of its reference at power-on otherwise.
@@ -66,7 +67,7 @@ class Kind:
         farewell: a part of what it sends last.
     """
 
-    stage: Callable[..., RotationStage]
+    settings: type[StageSettings]
     usual: Mapping[str, Any]
     wire: Callable[..., Any]
     garbage: tuple[bytes, ...]
@@ -85,16 +86,16 @@ PATIENCE = 0.25
 
 
 def _pm16c(clock: Clock, line: TriggerLine, **faults: Any) -> PM16CController:
-    return PM16CController(clock, line, counts_per_turn=36_000, home_at=50, **faults)
+    return flat(PM16CBuild, counts_per_turn=36_000, home_at=50, **faults).controller(clock, line)
 
 
 def _zaber(clock: Clock, line: TriggerLine, **faults: Any) -> ZaberController:
-    return ZaberController(clock, line, counts_per_turn=360_000, **faults)
+    return flat(ZaberBuild, counts_per_turn=360_000, **faults).controller(clock, line)
 
 
 KINDS = {
     "pm16c": Kind(
-        PM16CStage,
+        PM16CSettings,
         QUICK
         | {"counts_per_turn": 36_000, "low": math.radians(-5), "high": math.radians(100), "home": math.radians(0.5)},
         _pm16c,
@@ -106,7 +107,7 @@ KINDS = {
         home=50,
     ),
     "pi_gcs": Kind(
-        PiGcsStage,
+        PiGcsSettings,
         pi_gcs_rig.USUAL | QUICK,
         pi_gcs_rig.controller,
         garbage=(*GARBAGE, b"1=0.0", b"2=0.000000\n"),
@@ -116,8 +117,8 @@ KINDS = {
         unreferenced={"referenced": False, "found_at": 0.5},
     ),
     "zaber": Kind(
-        ZaberStage,
-        settings_of(**QUICK),
+        ZaberSettings,
+        zaber_rig.USUAL | QUICK,
         _zaber,
         garbage=(*GARBAGE, b"@01 1 ", b"@01 1 00 OK IDLE -- 7\r\n"),
         opening=("b'", "b'/1 0 00 get comm.checksum:"),
@@ -165,5 +166,6 @@ class Real:
         self.unplug = plugged.close
         url = plugged.enter_context(serve(self.wire))
         timeout = PATIENCE * SPEEDS[serve] if serve is not serve_sim else PATIENCE
-        self.stage = kind.stage(url, clock=clock, **(kind.usual | {"timeout": timeout} | (settings or {})))
+        chosen = flat(kind.settings, **(kind.usual | {"timeout": timeout} | (settings or {})))
+        self.stage = chosen.connect(url, clock)
         self.bench = StageBench(self.stage, clock, line)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from drivers.errors import DeviceRefused
 from drivers.protocols import StageLimits, TriggerTrain
-from drivers.stages.travel import Travel, check_figures, least_interval
+from drivers.stages.settings import StageFigures
+from drivers.stages.travel import Travel, least_interval
 
 LIMITS = StageLimits(360_000, math.radians(30), math.radians(60), 0.0, math.radians(100), True, 0, 2e-3)
 """30 000 counts/s at full speed, of which 60 take 2 ms."""
@@ -68,4 +69,4 @@ def test_no_pulse_no_way_between_them_and_a_place_beyond_the_limits_are_refused(
 @pytest.mark.parametrize("spacing", [-1e-6, math.nan, math.inf, 1e300])
 def test_a_spacing_that_no_pulses_can_have_is_refused(spacing: float) -> None:
     with pytest.raises(ValueError, match="apart"):
-        check_figures(360_000, 0.5, 1.0, 0.0, 1.0, spacing)
+        StageFigures(360_000, 0.5, 1.0, 0.0, 1.0).limits(1.0, spacing)

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from drivers.stages.zaber.train import PulseSettings
 from simulators.wires.serial_url import register
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.stage_bench import Build, StageBench
@@ -105,7 +104,7 @@ KINDS = {
     "pm16c, slow": replace(_PM16C, rig=_slow_pm16c),
     "pi_gcs": _PI_GCS,
     "pi_gcs, limit switch": replace(
-        _PI_GCS, rig=_pi_gcs_by_limit_switch, usual={"axis": "ROT_A", "trigger_line": 1, "reference": "FNL"}
+        _PI_GCS, rig=_pi_gcs_by_limit_switch, usual={"axis": "ROT_A", "trigger_line": 1, "reference": "negative_limit"}
     ),
     "zaber": _ZABER,
     "zaber, toggled": replace(
@@ -114,12 +113,10 @@ KINDS = {
     "zaber, fires when enabled": replace(
         _ZABER,
         rig=_zaber(fires_when_enabled=True),
-        usual={"pulses": PulseSettings(fires_when_enabled=True)},
+        usual={"fires_when_enabled": True},
         no_width=0.0,
     ),
-    "zaber, encoder": replace(
-        _ZABER, rig=_zaber(identity="deviceid"), usual={"pulses": PulseSettings(measured=True)}, no_width=0.0
-    ),
+    "zaber, encoder": replace(_ZABER, rig=_zaber(identity="deviceid"), usual={"measured": True}, no_width=0.0),
 }
 FEWER = 200
 MAKERS = ("pm16c", "pi_gcs", "zaber")

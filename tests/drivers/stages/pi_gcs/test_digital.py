@@ -7,26 +7,21 @@ import math
 import pytest
 
 from drivers.errors import DeviceRefused
+from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
+from drivers.stages.settings import StageFigures
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.wire import PiGcsController
+from simulators.wires.pi_gcs.wire import PiGcsBuild
 from simulators.wires.serial_url import register
+from tests.drivers.stages.flat_settings import flat
 
 
 def test_an_output_is_set_and_not_read_back() -> None:
     clock = VirtualClock()
-    wire = PiGcsController(clock, TriggerLine(clock), output=2, counts_per_turn=360_000)
-    stage = PiGcsStage(
-        register("pi-digital", wire),
-        trigger_line=2,
-        counts_per_turn=360_000,
-        clock=clock,
-        max_speed=1.0,
-        acceleration=2.0,
-        low=-math.pi,
-        high=math.pi,
-    )
+    wire = flat(PiGcsBuild, output=2, counts_per_turn=360_000).controller(clock, TriggerLine(clock))
+    settings = PiGcsSettings(StageFigures(360_000, 1.0, 2.0, -math.pi, math.pi), trigger_line=2)
+    stage = PiGcsStage(register("pi-digital", wire), settings, clock)
     output = stage.digital_output(3)
     assert output.name == "stage output 3"
     output.set(True)

@@ -37,7 +37,7 @@ def test_the_room_before_the_first_pulse_is_in_the_limits_and_asked_for() -> Non
     bench = Rig().bench()
     assert bench.stage.limits.run_up == 0
     bench.stage.close()
-    with pytest.raises(DeviceRefused, match="sometimes"):
+    with pytest.raises(ValueError, match="sometimes"):
         Rig().open(first_pulse="sometimes")
 
 

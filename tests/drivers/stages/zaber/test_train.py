@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,8 +12,11 @@ from hypothesis import strategies as st
 
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import TriggerTrain
-from drivers.stages.zaber.train import PulseSettings, pulses_of, remaining, set_up
+from drivers.stages.settings import StageFigures, Wiring
+from drivers.stages.zaber.settings import ZaberSettings
+from drivers.stages.zaber.train import PulseSettings, TriggerUse, remaining, set_up
 from tests.drivers.stage_bench import LONG, SPEED, StageBench
+from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_rig import Rig
 
 
@@ -44,7 +48,7 @@ def test_the_starter_stands_one_step_before_and_enables_the_repeater() -> None:
 
 
 def test_within_the_last_step_the_starter_gives_the_first_pulse() -> None:
-    settings = PulseSettings(width=None, measured=True, starter=4, repeater=6)
+    settings = PulseSettings(width=None, triggers=TriggerUse(measured=True, starter=4, repeater=6))
     setup = set_up(settings, TriggerTrain(-500, -200, 3), axis=2, counts=-450)
     assert setup.commands[3:] == (
         "trigger 6 when 2 encoder dist 100",
@@ -66,7 +70,7 @@ def test_within_the_last_step_the_starter_gives_the_first_pulse() -> None:
         (PulseSettings(width=None), "d 10", 5),
         (PulseSettings(width=None), "d 9", 4),
         (PulseSettings(width=None), "d 1", 0),
-        (PulseSettings(chained=False), "d 4", 4),
+        (PulseSettings(triggers=TriggerUse(chained=False)), "d 4", 4),
     ],
 )
 def test_pulses_to_come_from_what_the_controller_shows(settings: PulseSettings, shown: str, left: int) -> None:
@@ -91,7 +95,7 @@ def test_a_controller_with_fewer_triggers_is_noticed() -> None:
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
-        PulseSettings(**wrong)
+        flat(PulseSettings, **wrong)
 
 
 @pytest.mark.parametrize(
@@ -107,14 +111,15 @@ def test_trains_that_would_run_together_are_refused(made: dict[str, Any], neares
 
 
 def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
-    rest = PulseSettings(chained=False, shortest=2e-3, width=5e-3)
-    made = pulses_of(rest, output=3, width=None, active_high=False, toggle=False)
-    assert made == PulseSettings(3, 1e-3, False, chained=False, shortest=2e-3)
-    assert pulses_of(rest, output=1, width=4e-3, active_high=True, toggle=False).spacing == 8e-3
-    toggled = pulses_of(rest, output=1, width=None, active_high=True, toggle=True)
+    triggers = TriggerUse(chained=False, shortest=2e-3)
+    usual = ZaberSettings(StageFigures(360_000, 1.0, 1.0), triggers=triggers)
+    falling = replace(usual, output=3, wiring=Wiring(active_high=False))
+    assert falling.pulses == PulseSettings(3, 1e-3, False, triggers)
+    assert replace(usual, wiring=Wiring(pulse_width=4e-3)).pulses.spacing == 8e-3
+    toggled = replace(usual, toggle=True).pulses
     assert (toggled.width, toggled.spacing) == (None, 4e-3)
     with pytest.raises(ValueError, match="a toggled output has no pulse width"):
-        pulses_of(rest, output=1, width=4e-3, active_high=True, toggle=True)
+        replace(usual, toggle=True, wiring=Wiring(pulse_width=4e-3))
 
 
 # what comes of it
@@ -201,7 +206,7 @@ def test_firmware_whose_actions_enable_no_triggers_says_so_and_is_served_unchain
     with pytest.raises(DeviceRefused, match="chained"):
         bench.stage.arm(train)
     bench.stage.close()
-    bench = rig.bench(pulses=PulseSettings(chained=False))
+    bench = rig.bench(chained=False)
     bench.stage.arm(train)
     assert math.degrees(bench.stage.position()) == pytest.approx(9.0)
     assert bench.stage.remaining_pulses() == 5
@@ -211,7 +216,7 @@ def test_firmware_whose_actions_enable_no_triggers_says_so_and_is_served_unchain
 
 @pytest.mark.parametrize(("back", "pulses"), [(8.5, 0), (9.0, 5)])
 def test_an_unchained_train_ends_when_it_is_turned_away_from(back: float, pulses: int) -> None:
-    bench = Rig(can_chain=False).bench(pulses=PulseSettings(chained=False))
+    bench = Rig(can_chain=False).bench(chained=False)
     bench.stage.arm(bench.train(10.0, 1.0, 5))
     bench.go(back)
     bench.go(20.0)
@@ -219,7 +224,7 @@ def test_an_unchained_train_ends_when_it_is_turned_away_from(back: float, pulses
 
 
 def test_an_unchained_train_without_room_before_it_is_refused() -> None:
-    bench = Rig(can_chain=False).bench(pulses=PulseSettings(chained=False))
+    bench = Rig(can_chain=False).bench(chained=False)
     bench.go(-5.0)
     with pytest.raises(DeviceRefused, match="room for one step"):
         bench.stage.arm(bench.train(-4.5, 1.0, 5))

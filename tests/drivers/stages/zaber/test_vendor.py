@@ -12,7 +12,8 @@ import pytest
 
 from drivers.clock import SystemClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.wire import ZaberController
+from simulators.wires.zaber.wire import ZaberBuild, ZaberController
+from tests.drivers.stages.flat_settings import flat
 from tests.simulators.wires.transports import serve_tcp
 
 pytest.importorskip("zaber_motion", reason="the vendor's library is not installed: pip install '.[oracle]'")
@@ -40,7 +41,7 @@ class Vendor:
 def serve(**settings: Any) -> Iterator[Vendor]:
     clock = SystemClock()
     line = TriggerLine(clock)
-    controller = ZaberController(clock, line, counts_per_turn=360_000, **settings)
+    controller = flat(ZaberBuild, counts_per_turn=360_000, **settings).controller(clock, line)
     with serve_tcp(controller) as url:
         host, port = url.removeprefix("socket://").split(":")
         with Connection.open_tcp(host, int(port)) as connection:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.zaber.packets import Command, Malformed, PacketReader, frame, lrc
-from simulators.wires.zaber.wire import Fault, ZaberController
+from simulators.wires.zaber.wire import Fault, ZaberBuild
+from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_vectors import VECTORS
 from tests.simulators.zaber_host import SPEED, TURN, Wire
 
@@ -306,7 +307,7 @@ def test_a_reply_that_says_idle_never_shows_a_place_on_the_way() -> None:
     """However the end of the move falls between the looks at the clock that a reply takes."""
     for late in range(40):
         clock = Passing(start=0.0)
-        box = ZaberController(clock, TriggerLine(clock), counts_per_turn=TURN)
+        box = flat(ZaberBuild, counts_per_turn=TURN).controller(clock, TriggerLine(clock))
         box.receive(b"/1 1 move abs 1000\n")
         clock.sleep(late * 0.25e-3)
         reply = "BUSY"

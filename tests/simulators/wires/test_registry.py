@@ -1,18 +1,20 @@
-"""Kinds of simulated devices: by name, with options as text, and what cannot be meant is refused by name."""
+"""The simulated controllers that there are: by name, with options as text; what cannot be meant is refused."""
 
 from __future__ import annotations
 
-import importlib
-import sys
-from types import SimpleNamespace
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
 
 import pytest
 import serial
 
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
+from drivers.stages.registry import STAGES
 from simulators.devices.clock import VirtualClock
-from simulators.wires.kinds import KINDS, stand_alone
+from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CController
+from simulators.wires.registry import WIRES, stand_alone
 from simulators.wires.serial_url import SCHEME
 from simulators.wires.wire import Wire
 
@@ -22,12 +24,8 @@ def ask(wire: Wire, request: bytes) -> bytes:
     return wire.transmit()
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS))
-def test_every_kind_can_be_made_and_has_its_clock(kind: str) -> None:
-    try:
-        importlib.import_module(KINDS[kind].partition(":")[0])
-    except ModuleNotFoundError:
-        pytest.skip(f"{kind} is not in this checkout")
+@pytest.mark.parametrize("kind", sorted(WIRES))
+def test_every_kind_can_be_built_and_has_its_clock(kind: str) -> None:
     clock = VirtualClock()
     wire = stand_alone(kind, clock)
     assert wire.clock is clock
@@ -47,36 +45,50 @@ def test_options_reach_the_device() -> None:
     assert ask(wire, b"ERRF?") == b"01\r\n"
 
 
-class Everything:
-    """A device with an option of every type."""
+class Colour(StrEnum):
+    RED = "red"
+    GREEN = "green"
 
-    def __init__(
-        self,
-        clock: object,
-        line: object,
-        *,
-        a: int = 0,
-        b: float = 0.0,
-        c: str = "",
-        d: bool = False,
-        e: float | None = None,
-        f: frozenset[int] = frozenset(),
-    ) -> None:
-        if a < 0:
+
+@dataclass(frozen=True)
+class Nested:
+    e: float | None = None
+    f: frozenset[int] = frozenset()
+    g: Colour = Colour.RED
+
+
+@dataclass(frozen=True)
+class Everything:
+    """A build with an option of every type."""
+
+    a: int = 0
+    b: float = 0.0
+    c: str = ""
+    d: bool = False
+    nested: Nested = Nested()
+
+    def __post_init__(self) -> None:
+        if self.a < 0:
             raise ValueError("a is negative")
-        self.options = (a, b, c, d, e, f)
+
+    @classmethod
+    def matching(cls, settings: object) -> Everything:
+        return cls()
+
+    def controller(self, clock: Clock, line: TriggerLine) -> Any:
+        return self
 
 
 @pytest.fixture
 def everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "everything_of_a_test", SimpleNamespace(Everything=Everything))
-    monkeypatch.setitem(KINDS, "everything", "everything_of_a_test:Everything")
+    monkeypatch.setitem(WIRES, "everything", Everything)
 
 
 def test_options_are_read_by_their_type(everything: None) -> None:
-    made = stand_alone("everything?a=-0&b=1e-3&c=x%20y&d=Yes&e=2", VirtualClock())
-    assert made.options == (0, 1e-3, "x y", True, 2.0, frozenset())  # type: ignore[attr-defined]
-    assert stand_alone("everything?d=0&e=None&c=", VirtualClock()).options[2:5] == ("", False, None)  # type: ignore[attr-defined]
+    every: Any = stand_alone("everything?a=-0&b=1e-3&c=x%20y&d=Yes&e=2&g=green", VirtualClock())
+    assert every == Everything(0, 1e-3, "x y", True, Nested(2.0, g=Colour.GREEN))
+    other: Any = stand_alone("everything?d=0&e=None&c=", VirtualClock())
+    assert other == Everything()
 
 
 @pytest.mark.parametrize(
@@ -84,20 +96,21 @@ def test_options_are_read_by_their_type(everything: None) -> None:
     [
         ("nothing", "no simulated device 'nothing'; there are .*pm16c"),
         ("", "no simulated device"),
-        ("everything?z=1", "no option 'z'; it has a, b, c, d, e$"),
+        ("everything?z=1", "no option 'z'; it has a, b, c, d, e, g$"),
         ("everything?f=1", "no option 'f'"),
         ("everything?clock=1", "no option 'clock'"),
         ("everything?a=1.5", "a=1.5 of everything cannot be read"),
         ("everything?a=none", "cannot be read"),
         ("everything?d=maybe", "true or false"),
+        ("everything?g=blue", "g=blue of everything cannot be read"),
         ("everything?a=1&a=2", "twice"),
         ("everything?a", "bad query field"),
-        ("everything?a=-1", "cannot be made.*a is negative"),
-        ("pm16c?channel=16", "cannot be made|no channel"),
-        ("pm16c?counts_per_turn=0", "cannot be made"),
-        ("pi_gcs?counts_per_turn=0", "cannot be made"),
-        ("zaber?counts_per_turn=0", "cannot be made"),
-        ("zaber?firmware=new", "cannot be made"),
+        ("everything?a=-1", "cannot be built.*a is negative"),
+        ("pm16c?channel=16", "cannot be built|no channel"),
+        ("pm16c?counts_per_turn=0", "cannot be built"),
+        ("pi_gcs?counts_per_turn=0", "cannot be built"),
+        ("zaber?counts_per_turn=0", "cannot be built"),
+        ("zaber?firmware=new", "cannot be built"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_and_named(everything: None, name: str, problem: str) -> None:
@@ -139,3 +152,10 @@ def test_a_port_that_cannot_be_says_why(name: str) -> None:
 
 def test_a_device_by_itself_runs_on_the_systems_clock() -> None:
     assert isinstance(stand_alone("pm16c", SystemClock()).clock, SystemClock)
+
+
+# beside the drivers
+
+
+def test_every_stage_has_its_simulated_controller() -> None:
+    assert WIRES.keys() == STAGES.keys()

@@ -1,0 +1,86 @@
+"""Settings of a PI GCS 2.0 stage, and what the controller makes of them: it takes them as they are, in degrees."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from drivers.clock import Clock
+from drivers.protocols import RotationStage, StageLimits
+from drivers.stages.pi_gcs.train import FirstPulse
+from drivers.stages.settings import StageFigures, Wiring, key
+
+SLOWEST = 1e-6
+"""degrees/s that can still be written."""
+AXIS_NAME = r"^\w{1,16}$"
+
+
+class Reference(StrEnum):
+    """What the search for the reference goes to."""
+
+    SWITCH = "switch"
+    NEGATIVE_LIMIT = "negative_limit"
+    POSITIVE_LIMIT = "positive_limit"
+
+    @property
+    def command(self) -> str:
+        return {"switch": "FRF", "negative_limit": "FNL", "positive_limit": "FPL"}[self]
+
+
+@dataclass(frozen=True)
+class PiGcsSettings:
+    """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863.
+
+    Attributes:
+        axis: identifier as SAI? lists it.
+        trigger_line: digital output of the pulses, from 1.
+        first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
+        firmware_pulse: s that the firmware holds a pulse, from memory; trains must leave as long between two.
+        tolerance: counts from the target within which a move has arrived (a servo holds to a few counts, never one).
+        settle: s after a move in which the controller may still bring the axis on target.
+
+    Raises:
+        ValueError: a speed or acceleration that cannot be written, or a pulse width, which the firmware fixes.
+    """
+
+    figures: StageFigures
+    wiring: Wiring = field(default=Wiring())
+    axis: str = key("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
+    trigger_line: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
+    reference: Reference = key(Reference.SWITCH, "What the search for the reference goes to.")
+    first_pulse: FirstPulse = key(
+        FirstPulse.AT_THRESHOLD,
+        "Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md).",
+    )
+    firmware_pulse: float = key(50e-6, "How long the firmware holds a pulse.", unit="s", gt=0)
+    tolerance: int = key(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    settle: float = key(
+        1.0, "After a move, in which the controller may still bring the axis on target.", unit="s", ge=0
+    )
+
+    def __post_init__(self) -> None:
+        if self.wiring.pulse_width is not None:
+            raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
+        if not re.fullmatch(AXIS_NAME, self.axis):
+            raise ValueError(f"an axis cannot be called {self.axis!r}; its name has 1 to 16 letters, digits and _")
+        self.limits()
+
+    @property
+    def pulse_output(self) -> int:
+        return self.trigger_line
+
+    def limits(self) -> StageLimits:
+        """As `StageSettings` has it. Where the first pulse comes a step after the threshold, the stage must stand more
+        than a step before it. Pulses leave as long between them as the firmware holds them."""
+        figures = self.figures
+        if min(math.degrees(figures.max_speed), math.degrees(figures.acceleration)) < SLOWEST:
+            raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
+        run_up = 1 if self.first_pulse is FirstPulse.STEP_AFTER else 0
+        return figures.limits(figures.acceleration, 2 * self.firmware_pulse, run_up=run_up)
+
+    def connect(self, url: str, clock: Clock) -> RotationStage:
+        from drivers.stages.pi_gcs.stage import PiGcsStage
+
+        return PiGcsStage(url, self, clock)

@@ -1,0 +1,116 @@
+"""Settings of a PM16C stage, and what the controller makes of them: whole pulses/s, and the accelerations it has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from drivers.clock import Clock
+from drivers.protocols import RotationStage, StageLimits
+from drivers.stages.pm16c.train import FirstPulse, PulseWidths
+from drivers.stages.settings import StageFigures, Wiring, key
+
+MAX_SPEED = 5_000_000
+"""pulses/s."""
+MAX_COUNT = 2_147_483_647
+"""Of positions, trigger points and limits, either way."""
+E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
+_TRIED = (m / 10 * 10.0**e for m in E24 for e in range(-2, 4))
+RATES = sorted((ms for ms in _TRIED if 0.0155 < ms < 1005), reverse=True)
+"""RTE code -> ms per 1000 pulses/s: the preferred numbers of IEC 60063 from 1000 down to 0.016, codes 0 to 115."""
+
+
+def steepest_code(acceleration: float) -> int:
+    """The code of the steepest acceleration that is not above `acceleration` (pulses/s²).
+
+    Raises:
+        ValueError: even the gentlest is above it.
+    """
+    codes = [code for code, ms in enumerate(RATES) if 1e6 / ms <= acceleration * (1 + 1e-9)]
+    if not codes:
+        raise ValueError(f"{acceleration:g} pulses/s² is gentler than the controller's gentlest, {1e6 / RATES[0]:g}")
+    return codes[-1]
+
+
+@dataclass(frozen=True)
+class PM16CSettings:
+    """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated.
+
+    Attributes:
+        channel: motor channel.
+        first_pulse: where the firmware puts the first pulse; that it is the start point is from memory.
+        home: angle of the home switch in rad; None where the stage has none: then a search is refused.
+        home_speed: rad/s for the search; None is a tenth of the full speed.
+
+    Raises:
+        ValueError: a speed, a place, a width, a polarity or a channel that the controller does not have, or an
+            acceleration below its gentlest.
+    """
+
+    pulse_output: ClassVar[None] = None
+    """Pulses come from TP0; there is no output that can be set."""
+    figures: StageFigures
+    wiring: Wiring = field(default=Wiring(baudrate=9600))
+    channel: int = key(0, ge=0, le=15)
+    first_pulse: FirstPulse = key(
+        FirstPulse.AT_START,
+        "Where the firmware puts a train's first pulse: at its start point (from memory), or an interval behind it.",
+    )
+    home: float | None = key(None, "Where its home switch is; null: it has none, and no search is made.", unit="deg")
+    home_speed: float | None = key(None, "For the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.channel <= 15:
+            raise ValueError(f"there is no channel {self.channel}; there are 0 to 15")
+        if not self.wiring.active_high:
+            raise ValueError("active_high cannot be false: the PM16C's trigger output has one polarity")
+        if self.home is not None and not abs(self.home) * self.figures.per_radian <= MAX_COUNT:
+            raise ValueError(f"the home switch cannot be at {math.degrees(self.home):g} deg")
+        self.limits()
+        if not 1 <= self.search_rate <= self.fastest:
+            raise ValueError(f"the search for home cannot run at {self.search_rate} pulses/s")
+
+    @property
+    def widths(self) -> PulseWidths:
+        """The pulse widths that a train may take."""
+        return PulseWidths(self.wiring.pulse_width)
+
+    @property
+    def fastest(self) -> int:
+        """pulses/s."""
+        return round(self.figures.max_speed * self.figures.counts_per_turn / (2 * math.pi))
+
+    @property
+    def search_rate(self) -> int:
+        """pulses/s of the search for the home switch."""
+        most, speed = 2 * self.figures.max_speed, self.home_speed
+        speed = self.figures.max_speed / 10 if speed is None else speed
+        return round(speed * self.figures.counts_per_turn / (2 * math.pi)) if 0 < speed < most else 0
+
+    @property
+    def rate_code(self) -> int:
+        """RTE code of the acceleration."""
+        return steepest_code(self.figures.acceleration / (2 * math.pi / self.figures.counts_per_turn))
+
+    def limits(self) -> StageLimits:
+        """As `StageSettings` has it: the acceleration is the steepest one that the controller has and that is not
+        above the configured one. Where the first pulse comes an interval after the start point, the stage must stand
+        more than that before it. Pulses leave their width between them."""
+        figures = self.figures
+        radians = 2 * math.pi / figures.counts_per_turn
+        if max(abs(figures.low), abs(figures.high)) > MAX_COUNT * radians:
+            most = math.degrees(MAX_COUNT * radians)
+            raise ValueError(f"the controller counts to {MAX_COUNT}, which is {most:g} deg")
+        fastest = round(figures.max_speed / radians)
+        if not 1 <= fastest <= MAX_SPEED:
+            speed = math.degrees(figures.max_speed)
+            raise ValueError(f"{speed:g} deg/s are {fastest} pulses/s, the controller gives 1 to {MAX_SPEED}")
+        acceleration = 1e6 / RATES[self.rate_code] * radians
+        run_up = 1 if self.first_pulse is FirstPulse.INTERVAL_AFTER else 0
+        return figures.limits(acceleration, self.widths.spacing, run_up=run_up)
+
+    def connect(self, url: str, clock: Clock) -> RotationStage:
+        from drivers.stages.pm16c.stage import PM16CStage
+
+        return PM16CStage(url, self, clock)

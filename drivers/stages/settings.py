@@ -1,0 +1,160 @@
+"""Settings of a stage: the values that every driver takes, and how each of them is written in a configuration.
+
+A driver's settings are a frozen dataclass in radians and seconds. `key` says with each field how a configuration file
+writes it: its unit, which ends the key's name, its legal values and its meaning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from drivers.clock import Clock
+from drivers.protocols import RotationStage, StageLimits
+
+FARTHEST = 1e9
+"""rad."""
+MOST = 2.0**53
+"""counts that a float still tells apart."""
+ANGULAR = {"deg", "deg_s", "deg_s2"}
+"""Units of keys whose fields are in radians."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """How a configuration writes a field.
+
+    Attributes:
+        unit: what ends the key's name; "" for none.
+        default: in that unit; MISSING where the key has to be there.
+        doc: what it means, where its name does not say.
+        bounds: legal values, by pydantic's names: gt, ge, le, pattern.
+    """
+
+    unit: str
+    default: Any
+    doc: str
+    bounds: Mapping[str, Any]
+
+    def name_of(self, field: str) -> str:
+        return f"{field}_{self.unit}" if self.unit else field
+
+
+def key(default: Any = MISSING, doc: str = "", *, unit: str = "", **bounds: Any) -> Any:
+    """A dataclass field that a configuration writes; `default` in the key's unit."""
+    inside = math.radians(default) if unit in ANGULAR and isinstance(default, float) else default
+    return field(default=inside, metadata={"key": Key(unit, default, doc, bounds)})
+
+
+@dataclass(frozen=True)
+class StageFigures:
+    """What a stage is limited to: counts for 2π, rad/s, rad/s², soft limits in rad.
+
+    Raises:
+        ValueError: figures that no stage can have.
+    """
+
+    counts_per_turn: int = key(doc="Motor pulses or encoder counts for 360 deg; triggers fall on whole ones.", gt=0)
+    max_speed: float = key(unit="deg_s", gt=0)
+    acceleration: float = key(unit="deg_s2", gt=0)
+    low: float = key(-5.0, unit="deg")
+    high: float = key(365.0, "The stage is never sent beyond low_deg and high_deg.", unit="deg")
+
+    def __post_init__(self) -> None:
+        if self.counts_per_turn < 1:
+            raise ValueError(f"a turn cannot have {self.counts_per_turn} counts")
+        for meaning, rate in (("speed", self.max_speed), ("acceleration", self.acceleration)):
+            if not 0 < rate * self.per_radian < MOST:
+                raise ValueError(f"{rate:g} rad is no {meaning} that a stage can have")
+        if not -FARTHEST <= self.low < self.high <= FARTHEST:
+            low, high = math.degrees(self.low), math.degrees(self.high)
+            raise ValueError(f"from {low:g} to {high:g} deg there is no room to move")
+        if not (self.high - self.low) * self.per_radian < MOST:
+            raise ValueError(f"{(self.high - self.low) * self.per_radian:g} counts are more than can be told apart")
+
+    @property
+    def per_radian(self) -> float:
+        """counts."""
+        return self.counts_per_turn / (2 * math.pi)
+
+    def limits(
+        self, acceleration: float, pulse_spacing: float, *, run_up: int = 0, interval_unit: int = 1
+    ) -> StageLimits:
+        """The limits of a stage with these figures that emits trigger pulses; the rest as in `StageLimits`.
+
+        Raises:
+            ValueError: no pulses can be so far apart.
+        """
+        if not 0 <= pulse_spacing * self.max_speed * self.per_radian < MOST:
+            raise ValueError(f"pulses cannot be {pulse_spacing:g} s apart")
+        return StageLimits(
+            self.counts_per_turn,
+            self.max_speed,
+            acceleration,
+            self.low,
+            self.high,
+            True,
+            run_up,
+            pulse_spacing,
+            interval_unit,
+        )
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """How a stage's controller is connected; s.
+
+    Attributes:
+        baudrate: as set on the controller; nominal over USB and TCP.
+        pulse_width: s; None leaves it to the driver.
+        active_high: polarity of the pulses.
+        transcript: file to which every byte on the wire is appended; None keeps none.
+
+    Raises:
+        ValueError: no reply can come in that timeout.
+    """
+
+    timeout: float = key(1.0, "For a reply.", unit="s", gt=0)
+    baudrate: int = key(115_200, gt=0)
+    pulse_width: float | None = key(
+        None, "Of the trigger pulses; null: the driver's choice, or what the controller has.", unit="s", gt=0
+    )
+    active_high: bool = key(True, "Trigger pulses are high; refused where the controller has no such choice.")
+    transcript: Path | None = key(
+        None, "A file to which every byte to and from the controller is appended with its time; null: none."
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 < self.timeout < math.inf:
+            raise ValueError(f"a timeout of {self.timeout:g} s is not possible; expected a positive number of seconds")
+
+
+class StageSettings(Protocol):
+    """What a driver is opened with; each stage's folder has one, and `drivers.stages.registry` lists them."""
+
+    @property
+    def figures(self) -> StageFigures: ...
+
+    @property
+    def wiring(self) -> Wiring: ...
+
+    @property
+    def pulse_output(self) -> int | None:
+        """Number of the digital output that the trigger pulses come from; None where no output can be set."""
+        ...
+
+    def limits(self) -> StageLimits:
+        """What the driver will say of the stage, as far as that is known before it is connected."""
+        ...
+
+    def connect(self, url: str, clock: Clock) -> RotationStage:
+        """The driver, connected at what pyserial opens. Nothing moves.
+
+        Raises:
+            DeviceRefused: the settings do not fit the controller, or it is moving.
+            DeviceError, DeviceTimeout: no contact.
+        """
+        ...
