@@ -141,11 +141,11 @@ class DigitalOutput(Protocol):
     name: str
 
     def set(self, high: bool) -> None:
-        """Put the line to high or low. Raises DeviceError where the controller does not take it."""
+        """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
         ...
 
     def get(self) -> bool | None:
-        """The line is high, as the controller says; None where it does not tell."""
+        """Whether the line is high; None if the controller cannot read it back."""
         ...
 
 

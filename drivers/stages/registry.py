@@ -1,17 +1,21 @@
-"""The stages that there are: each kind's settings, which are what its driver is opened with."""
+"""The registry of stages: each kind's settings, with which its driver is opened.
+
+Adding a stage takes its folder `drivers/stages/<kind>` with a module `settings`, and its line in REGISTRY.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 
-from drivers.stages.pi_gcs.settings import PiGcsSettings
-from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.settings import StageSettings
-from drivers.stages.zaber.settings import ZaberSettings
 
-STAGES: Mapping[str, type[StageSettings]] = {
-    "pm16c": PM16CSettings,
-    "pi_gcs": PiGcsSettings,
-    "zaber": ZaberSettings,
+REGISTRY = {  # kind, as a configuration names it: class in the kind's module `settings`
+    "pm16c": "PM16CSettings",
+    "pi_gcs": "PiGcsSettings",
+    "zaber": "ZaberSettings",
 }
-"""Kind, as a configuration names it -> the settings."""
+STAGES: Mapping[str, type[StageSettings]] = {
+    kind: getattr(import_module(f"drivers.stages.{kind}.settings"), name) for kind, name in REGISTRY.items()
+}
+"""Kind -> the settings."""

@@ -1,4 +1,4 @@
-"""The simulated controllers that there are, and one of them by text: "pm16c?channel=3&counts_per_turn=360000".
+"""The registry of simulated controllers, and one of them by text: "pm16c?channel=3&counts_per_turn=360000".
 
 An option is any field of the controller's build, or of a value in it, that is a number, a text, a choice, or true or
 false.
@@ -8,23 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import StrEnum
+from importlib import import_module
 from typing import Any
 from urllib.parse import parse_qsl
 
 from drivers.clock import Clock
 from drivers.flat import FlatField, flat_fields, from_flat
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.wire import PiGcsBuild
-from simulators.wires.pm16c.wire import PM16CBuild
 from simulators.wires.wire import Build, Controller
-from simulators.wires.zaber.wire import ZaberBuild
 
-WIRES: dict[str, type[Build]] = {
-    "pm16c": PM16CBuild,
-    "pi_gcs": PiGcsBuild,
-    "zaber": ZaberBuild,
+REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's module `wire`
+    "pm16c": "PM16CBuild",
+    "pi_gcs": "PiGcsBuild",
+    "zaber": "ZaberBuild",
 }
-"""Kind, as `drivers.stages.registry` has it -> how its simulated controller is built."""
+WIRES: dict[str, type[Build]] = {
+    kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()
+}
+"""Kind -> how its simulated controller is built."""
 
 
 def stand_alone(name: str, clock: Clock) -> Controller:
