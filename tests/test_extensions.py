@@ -260,7 +260,113 @@ assert describe("scan.npy")["format"] == "npy_stack"
 """,
 )
 
-EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER}
+STAGE = Extension(
+    {
+        "drivers/stages/turn/__init__.py": '"""A dummy controller, which answers with its counts."""\n',
+        "drivers/stages/turn/settings.py": '''
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import serial
+
+from drivers.stages.settings import StageFigures, Wiring, key
+
+
+class TurnStage:
+    name = "stage"
+
+    def __init__(self, url, settings):
+        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
+        self._gear = settings.gear
+
+    def position(self):
+        self._line.write(b"?")
+        return int(self._line.read(4)) / self._gear
+
+    def close(self):
+        self._line.close()
+
+
+@dataclass(frozen=True)
+class TurnSettings:
+    """A dummy."""
+
+    pulse_output: ClassVar[None] = None
+    figures: StageFigures
+    wiring: Wiring = field(default=Wiring())
+    gear: int = key(2, "Counts a step.", ge=1)
+
+    def limits(self):
+        return self.figures.limits(self.figures.acceleration, 0.0)
+
+    def connect(self, url, clock):
+        return TurnStage(url, self)
+''',
+        "simulators/wires/turn/__init__.py": '"""The dummy controller."""\n',
+        "simulators/wires/turn/wire.py": """
+from dataclasses import dataclass
+
+
+class TurnController:
+    def __init__(self, clock, counts):
+        self.clock, self._counts, self._reply = clock, counts, b""
+
+    def receive(self, data):
+        self._reply += b"%04d" % self._counts * len(data)
+
+    def transmit(self):
+        reply, self._reply = self._reply, b""
+        return reply
+
+    def output_is_high(self, number):
+        return False
+
+
+@dataclass(frozen=True)
+class TurnBuild:
+    counts: int = 12
+
+    @classmethod
+    def matching(cls, settings):
+        return cls(counts=6 * settings.gear)
+
+    def controller(self, clock, line):
+        return TurnController(clock, self.counts)
+""",
+    },
+    (
+        ("drivers/stages/registry.py", '    "zaber": "ZaberSettings",', '    "turn": "TurnSettings",'),
+        ("simulators/wires/registry.py", '    "zaber": "ZaberBuild",', '    "turn": "TurnBuild",'),
+    ),
+    """
+import math
+from beamline.config.load import config_folder, load
+from beamline.core.errors import ConfigError
+from beamline.instrument.connect import connect
+from beamline.scan.preflight import dry_run
+from drivers.clock import SystemClock
+from simulators.wires.registry import stand_alone
+
+turn = "kind: turn, port: 'sim://turn', counts_per_turn: 3600, max_speed_deg_s: 90, acceleration_deg_s2: 180"
+path = config_folder() / "simulated.yaml"
+config = load(path, ["devices.stage={%s, gear: 3}" % turn], {})
+assert dry_run(config).lines()
+with connect(config) as instrument:
+    stage = instrument.devices.stage
+    assert stage.position() == 6 and math.isclose(stage.limits.max_speed, math.pi / 2)
+try:
+    load(path, ["devices.stage={%s, gear: 0}" % turn], {})
+except ConfigError as error:
+    assert "devices.stage" in str(error) and "gear" in str(error), error
+else:
+    raise AssertionError("a gear of 0 was taken")
+wire = stand_alone("turn?counts=7", SystemClock())
+wire.receive(b"?")
+assert wire.transmit() == b"0007"
+""",
+)
+
+EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER, "stage": STAGE}
 
 
 @pytest.mark.parametrize("kind", EXTENSIONS)
