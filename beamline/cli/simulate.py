@@ -17,8 +17,7 @@ from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import named_on_failure, refuse_existing, whole_file
-from beamline.core.free_memory import free_memory
-from beamline.core.machine import machine, machine_line
+from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.text import size
 from beamline.simulate.figure import sheet
 from beamline.simulate.labels import labels_path
@@ -163,7 +162,7 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict
         needed, free = memory_of(scan.detector, n), free_memory()
     except ValueError as error:
         raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
-    if free is not None and needed > free:
+    if needed > free:
         raise ConfigError(
             f"--truth-bin {n}: the truth takes {size(needed)} of memory, {size(free)} are free. Give a larger "
             "--truth-bin. Nothing was simulated."

@@ -1,20 +1,25 @@
-"""The machine that figures were measured on, in one line: no time means anything without it."""
+"""This machine: what figures were measured on, and how much memory there is and was used."""
 
 from __future__ import annotations
 
 import os
 import platform
 import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
-import numba
-import torch
+import psutil
 
-_CPUINFO = Path("/proc/cpuinfo")
+_CPUINFO, _STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def machine() -> dict[str, str | int]:
     """Processor, cores this process may use, numba's threads, and the versions of what computes."""
+    import numba  # not for callers that only ask for memory
+    import torch
+
     return {
         "processor": _processor(),
         "cores": usable_cores(),
@@ -27,7 +32,7 @@ def machine() -> dict[str, str | int]:
 
 
 def machine_line(found: dict[str, str | int] | None = None) -> str:
-    """`machine()` as people read it."""
+    """`machine()` as one line of text: a time means nothing without it."""
     m = found or machine()
     return (
         f"{m['processor']}, {_counted(m['cores'], 'core')}, {_counted(m['threads'], 'thread')}, {m['system']}, "
@@ -35,15 +40,38 @@ def machine_line(found: dict[str, str | int] | None = None) -> str:
     )
 
 
-def _counted(n: str | int, word: str) -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"
-
-
 def usable_cores() -> int:
     """Cores that this process may run on, where the system tells; else all there are."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    if sys.platform == "darwin":  # has no affinity
+        return os.cpu_count() or 1
+    return len(psutil.Process().cpu_affinity())
+
+
+def free_memory() -> int:
+    """Bytes that can be had without swapping, also within a container's limit."""
+    return min([int(psutil.virtual_memory().available), *_left_in_cgroups(_CGROUPS, _OWN_CGROUP)])
+
+
+def peak_memory() -> int | None:
+    """Largest resident set of this process so far, in bytes; None where the system does not tell."""
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    if _STATUS.is_file():
+        # Linux lets a new process inherit ru_maxrss of the one that started it; VmHWM is its own.
+        return _high_water(_STATUS.read_text(encoding="ascii", errors="replace"))
+    import resource
+
+    return int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)  # macOS: bytes
+
+
+def reset_peak_memory() -> None:
+    """Let `peak_memory` count from now on, where the system can do that (Linux); elsewhere nothing happens."""
+    with suppress(OSError):
+        _CLEAR.write_text("5", encoding="ascii")  # proc_pid_clear_refs(5): reset the peak resident set size
+
+
+def _counted(n: str | int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 def _processor() -> str:
@@ -53,3 +81,39 @@ def _processor() -> str:
             if name.strip() == "model name":
                 return value.strip()
     return platform.processor() or platform.machine() or "unknown processor"
+
+
+def _high_water(status: str) -> int | None:
+    for line in status.splitlines():
+        name, _, value = line.partition(":")
+        if name == "VmHWM" and value.split()[1:] == ["kB"]:
+            return int(value.split()[0]) * 1024
+    return None
+
+
+def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
+    """What each limit above this process leaves (cgroup v2), which psutil does not know.
+
+    A container may see its own limit at the root.
+    """
+    inner = ""
+    with suppress(OSError):
+        for line in own.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("0::/"):
+                inner = line.removeprefix("0::/")
+    folder = root / inner
+    for place in (folder, *folder.parents):
+        if not place.is_relative_to(root):
+            return
+        with suppress(OSError, ValueError):  # no limit is the word "max"
+            limit, used = (int((place / name).read_text("ascii")) for name in ("memory.max", "memory.current"))
+            yield max(limit - used + _reclaimable(place / "memory.stat"), 0)
+
+
+def _reclaimable(stat: Path) -> int:
+    """The file cache that counts as used and is given up first."""
+    for line in stat.read_text("ascii").splitlines():
+        name, _, value = line.partition(" ")
+        if name == "inactive_file":
+            return int(value)
+    return 0

@@ -10,7 +10,7 @@ from typing import Any
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
 from beamline.config.load import Config
 from beamline.config.models import Storage
-from beamline.core.free_memory import free_memory
+from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.doctor import camera, disk
 from beamline.doctor.check import Check, Verdict, of_error

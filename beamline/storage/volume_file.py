@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import zlib
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import h5py
 import numpy as np
@@ -11,12 +14,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.free_memory import free_memory
+from beamline.core.machine import free_memory
 from beamline.storage import hdf5
-from beamline.storage.nifti import read_nifti
 
 PACKED = 1e5
 """No TIFF holds so many times its own size: zeros come to 1000 times with deflate, and 20 000 with Zstandard."""
+LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
+"""mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
 SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", ".nxs")
 
 
@@ -43,7 +47,7 @@ def read_volume(
         raise DataError(f"{path} cannot be read: it is neither an .npz nor an .npy, whatever its name says.")
     try:
         if name.endswith((".nii", ".nii.gz")):
-            return read_nifti(path)
+            return _from_nifti(path)
         if is_hdf5 or name.endswith((".h5", ".hdf5", ".nxs")):
             with hdf5.open_hdf5(path) as file:
                 return _from_hdf5(path, file, dataset), None
@@ -75,11 +79,64 @@ def _from_tiff(path: Path) -> NDArray[np.generic]:
 def _check_size(path: Path, n: int) -> None:
     """Raises DataError where n bytes are more than there are: a damaged file claims anything."""
     free = free_memory()
-    if free is not None and n > free:
+    if n > free:
         raise DataError(
             f"{path} cannot be read: it says that it holds {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are "
             "free; cut the volume or bin it."
         )
+
+
+def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
+    """Single-file NIfTI-1 (Cox et al. 2004): values scaled as the header says, and mm between voxels along z, y, x.
+
+    Scaled values are float32, others of the file's type. The orientation of the patient is not applied.
+    """
+    try:
+        from nibabel import Nifti1Header
+        from nibabel.openers import ImageOpener
+        from nibabel.spatialimages import HeaderDataError
+        from nibabel.wrapstruct import WrapStructError
+    except ImportError as error:
+        raise DataError(
+            f"{path} is a NIfTI volume; install nibabel to read it: pip install splatline[nifti]."
+        ) from error
+    try:
+        with ImageOpener(str(path)) as file:
+            header = Nifti1Header.from_fileobj(file, check=False)
+            dtype, size = _checked_nifti(path, header)
+            _check_size(path, size)
+            values = np.asarray(header.raw_data_from_fileobj(file)).T
+    except (EOFError, HeaderDataError, WrapStructError, OSError, OverflowError, ValueError, zlib.error) as error:
+        raise DataError(
+            f"{path} cannot be read as NIfTI: it is cut or damaged ({str(error).splitlines()[0]})."
+        ) from error
+    unit = LENGTHS[int(header["xyzt_units"]) & 7]
+    x, y, z = (abs(float(size)) * unit for size in header["pixdim"][1:4])
+    values = values.astype(dtype.newbyteorder("="))
+    slope, intercept = (float(header[name]) for name in ("scl_slope", "scl_inter"))
+    if not math.isfinite(slope) or slope == 0 or (slope == 1 and intercept == 0):
+        return values, (z, y, x)
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite; the caller refuses them
+        return values.astype(np.float32) * np.float32(slope) + np.float32(intercept), (z, y, x)
+
+
+def _checked_nifti(path: Path, header: Any) -> tuple[np.dtype[Any], int]:
+    """Type and bytes of the values; DataError for a header that no volume of real numbers has."""
+    magic = bytes(header["magic"]).rstrip(b"\0")
+    if int(header["sizeof_hdr"]) != 348 or magic != b"n+1":
+        raise DataError(f"{path} is no single-file NIfTI-1 (header of {header['sizeof_hdr']} bytes, magic {magic!r}).")
+    dtype, dims = header.get_data_dtype(), header["dim"].tolist()
+    if dtype.kind not in "iuf" or int(header["bitpix"]) != 8 * dtype.itemsize or dtype.itemsize > 8:
+        kind, bits = header["datatype"], header["bitpix"]
+        raise DataError(f"{path} holds values of type {kind} with {bits} bits; real numbers of 8 to 64 bits are read.")
+    if not (3 <= dims[0] <= 7 and min(dims[1:4]) >= 1 and all(n == 1 for n in dims[4 : dims[0] + 1])):
+        raise DataError(f"{path} has the axes {dims[1 : max(dims[0], 0) + 1]}; a volume has three.")
+    sizes, offset = header["pixdim"][1:4], float(header["vox_offset"])
+    if not (np.isfinite(sizes).all() and sizes.all() and math.isfinite(offset) and offset >= 348):
+        raise DataError(f"{path}: voxels of {sizes.tolist()}, values from byte {offset:g} on: the header is damaged.")
+    if (unit := int(header["xyzt_units"]) & 7) not in LENGTHS:
+        raise DataError(f"{path}: lengths in unit {unit} of xyzt_units; 1, 2 and 3 (m, mm, um) are known.")
+    return dtype, math.prod(dims[1:4]) * dtype.itemsize
 
 
 def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import recon
-from beamline.core.memory import forget_peak, peak_memory
+from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
 from beamline.tradeoff.data import Data, geometry_in
@@ -68,7 +68,7 @@ def run(
     grid = Grid.matching(data.geometry)
     # On a toy of the same kind, so that compilation is in no trial's time.
     warm_up(trial.build(), data.geometry)
-    forget_peak()
+    reset_peak_memory()
     before = cpu()
     result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
     cpu_seconds = cpu() - before

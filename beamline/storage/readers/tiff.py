@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
@@ -28,7 +28,7 @@ def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
         return stack[None] if stack.ndim == 2 else stack
     path = Path(images)
     files = (
-        sorted((item for item in path.iterdir() if item.suffix.lower() in SUFFIXES), key=lambda f: natural(f.name))
+        [path / name for name in natural_sorted(f.name for f in path.iterdir() if f.suffix.lower() in SUFFIXES)]
         if path.is_dir()
         else [path]
     )
@@ -55,8 +55,3 @@ def pages_one_by_one(tif: tifffile.TiffFile) -> bool:
     parts = tif.series
     alike = all(len(part.shape) == 2 and (part.shape, part.dtype) == (parts[0].shape, parts[0].dtype) for part in parts)
     return len(parts) > 1 and alike and len(parts) == len(tif.pages)
-
-
-def natural(name: str) -> list[tuple[int, str]]:
-    """A sort key by which image_9 comes before image_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name.lower())]

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, natural, read_image
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image
 from drivers.frame import FrameKind
 
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
@@ -40,7 +41,7 @@ class TiffSeries(ScanReader):
         self._zip = _open_zip(path) if path.is_file() else None
         try:
             names = self._names()
-            images = sorted((name for name in names if name.lower().endswith(SUFFIXES)), key=natural)
+            images = natural_sorted(name for name in names if name.lower().endswith(SUFFIXES))
             kinds = {name: kind_of(name) for name in images}
             series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
             _check_one_series(path, series)

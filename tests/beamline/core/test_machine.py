@@ -1,12 +1,21 @@
-"""The line about the machine: short, true, and the same for people and programs."""
+"""This machine: a line that is short and true; memory in bytes, within a container's limit, and a peak that stays."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numba
+import numpy as np
+import pytest
 
-from beamline.core.machine import machine, machine_line
+from beamline.core import machine as module
+from beamline.core.machine import _high_water, free_memory, machine, machine_line, peak_memory, reset_peak_memory
+
+KB = 1024
 
 
 def test_what_a_time_means_nothing_without() -> None:
@@ -19,3 +28,80 @@ def test_what_a_time_means_nothing_without() -> None:
     assert "1 core, 1 thread," in machine_line({**found, "cores": 1, "threads": 1})
     assert "2 cores, 3 threads," in machine_line({**found, "cores": 2, "threads": 3})
     assert "\n" not in line and all(str(value) in line for value in found.values())
+
+
+@pytest.mark.skipif(sys.platform not in ("linux", "darwin", "win32"), reason="nothing is promised elsewhere")
+def test_the_peak_is_bytes_and_stays() -> None:
+    before = peak_memory()
+    assert before is not None
+    held = np.ones(int(before * 0.2 + 4e7) // 8)
+    after = peak_memory()
+    assert after is not None
+    size = held.nbytes
+    del held
+    # What was free before may be taken up again, so that the peak grows by less than what is held.
+    assert 10e6 < before <= after < before + 2 * size
+    assert peak_memory() == pytest.approx(after, rel=0.2)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can do it")
+def test_a_peak_can_be_reset() -> None:
+    held = np.ones(40_000_000)  # 320 MB, given back at once: it is mapped memory
+    high = peak_memory()
+    del held
+    reset_peak_memory()
+    low = peak_memory()
+    assert high is not None and low is not None
+    assert low < high - 2e8
+
+
+def test_the_status_file_of_linux() -> None:
+    assert _high_water("Name:\tpython\nVmPeak:\t  999 kB\nVmHWM:\t  1234 kB\n") == 1234 * 1024
+    assert _high_water("Name:\tpython\n") is None
+
+
+def test_this_computer_tells_something_plausible() -> None:
+    assert 10**7 < free_memory() < 10**14
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="ascii")
+    return path
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, folder: Path, own: str = "0::/user/session\n") -> Path:
+    """A computer with 8 MB available, whose control groups a test fills in."""
+    monkeypatch.setattr(module.psutil, "virtual_memory", lambda: SimpleNamespace(available=8192 * KB))
+    monkeypatch.setattr(module, "_OWN_CGROUP", write(folder / "cgroup", own))
+    monkeypatch.setattr(module, "_CGROUPS", folder / "groups")
+    return folder / "groups"
+
+
+def test_without_limits_it_is_the_computer_s(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pretend(monkeypatch, tmp_path)
+    assert free_memory() == 8192 * KB
+
+
+@pytest.mark.parametrize("where", ["user/session", "user", "."])
+def test_the_narrowest_limit_above_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, where: str) -> None:
+    groups = pretend(monkeypatch, tmp_path)
+    for place in ("user/session", "user", "."):
+        write(groups / place / "memory.max", "3000000\n" if place == where else "max\n")
+        write(groups / place / "memory.current", "2500000\n")
+        write(groups / place / "memory.stat", "anon 2000000\ninactive_file 400000\n")
+    assert free_memory() == 3_000_000 - 2_500_000 + 400_000
+
+
+def test_a_limit_that_is_overdrawn_leaves_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    groups = pretend(monkeypatch, tmp_path, own="12:memory:/old\n0::/\n")
+    write(groups / "memory.max", "1000")
+    write(groups / "memory.current", "2000")
+    write(groups / "memory.stat", "")
+    assert free_memory() == 0
+
+
+def test_memory_is_asked_without_loading_what_computes() -> None:
+    code = "import sys, beamline.core.machine as m; m.free_memory(); print({'torch', 'numba'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import sys
 from pathlib import Path
 
 import h5py
@@ -69,8 +70,8 @@ def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (nifti()[:-1], "ends after 47 of the 48 bytes"),
-        (nifti()[:100], "no single-file NIfTI-1"),
+        (nifti()[:-1], "cut or damaged .Expected 48 bytes, got 47 bytes"),
+        (nifti()[:100], "cut or damaged"),
         (nifti(magic=b"ni1\0"), "no single-file NIfTI-1"),
         (nifti(size=540), "no single-file NIfTI-1"),
         (nifti(datatype=128, bitpix=24), "type 128 with 24 bits"),
@@ -82,10 +83,10 @@ def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> N
         (nifti(offset=float("nan")), "header is damaged"),
         (nifti(offset=3.0), "header is damaged"),
         (nifti(units=5), "unit 5"),
-        (nifti(offset=3e38), "asks for more than there can be"),
-        (nifti(offset=1e12), "ends after 0 of the 48 bytes"),
-        (nifti(VALUES.astype("f8"), dim=(3, 32767, 32767, 32767, 1, 1, 1, 1)), "more than there can be|ends after"),
-        (b"", "no single-file NIfTI-1"),
+        (nifti(offset=3e38), "cut or damaged"),
+        (nifti(offset=1e12), "cut or damaged .Expected 48 bytes, got 0 bytes"),
+        (nifti(VALUES.astype("f8"), dim=(3, 32767, 32767, 32767, 1, 1, 1, 1)), "it says that it holds 2.81e.05 GB"),
+        (b"", "cut or damaged"),
     ],
 )
 def test_a_damaged_nifti_is_refused(tmp_path: Path, content: bytes, said: str) -> None:
@@ -101,8 +102,15 @@ def test_a_nifti_that_is_not_compressed_is_no_gz(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot be read as NIfTI"):
         read_volume(path)
     path.write_bytes(gzip.compress(nifti())[:-20])
-    with pytest.raises(DataError, match=r"cannot be read as NIfTI|ends after"):
+    with pytest.raises(DataError, match="cannot be read as NIfTI"):
         read_volume(path)
+
+
+def test_without_nibabel_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "v.nii").write_bytes(nifti())
+    monkeypatch.setitem(sys.modules, "nibabel", None)
+    with pytest.raises(DataError, match=r"pip install splatline\[nifti\]"):
+        read_volume(tmp_path / "v.nii")
 
 
 def test_the_thorax_is_read(shared_data: Path) -> None:

@@ -11,7 +11,7 @@ import tifffile
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.tiff import load_images, natural
+from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import kind_of
 from drivers.frame import FrameKind
 
@@ -76,10 +76,6 @@ def test_a_folder_or_zip_explains_itself_by_names(series: tuple[Path, np.ndarray
 )
 def test_kinds_by_name(name: str, kind: FrameKind) -> None:
     assert kind_of(name) is kind
-
-
-def test_natural_order() -> None:
-    assert sorted(["a10", "a9", "b1", "a9b2", "a9b10"], key=natural) == ["a9", "a9b2", "a9b10", "a10", "b1"]
 
 
 def test_angles_that_do_not_fit_are_refused_with_the_rows_that_would(series: tuple[Path, np.ndarray]) -> None:
