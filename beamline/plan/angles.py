@@ -89,8 +89,8 @@ def from_text(text: str) -> NDArray[np.float64]:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees, such as 12.5")
+            raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("there is no angle in it; expected degrees, one a line")
+        raise ValueError("there is no angle in it; expected one angle in degrees a line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.plan.angles import from_text
 from beamline.storage import hdf5
 from drivers.frame import FrameKind
 
@@ -28,15 +29,11 @@ def load_angles(angles: Angles) -> NDArray[np.float64]:
 
 
 def parse_angles(content: str, name: str) -> NDArray[np.float64]:
-    """Radians from text in degrees; `name` is where it came from."""
+    """Radians from text in degrees (see `plan.angles.from_text`); `name` is where it came from."""
     try:
-        lines = [line for line in content.splitlines() if line.partition("#")[0].strip()]
-        degrees = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 1))
+        return from_text(content)
     except ValueError as error:
-        raise DataError(f"{name}: expected one angle in degrees a line ({error}).") from error
-    if degrees.shape[1] != 1 or degrees.size == 0:
-        raise DataError(f"{name}: expected one angle in degrees a line, found a table of {degrees.shape}.")
-    return np.radians(degrees[:, 0])
+        raise DataError(f"{name}: {error}.") from error
 
 
 def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
