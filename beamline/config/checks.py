@@ -1,4 +1,4 @@
-"""Configuration checks: what no single value's type can say, each fault with the key that it is about."""
+"""Configuration checks: conditions between several values; each error names its key."""
 
 from __future__ import annotations
 

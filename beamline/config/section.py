@@ -1,4 +1,4 @@
-"""A section of a configuration: a frozen group of keys that refuses what it does not know."""
+"""Section: a frozen group of configuration keys; unknown keys are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration of the rotation stage: a section for each stage that there is, with the keys its driver declares."""
+"""Configuration of the rotation stage: one section per kind, with the keys that its settings declare."""
 
 from __future__ import annotations
 

@@ -32,12 +32,12 @@ def make_camera(config: DcamOrca, clock: Clock) -> DcamCamera:
     return DcamCamera(library, config.index, clock=clock, options=options_of(config))
 
 
-def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, heed: Callable[[], None]) -> None:
+def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, check_stop: Callable[[], None]) -> None:
     """Wait for a cold sensor and tell the operator how cold it is.
 
     Args:
         seconds: at most.
-        heed: called once a second; what it raises ends the wait.
+        check_stop: called once a second; what it raises ends the wait.
 
     Raises:
         DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
@@ -47,7 +47,7 @@ def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, heed: Call
 
     def progress(celsius: float, status: str) -> None:
         nonlocal told
-        heed()
+        check_stop()
         if clock.now() - told >= TELL_EVERY:
             told = clock.now()
             click.echo(f"The sensor has {celsius:.1f} °C, its cooler says {status}.", err=True)

@@ -69,14 +69,14 @@ class Instrument:
 
 
 def connect(
-    config: Config, clock: Clock | None = None, ask: Ask | None = None, heed: Callable[[], None] = lambda: None
+    config: Config, clock: Clock | None = None, ask: Ask | None = None, check_stop: Callable[[], None] = lambda: None
 ) -> Instrument:
     """Open every device that the configuration names. Nothing moves.
 
     Args:
         clock: takes the place of the configured one.
         ask: puts a request to the operator (manual shutter and sample mover); the terminal unless given.
-        heed: called again and again while there is something to wait for; what it raises ends that.
+        check_stop: called again and again while there is something to wait for; what it raises ends that.
 
     Raises:
         DeviceError: a device does not answer; those opened before it are closed again.
@@ -85,7 +85,7 @@ def connect(
     with ExitStack() as opened:
         if config.simulation is None:
             clock, simulated = clock or SystemClock(), None
-            devices = _instrument(config, clock, ask or ask_operator, heed, opened)
+            devices = _instrument(config, clock, ask or ask_operator, check_stop, opened)
         else:
             clock = clock or clock_of(config.simulation.clock)
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
@@ -141,7 +141,7 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
     return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
 
 
-def _instrument(config: Config, clock: Clock, ask: Ask, heed: Callable[[], None], opened: ExitStack) -> Devices:
+def _instrument(config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack) -> Devices:
     chosen, wanted = config.devices.camera, config.devices.shutter
     if not isinstance(chosen, DcamOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
@@ -150,7 +150,7 @@ def _instrument(config: Config, clock: Clock, ask: Ask, heed: Callable[[], None]
     camera = make_camera(chosen, clock)
     opened.callback(camera.close)
     if chosen.cool_s:
-        wait_until_cold(camera, chosen.cool_s, clock, heed)
+        wait_until_cold(camera, chosen.cool_s, clock, check_stop)
     shutter: Shutter = ManualShutter(ask)
     if isinstance(wanted, StageOutputShutter):
         output = stage.digital_output(wanted.output)

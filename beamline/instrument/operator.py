@@ -10,7 +10,7 @@ from drivers.errors import DeviceError
 
 
 def ask_operator(request: str) -> None:
-    """Put a request to whoever sits at the terminal, and wait for Enter.
+    """Ask the operator at the terminal, and wait for Enter.
 
     Raises:
         DeviceError: nobody sits there.
@@ -24,7 +24,7 @@ def ask_operator(request: str) -> None:
             state="What was acquired so far is in the file",
         )
     try:
-        # A read from a terminal goes on after a signal, so that a stop is heeded only once it returns.
+        # A read from a terminal goes on after a signal, so that a stop takes effect only when it returns.
         how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
         click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
     except click.Abort as error:  # the end of input

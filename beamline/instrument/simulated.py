@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a simulator knows and an instrument does not.
+    """What is known of a simulated scene and cannot be known at an instrument.
 
     Attributes:
         truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
@@ -49,7 +49,7 @@ class Simulated:
 def simulated_devices(
     config: Config, simulation: Simulation, clock: Clock, opened: ExitStack
 ) -> tuple[Devices, Simulated]:
-    """Every device of the configuration, connected, and what is known of them.
+    """Every device of the configuration, connected, and what is known of the simulated scene.
 
     Args:
         opened: takes what closes them.
@@ -101,11 +101,11 @@ def scene_of(config: Config) -> Scene:
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
     if _cone(scene) is not None:
-        _refuse_untold(config, scene)
+        _refuse_unrecordable(config, scene)
     return scene
 
 
-def _refuse_untold(config: Config, scene: Scene) -> None:
+def _refuse_unrecordable(config: Config, scene: Scene) -> None:
     """Raises ConfigError where the file of a cone's scan could not be reconstructed: what it has no words for."""
     camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
     row0, col0, rows, _ = camera.roi or (0, 0, height, width)

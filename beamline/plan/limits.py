@@ -1,4 +1,4 @@
-"""Plan checks: every limit that a worked-out plan breaks, and what the operator should know though it breaks none."""
+"""Plan checks: the limits that a plan breaks, and remarks for the operator."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARGIN = 1.01
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """A plan and what has been worked out of it: what the checks look at."""
+    """A plan with its computed speeds, times and sizes, which the checks look at."""
 
     plan: ScanPlan
     views: Block

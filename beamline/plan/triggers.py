@@ -1,4 +1,4 @@
-"""Trigger trains: angles become pulses at whole counts of the stage, or a sentence says why they cannot."""
+"""Trigger trains: angles become pulses at whole counts of the stage, or an error says why not."""
 
 from __future__ import annotations
 

@@ -110,7 +110,9 @@ def run_scan(
     stop = stop or StopRequest()
     runs = runs or Path(config.storage.folder)
     with ExitStack() as connected:
-        instrument = instrument or connected.enter_context(connect(config, ask=ask, heed=lambda: _refuse_stop(stop)))
+        instrument = instrument or connected.enter_context(
+            connect(config, ask=ask, check_stop=lambda: _refuse_stop(stop))
+        )
         ready = preflight(config, instrument, runs)
         _refuse_stop(stop)
         folder = create_run_folder(runs, config.sample.name, SystemClock().now())

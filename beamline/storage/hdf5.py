@@ -85,7 +85,7 @@ def reason(error: Exception) -> str:
 
 
 def never_close(file: h5py.File) -> None:
-    """Leave a file as it is on the disk, whoever lets go of it or of what is in it, until the process ends.
+    """Keep a file open until the process ends, so that HDF5 changes nothing more on the disk.
 
     For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
     object, and may leave it marked as one that nobody can open.

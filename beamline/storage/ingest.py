@@ -100,7 +100,7 @@ def ingest(
 
 
 def _remove(part: Path) -> str:
-    """Remove the file begun; what is left of it."""
+    """Remove the unfinished file; a sentence on what remains of it."""
     try:
         part.unlink(missing_ok=True)
     except OSError:  # Windows removes no file that is open, as it is after a full disk

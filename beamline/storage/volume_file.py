@@ -1,4 +1,4 @@
-"""Volume file: a volume [z, y, x] from TIFF, NumPy, NIfTI or HDF5, for whoever wants voxels and not a scan."""
+"""Volume file: a volume [z, y, x] read from TIFF, NumPy, NIfTI or HDF5."""
 
 from __future__ import annotations
 

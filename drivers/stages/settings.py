@@ -18,7 +18,7 @@ from drivers.protocols import RotationStage, StageLimits
 FARTHEST = 1e9
 """rad."""
 MOST = 2.0**53
-"""counts that a float still tells apart."""
+"""counts: the largest whole numbers that a float holds exactly."""
 ANGULAR = {"deg", "deg_s", "deg_s2"}
 """Units of keys whose fields are in radians."""
 

@@ -1,4 +1,4 @@
-"""Stops of a stage, from any thread: a move that was just being begun when one came does not go on behind its back."""
+"""Stops of a stage, from any thread: a stop also ends a move whose command is being sent."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from drivers.errors import DeviceError
 class Stops:
     """`count` is the number of stops so far.
 
-    A stop goes out at once, maybe just before the command of a move that another thread has begun to give. So whoever
-    begins a move looks, once the command has gone, whether a stop came meanwhile, and then sends it again.
+    A stop goes out at once, perhaps just before the move command that another thread is about to send. So the thread
+    that starts a move checks after its command whether a stop came meanwhile, and sends the stop again.
 
     Args:
         send: sends a stop (True: without deceleration) and does not wait until it stands.
@@ -33,8 +33,8 @@ class Stops:
         """Around the commands that begin a move.
 
         Args:
-            purpose: what is begun, for the error.
-            since: the count before all of it, where it has begun earlier.
+            purpose: what is started, for the error.
+            since: the number of stops before the first of several commands.
 
         Raises:
             DeviceError: a stop came; it has been sent again.
@@ -50,7 +50,7 @@ class Stops:
         if came:
             raise DeviceError(
                 self._name,
-                f"{purpose} was stopped while it was being begun",
+                f"{purpose} was stopped while it was started",
                 advice="Find who stopped it before moving on",
                 state="The stop was sent again: it stands, or slows down to stand",
             ) from problem

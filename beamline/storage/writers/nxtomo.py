@@ -95,7 +95,7 @@ class NXtomoWriter:
             self.path.unlink()
             if isinstance(error, OSError | RuntimeError):
                 raise DataError(
-                    f"{self.path} cannot be begun ({hdf5.reason(error)}). Nothing is left of it."
+                    f"{self.path} cannot be created ({hdf5.reason(error)}). Nothing is left of it."
                 ) from error
             raise
         self._table = layout.Rows(self._file)

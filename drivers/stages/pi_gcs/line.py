@@ -50,7 +50,7 @@ class GcsLine:
     def __init__(self, url: str, axis: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.fault = 0
         self.commanded = False
-        """A move was begun: what is said of a failure depends on it."""
+        """Whether a move has started; the text of an error depends on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
         self._serial = SerialLine(

@@ -65,5 +65,5 @@ def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
     """Whether a move from `here` to `target` (counts) must not find the train armed: it was emitted, and passing it
     again would emit it again; or it has begun, and on the way back pulses would come too."""
     sign = 1 if train.interval > 0 else -1
-    begun, whole = sign * (here - train.start) >= 0, sign * (here - train.end) >= 0
-    return whole or (begun and sign * (target - here) < 0)
+    started, passed = sign * (here - train.start) >= 0, sign * (here - train.end) >= 0
+    return passed or (started and sign * (target - here) < 0)

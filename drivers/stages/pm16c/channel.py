@@ -34,7 +34,7 @@ class ChannelStatus:
 
     @property
     def stopped(self) -> bool:
-        """Somebody stopped it."""
+        """Whether the move was stopped."""
         return bool(STOPS & set(self.ending.split(", ")))
 
 
@@ -70,7 +70,7 @@ class PM16CChannel:
             channels = self._line.until(self._channels, lambda channels: channels.startswith(c))
             if not channels.startswith(c):
                 raise self._line.not_followed(command, channels, f"channel {c} on position controller A")
-        self._line.make_ready(f"TMGC{c}", f"TMGR?{c}", "NO")  # of whoever was here before and died
+        self._line.make_ready(f"TMGC{c}", f"TMGR?{c}", "NO")  # a train left by a program that died
         self._line.set(f"RTE{c}{rate_code:03d}", f"RTE?{c}", rate_code)
         return version
 
@@ -200,11 +200,11 @@ class PM16CChannel:
         self._line.commanded, self.last_move = True, command
         self._line.send(command)
 
-        def begun(status: ChannelStatus) -> bool:
+        def has_started(status: ChannelStatus) -> bool:
             return status.moving or status.counts == (self.home() if target is None else target)
 
-        status = self._line.until(self.status, begun)
-        if not begun(status):
+        status = self._line.until(self.status, has_started)
+        if not has_started(status):
             raise DeviceError(
                 self._name,
                 f"the move did not start ({status.ending or self._line.complaint()})",

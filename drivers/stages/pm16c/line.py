@@ -31,7 +31,7 @@ class PM16CLine:
 
     def __init__(self, url: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.commanded = False
-        """A move was begun: what is said of a failure depends on it."""
+        """Whether a move has started; the text of an error depends on it."""
         self._name, self._clock = name, clock
         self._serial = SerialLine(
             url,

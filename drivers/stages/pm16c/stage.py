@@ -24,8 +24,8 @@ from drivers.stages.travel import Travel
 class PM16CStage:
     """Implements `drivers.protocols.RotationStage`. Closing it leaves a move under way to end by itself.
 
-    `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises: no
-    thread takes it for arrived. Arming and disarming need a standing stage.
+    `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped raises, whoever
+    stopped it: no thread takes it for arrived. Arming and disarming need a standing stage.
 
     Args:
         url: what pyserial opens; the controller's LAN port is "socket://host:7777".
@@ -73,7 +73,7 @@ class PM16CStage:
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """As `drivers.protocols.Motion` has it; `wait` takes the later steps, and a train that was armed is no more."""
+        """As `drivers.protocols.Motion` has it; `wait` takes the later steps, and an armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,
@@ -158,7 +158,7 @@ class PM16CStage:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            with contextlib.suppress(DeviceError):  # closing a dead line is no news to whoever closes
+            with contextlib.suppress(DeviceError):  # a line that no longer answers is closed all the same
                 self._channel.close()
 
     def _send_stop(self, hard: bool) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from drivers.errors import DeviceRefused
 from drivers.protocols import TriggerTrain
 from drivers.stages.zaber.axis import ZaberAxis
-from drivers.stages.zaber.train import PulseSettings, begun, remaining, set_up
+from drivers.stages.zaber.train import PulseSettings, has_started, remaining, set_up
 
 ADVICE = (
     "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
@@ -71,7 +71,7 @@ class ZaberPulses:
         """Keep a train right when a move from `counts` goes against it: distance counts both ways. One that is under
         way ends; one whose first pulse is still to come is set up anew, or ends where that takes standing elsewhere."""
         train = self._train
-        if train is None or train.interval * (target - counts) >= 0 or not begun(self.settings, self._shown()):
+        if train is None or train.interval * (target - counts) >= 0 or not has_started(self.settings, self._shown()):
             return
         if self.settings.triggers.chained and self.remaining() == train.n:
             self.arm(train, counts, _nowhere)

@@ -57,7 +57,7 @@ class ZaberStage:
             self._check_turn_and_travel()
             self._axis.set("accel", steepest)
             if self._identity.has_triggers:
-                self._pulses.disarm()  # of whoever was here before and died
+                self._pulses.disarm()  # a train left by a program that died
         except BaseException:
             self.close()
             raise
@@ -213,7 +213,7 @@ class ZaberStage:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            with contextlib.suppress(DeviceError):  # closing a dead line is no news to whoever closes
+            with contextlib.suppress(DeviceError):  # a line that no longer answers is closed all the same
                 self.disarm()
             with contextlib.suppress(DeviceError):
                 self._axis.close()

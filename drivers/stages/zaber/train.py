@@ -153,7 +153,7 @@ def set_up(settings: PulseSettings, train: TriggerTrain, axis: int, counts: int)
     return TriggerSetup(tuple(commands), f"{starter} enable 1", None)
 
 
-def begun(settings: PulseSettings, shown: str) -> bool:
+def has_started(settings: PulseSettings, shown: str) -> bool:
     """Distance is being counted, as `trigger show` tells."""
     return not settings.triggers.chained or _state(shown, settings.triggers.starter) == "d"
 
@@ -164,7 +164,7 @@ def remaining(settings: PulseSettings, train: TriggerTrain, shown: str) -> int:
     Raises:
         ValueError: it does not tell of these triggers.
     """
-    if not begun(settings, shown):
+    if not has_started(settings, shown):
         return train.n
     left = _state(shown, settings.triggers.repeater)
     fires = int(left) if left.isdigit() else 0

@@ -236,7 +236,7 @@ class GcsAxis:
         self._cut(self.move.halted(counts))
 
     def _cut(self, move: TrapezoidMove) -> None:
-        """End the move otherwise than it was begun."""
+        """Give the move another end."""
         self._referencing, self._at_end = False, None
         self._replace(move)
         self._target = (move.target - self._zero) / self.per_degree

@@ -86,7 +86,7 @@ class WiredOutput:
         self._schedule(move, now, owed)
 
     def cut(self, move: TrapezoidMove, now: float) -> None:
-        """The move under way will end otherwise than it was begun."""
+        """The move in progress gets another end."""
         self._schedule(move, now, self._settle(now))
 
     def _window(self) -> Window:

@@ -19,7 +19,7 @@ class HomeSwitch:
         self._motor, self.at = motor, at
         self._found: int | None = None
         self._searched_for: int | None = None
-        self._begun = -math.inf
+        self._incomplete = -math.inf
 
     def search(self, speed: float, acceleration: float) -> None:
         """Begin to search (pulses/s, pulses/s²); what an earlier search had found is forgotten."""
@@ -28,12 +28,12 @@ class HomeSwitch:
         self._found, self._searched_for = None, home
         beyond = math.ceil(speed**2 / (2 * acceleration)) if home != here else 0
         self._motor.start(home + (beyond if home > here else -beyond), speed, acceleration)
-        self._begun = self._motor.move.begin
+        self._incomplete = self._motor.move.begin
 
     def found(self) -> int | None:
         """Where the search passed the switch, in counts; None where none did."""
         move, home = self._motor.move, self._searched_for
-        if home is not None and move.begin == self._begun:
+        if home is not None and move.begin == self._incomplete:
             low, high = sorted((round(move.start), self._motor.position()))
             if low <= home <= high:
                 self._found, self._searched_for = home, None

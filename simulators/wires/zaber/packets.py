@@ -53,7 +53,7 @@ class PacketReader:
 
     def __init__(self) -> None:
         self._bytes = bytearray()
-        self._begun: Command | None = None
+        self._incomplete: Command | None = None
         self._parts = 0
 
     def feed(self, data: bytes) -> list[Command | Malformed]:
@@ -84,15 +84,15 @@ class PacketReader:
 
     def _join(self, command: Command, unfinished: bool) -> Command | Malformed | None:
         """Put a command in parts together; the parts after the first begin with `cont 1`, `cont 2`, ..."""
-        begun, self._begun = self._begun, None
+        first, self._incomplete = self._incomplete, None
         if command.words[:1] == ("cont",):
-            if begun is None or command.words[1:2] != (str(self._parts),):
+            if first is None or command.words[1:2] != (str(self._parts),):
                 return Malformed(command, "BADSPLIT")
-            command = Command(begun.address, begun.axis, begun.id, begun.words + command.words[2:])
+            command = Command(first.address, first.axis, first.id, first.words + command.words[2:])
         else:
             self._parts = 0
         if unfinished:
-            self._begun, self._parts = command, self._parts + 1
+            self._incomplete, self._parts = command, self._parts + 1
             return None
         return command
 

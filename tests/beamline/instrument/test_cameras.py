@@ -65,21 +65,21 @@ def test_every_camera_option_reaches_the_driver(
 
 def test_a_stop_ends_the_wait_for_a_cold_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Signals only set the stop request, so that the wait has to look at it; all that is open is closed again."""
-    stage, looks, heeded = Closable(), itertools.count(1), 3
+    stage, looks, asked = Closable(), itertools.count(1), 3
 
     class Camera(Closable):
         def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> None:
             while True:
                 progress(20.0, "busy")
 
-    def heed() -> None:
-        if next(looks) == heeded:
+    def check_stop() -> None:
+        if next(looks) == asked:
             raise ScanAborted("Interrupted")
 
     camera = Camera()
     monkeypatch.setattr(PM16CSettings, "connect", lambda *args: stage)
     monkeypatch.setattr(devices, "make_camera", lambda *args: camera)
     with pytest.raises(ScanAborted):
-        devices.connect(shipped("instrument", "devices.camera.cool_s=900"), heed=heed)
-    assert next(looks) == heeded + 1
+        devices.connect(shipped("instrument", "devices.camera.cool_s=900"), check_stop=check_stop)
+    assert next(looks) == asked + 1
     assert stage.closed == camera.closed == 1

@@ -340,6 +340,6 @@ def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
         raise no_room()
 
     monkeypatch.setattr(layout, "create", full)
-    with pytest.raises(DataError, match=r"s\.h5 cannot be begun \(No space left on device\)"):
+    with pytest.raises(DataError, match=r"s\.h5 cannot be created \(No space left on device\)"):
         NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     assert list(tmp_path.iterdir()) == []
