@@ -209,7 +209,7 @@ class Correction:
         if views is None:
             rows, cols = self._dark.shape
             views = Transmission(np.empty((0, rows, cols), np.float32), np.empty(0, np.int64), np.empty(0, np.int64))
-        air = air_level(views.data, *columns)
+        air = air_level(views.data, *columns) if views.view_ids.size else np.empty(0, np.float32)
         unlit = views.view_ids[~(air > settings.floor)]
         if unlit.size:
             raise ValueError(

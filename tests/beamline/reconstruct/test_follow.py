@@ -85,8 +85,10 @@ def _schedule(
     period: float = 0.1,
     status: str | None = "complete",
     axis_col: float | None = None,
+    pause: float = 0.0,
 ) -> None:
-    """The scan: its file appears after `begin` s and takes a frame every `period` s; status None never finishes it."""
+    """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
+    last one; status None never finishes it."""
     writers: list[NXtomoWriter] = []
     info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col)
 
@@ -99,7 +101,7 @@ def _schedule(
     start = clock.time + begin
     clock.due.append((start, create))
     clock.due += [(start + period * (i + 1), append(frame)) for i, frame in enumerate(frames)]
-    end = start + period * (len(frames) + 1)
+    end = start + period * (len(frames) + 1) + pause
     if status is not None:
         clock.due.append((end, lambda: writers[0].close(status)))
     else:
@@ -177,10 +179,11 @@ def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
     return [replace(frame, index=i) for i, frame in enumerate([*frames, *after])]
 
 
+@pytest.mark.parametrize("pause", [0.0, 2.0])
 @pytest.mark.parametrize("gain", [None, 1.3])
 @pytest.mark.parametrize("air", ["auto", "none", (3, 3)])
 def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to_the_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float | None, air: object
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float | None, air: object, pause: float
 ) -> None:
     """Also where flats at the end (of a brighter beam) change every view that the model has learnt from."""
     fits: list[StreamingFit] = []
@@ -200,7 +203,7 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
     monkeypatch.setattr(follow_module, "write_result", write_and_keep)
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
-    _schedule(clock, tmp_path / "scan.h5", frames if gain is None else _late_flats(frames, gain))
+    _schedule(clock, tmp_path / "scan.h5", frames if gain is None else _late_flats(frames, gain), pause=pause)
     correction = CorrectionSettings(air=air)  # type: ignore[arg-type]
     selection = Selection(axis_col=SCAN.axis_col, correction=correction)
     follow(_options(tmp_path, selection=selection), events.append, clock, RHYTHM)

@@ -296,6 +296,20 @@ def test_batches_of_any_size_are_the_views_at_once_to_the_bit(
     assert (parts.replaced, parts.floored) == pytest.approx((whole.replaced, whole.floored), rel=1e-12)
 
 
+@pytest.mark.parametrize("air", ["auto", "none", (4, 3)])
+def test_a_scan_may_end_after_its_last_view_was_fed(rng: np.random.Generator, air: object) -> None:
+    """Nothing is left to feed, and the newest view waits: `line_integrals(None)` gives it out."""
+    counts, references = beer_lambert(sphere(5), rng, noise=0.01)
+    options = CorrectionSettings(air=air)  # type: ignore[arg-type]
+    correction = Correction(references, options)
+    views = correction.transmission(counts, positions(counts))
+    correction.survey(views)
+    parts = [correction.line_integrals(views, last=False), correction.line_integrals(None)]
+    assert [part.view_ids.tolist() for part in parts] == [[0, 1, 2, 3], [4]]
+    whole = correct(counts, positions(counts), references, options)
+    np.testing.assert_array_equal(joined(parts).data, whole.data)
+
+
 def test_a_view_waits_for_the_one_after_it(rng: np.random.Generator) -> None:
     counts, references = beer_lambert(sphere(3), rng)
     correction = Correction(references, CorrectionSettings(air="none"))
