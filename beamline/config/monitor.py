@@ -32,7 +32,7 @@ class MonitorBase(Section):
             group, keys = next(iter(old.items())) if isinstance(old, dict) else ("<check>", None)
             limit = next(iter(keys)) if isinstance(keys, dict) and keys else "<limit>"
             raise ValueError(
-                f"thresholds is no key any more; write monitor.{group}.{limit} instead of "
+                f"thresholds is not a key any longer; write monitor.{group}.{limit} instead of "
                 f"monitor.thresholds.{group}.{limit}"
             )
         return {key: value for key, value in data.items() if key != "thresholds"}

@@ -79,7 +79,7 @@ def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]
         if word in seen:
             full = ".".join(map(str, (*path, word)))
             raise ConfigError(
-                f"{name}:{_line(key)}: {full} is said twice (also in line {seen[word]}); keep one. Nothing was started."
+                f"{name}:{_line(key)}: {full} appears twice (also in line {seen[word]}); keep one. Nothing was started."
             )
         seen[word] = _line(key)
         origins[(*path, word)] = f"{name}:{_line(key)}"

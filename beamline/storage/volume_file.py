@@ -42,7 +42,7 @@ def read_volume(
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)
     if not (is_hdf5 or is_numpy or name.endswith(SUFFIXES)):
-        raise DataError(f"{path} is no volume file that is known; the kinds are {', '.join(SUFFIXES)}.")
+        raise DataError(f"{path} is not a known volume file; the kinds are {', '.join(SUFFIXES)}.")
     if name.endswith((".npz", ".npy")) and not is_numpy:
         raise DataError(f"{path} cannot be read: it is neither an .npz nor an .npy, whatever its name says.")
     try:

@@ -82,4 +82,4 @@ def url_problem(url: str) -> str:
         legal = parts.scheme == "file" or (parts.scheme in ("http", "https") and bool(parts.hostname))
     except ValueError:
         legal = False
-    return "" if legal else f"{url!r} is no address of a page: http://host/..., https://host/... or file:///..."
+    return "" if legal else f"{url!r} is not the address of a page: http://host/..., https://host/... or file:///..."

@@ -73,4 +73,4 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 int(file.attrs["steps"]),
             )
     except (OSError, KeyError) as error:
-        raise DataError(f"{path} is no checkpoint that can be read ({error}); recon --checkpoint makes one.") from error
+        raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint makes one.") from error

@@ -87,12 +87,12 @@ FAULTS = {
     ),
     "no page": (
         ("  shutter:", "  beam_monitor: {kind: ring_current, url: ring, pattern: (.)}\n  shutter:"),
-        "my.yaml:9: devices.beam_monitor.url: 'ring' is no address of a page: http://host/...",
+        "my.yaml:9: devices.beam_monitor.url: 'ring' is not the address of a page: http://host/...",
     ),
     "no simulation": (("simulation: {}\n", ""), "simulated devices need a simulation section"),
     "twice": (
         ("  exposure_s: 0.01\n", "  exposure_s: 0.01\n  exposure_s: 0.02\n"),
-        "my.yaml:5: scan.exposure_s is said twice (also in line 4)",
+        "my.yaml:5: scan.exposure_s appears twice (also in line 4)",
     ),
     "no YAML": (("exposure_s: 0.01", "exposure_s: [0.01"), "my.yaml:5: this is not YAML"),
     "number as key": (("sample: {name: test}", "sample: {name: test, 1: 2}"), "my.yaml:1: sample"),
