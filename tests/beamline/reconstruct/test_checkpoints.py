@@ -162,7 +162,7 @@ def test_a_file_in_the_way_is_refused_before_the_work(tmp_path: Path) -> None:
         CheckpointOptions(tmp_path / "fit.h5").refuse_existing()
     with pytest.raises(DataError, match="does not exist"):
         CheckpointOptions(tmp_path / "no" / "fit.h5").refuse_existing()
-    with pytest.raises(DataError, match="no checkpoint"):
+    with pytest.raises(DataError, match="not a readable checkpoint"):
         CheckpointOptions(None, tmp_path / "fit.h5").refuse_existing()
     assert CheckpointOptions().begin({}, 0, lambda said: None) is None and not CheckpointOptions().wanted
 

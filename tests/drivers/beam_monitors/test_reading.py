@@ -231,5 +231,5 @@ def test_a_file_that_another_program_keeps(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("url", ["ring.html", "ftp://host/x", "http://", "http:///ring", "http://[::1/ring", ""])
 def test_addresses_that_are_none(url: str) -> None:
-    with pytest.raises(DeviceRefused, match="no address of a page"):
+    with pytest.raises(DeviceRefused, match="not the address of a page"):
         ring(url)
