@@ -71,6 +71,10 @@ def reconstruct(
         ValueError: for an unknown method, shapes that disagree, views from one side only, data without matter, or
             what the method does not take: views held out, a device, checkpoints, or these views.
     """
+    if isinstance(method, type):
+        raise ValueError(
+            f"method is the class {method.__name__}; give a name or an object, such as {method.__name__}()"
+        )
     chosen = by_name(method)() if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)

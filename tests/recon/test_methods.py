@@ -79,6 +79,18 @@ def test_an_unknown_name_is_refused_with_the_legal_ones() -> None:
             look("art")
 
 
+@pytest.mark.parametrize("method", [recon.FistaTv, recon.OsSirtTv])
+@pytest.mark.parametrize("weight", [-1e-3, float("nan"), float("inf")])
+def test_a_weight_that_no_total_variation_has_is_refused(method: type[recon.FistaTv], weight: float) -> None:
+    with pytest.raises(ValueError, match="tv_weight must be finite and 0 or more"):
+        method(tv_weight=weight)
+
+
+def test_a_class_in_place_of_a_method_is_refused(projections: NDArray[np.float32]) -> None:
+    with pytest.raises(ValueError, match=r"method is the class R2; give a name or an object, such as R2\(\)"):
+        recon.reconstruct(projections, VIEWS, recon.R2)  # type: ignore[arg-type]
+
+
 def test_every_trait_is_asked_somewhere() -> None:
     assert methods.with_trait("direct") == ("fbp",)
     for trait in (f.name for f in fields(Traits)):

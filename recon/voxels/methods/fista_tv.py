@@ -40,6 +40,10 @@ class FistaTv:
     tv_weight: float = 1e-3
     tv_steps: int = 5
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.tv_weight < math.inf:
+            raise ValueError(f"tv_weight must be finite and 0 or more, got {self.tv_weight}")
+
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_iterative(self, problem, control)
 
