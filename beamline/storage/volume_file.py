@@ -105,7 +105,8 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
             header = Nifti1Header.from_fileobj(file, check=False)
             dtype, size = _checked_nifti(path, header)
             _check_size(path, size)
-            values = np.asarray(header.raw_data_from_fileobj(file)).T
+            stored = np.asarray(header.raw_data_from_fileobj(file))  # [x, y, z], then any axes of length 1
+            values = stored.T.reshape(header["dim"][3:0:-1])
     except (EOFError, HeaderDataError, WrapStructError, OSError, OverflowError, ValueError, zlib.error) as error:
         raise DataError(
             f"{path} cannot be read as NIfTI: it is cut or damaged ({str(error).splitlines()[0]})."

@@ -57,6 +57,14 @@ def test_nifti_is_read_whatever_its_type_and_byte_order(tmp_path: Path, order: s
     assert spacing == pytest.approx((0.7, 0.6, 0.5))
 
 
+@pytest.mark.parametrize("axes", [3, 4, 5, 7])
+def test_axes_of_length_one_after_the_third_are_no_axes_of_the_volume(tmp_path: Path, axes: int) -> None:
+    (tmp_path / "v.nii").write_bytes(nifti(dim=(axes, 4, 3, 2, 1, 1, 1, 1)))
+    read, spacing = read_volume(tmp_path / "v.nii")
+    np.testing.assert_array_equal(read, VALUES)
+    assert spacing == pytest.approx((0.7, 0.6, 0.5))
+
+
 def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> None:
     path = tmp_path / "v.nii"
     path.write_bytes(nifti(slope=2.0, intercept=-1000.0, units=3, offset=352.0))
