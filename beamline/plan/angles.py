@@ -73,8 +73,11 @@ def golden(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.
     return start + span * np.mod(np.arange(views, dtype=np.float64) * GOLDEN, 1.0)
 
 
-def from_text(text: str) -> NDArray[np.float64]:
+def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     """Degrees, one a line, in the order of acquisition; # starts a comment, empty lines count for nothing.
+
+    Args:
+        unknown: lines may hold nan, as the log of a scan has it for darks and flats.
 
     Raises:
         ValueError: a line holds no finite number, or there is none; it names the line.
@@ -88,7 +91,7 @@ def from_text(text: str) -> NDArray[np.float64]:
             value = float(word)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not (math.isfinite(value) or (unknown and word.lower() == "nan")):
             raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
         degrees.append(value)
     if not degrees:

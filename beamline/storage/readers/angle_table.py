@@ -31,7 +31,7 @@ def load_angles(angles: Angles) -> NDArray[np.float64]:
 def parse_angles(content: str, name: str) -> NDArray[np.float64]:
     """Radians from text in degrees (see `plan.angles.from_text`); `name` is where it came from."""
     try:
-        return from_text(content)
+        return from_text(content, unknown=True)
     except ValueError as error:
         raise DataError(f"{name}: {error}.") from error
 

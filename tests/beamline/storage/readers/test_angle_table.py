@@ -27,6 +27,12 @@ def test_what_is_no_list_of_angles_is_refused(content: str) -> None:
         parse_angles(content, "a.txt")
 
 
+def test_a_log_may_hold_no_angle_for_darks_and_flats_but_no_other_word() -> None:
+    np.testing.assert_array_equal(parse_angles("nan\nNaN\n0\n180\n", "a.txt"), [np.nan, np.nan, 0, np.pi])
+    with pytest.raises(DataError, match="a.txt: line 2 holds 'inf'"):
+        parse_angles("0\ninf\n", "a.txt")
+
+
 def test_a_missing_angle_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere\.txt cannot be read \(No such file or directory\)\.$"):
         load_angles(tmp_path / "nowhere.txt")
