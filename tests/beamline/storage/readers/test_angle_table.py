@@ -29,7 +29,7 @@ def test_what_is_no_list_of_angles_is_refused(content: str) -> None:
 
 def test_a_log_may_hold_no_angle_for_darks_and_flats_but_no_other_word() -> None:
     np.testing.assert_array_equal(parse_angles("nan\nNaN\n0\n180\n", "a.txt"), [np.nan, np.nan, 0, np.pi])
-    with pytest.raises(DataError, match="a.txt: line 2 holds 'inf'"):
+    with pytest.raises(DataError, match=r"a\.txt: line 2 holds 'inf'"):
         parse_angles("0\ninf\n", "a.txt")
 
 
