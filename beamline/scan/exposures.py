@@ -68,6 +68,14 @@ class _Pass:
     seconds: float
     braked: float = math.inf
 
+    @property
+    def last_due(self) -> float:
+        """When the last trigger of the pass is due, in s since the Unix epoch; inf where that is not known."""
+        ledger, train = self.ledger, self.ledger.train
+        if ledger.last >= 0:
+            return ledger.phase + (train.n - 1 - ledger.last) * ledger.period
+        return math.inf if train.first is None else train.first + (train.n - 1) * train.period
+
     def enter(self, frame: CameraFrame) -> tuple[CameraFrame, int, float]:
         """The frame with its trigger within the block (or EXTRA) and its angle."""
         steady = frame.time < self.braked
@@ -190,6 +198,8 @@ class Exposures:
             elif braking or not self._stop.stopping:
                 if not self._stage.moving():
                     break
+                if not braking and self._clock.now() >= flight.last_due + tail:
+                    break  # no trigger is still to come: what is missing is named with the rest of the pass
                 if not braking:
                     raise InstrumentError(
                         f"{self._camera.name}: no frame for {wait:.3g} s while the stage turned. Check the trigger "

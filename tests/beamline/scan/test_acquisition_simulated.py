@@ -7,7 +7,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from beamline.core.stop import ScanStopped, StopRequest
@@ -78,6 +78,7 @@ class FaultyInstrument:
 
 @settings(max_examples=20, deadline=None)
 @given(PULSES, PULSES, PULSES)
+@example(set(), {0, 17, 18, 19}, {16, 17, 18, 19})
 def test_lost_pulses_ignored_triggers_and_lost_frames_are_all_named(
     pulses_lost: set[int], ignored: set[int], lost: set[int]
 ) -> None:
@@ -91,6 +92,22 @@ def test_lost_pulses_ignored_triggers_and_lost_frames_are_all_named(
     assert acquisition.missing == [i for i in range(N) if i not in kept]
     assert isinstance(error, LedgerError) if acquisition.missing else error is None
     assert instrument.stage.position() == 0.0
+    assert not instrument.shutter.is_open()
+    instrument.stage.close()
+
+
+@pytest.mark.parametrize("silent", [7, 12, 20])
+def test_a_camera_that_is_silent_at_the_end_of_a_pass_has_its_missing_frames_named(silent: int) -> None:
+    """Up to the patience for a frame (2 s, 13 periods); a camera that is silent for longer ends the scan."""
+    last = set(range(N - silent, N))
+    instrument = FaultyInstrument(set(), set(), last)
+    acquisition, frames, error = instrument.scan(StopRequest())
+    assert len(frames) == N - silent
+    if silent == 20:
+        assert "no frame for 2" in str(error)
+    else:
+        assert acquisition.missing == sorted(last)
+        assert isinstance(error, LedgerError)
     assert not instrument.shutter.is_open()
     instrument.stage.close()
 
