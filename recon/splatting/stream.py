@@ -23,7 +23,7 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import place
+from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
 
@@ -263,7 +263,7 @@ class StreamingFit:
     def _place_first(self) -> None:
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        field = Grid.for_fit(self._template, self._grid)
+        field = Grid.for_fit(self._template, self._grid, wider=leaves_the_field(data, geometry))
         placed = place(data, geometry, field, self._count, self._rng)
         self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
         self._state = fit.init(placed, self._rng)

@@ -19,7 +19,7 @@ from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import place
+from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.optimise import FitState
 from recon.splatting.polish import polish
 from recon.splatting.problem import FitProblem, coarser, joined
@@ -94,7 +94,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     if blank.size:
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
     seen, known = geometry.select(used), None if weights is None else weights[used]
-    field_grid = Grid.for_fit(geometry, problem.grid)
+    field_grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))
     joined(seen, settings.coarse)  # refuses what cannot be joined before anything is computed
     if control.resume is None:
         state, n_start, unit = _first_state(data[used], seen, field_grid, method, problem.seed, backend)

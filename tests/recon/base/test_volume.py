@@ -90,6 +90,15 @@ def test_small_shifts_leave_the_matching_volume_the_size_of_the_detector() -> No
     assert (box.edges[0] <= volume.edges[0]).all() and (volume.edges[1] <= box.edges[1]).all()
 
 
+def test_a_fit_of_a_wider_sample_gets_a_wider_box() -> None:
+    grid = Grid((10, 30, 30))
+    views = Geometry.parallel(TURN, (10, 30))
+    assert Grid.for_fit(views, grid, wider=True) == Grid((10, 36, 36))
+    near = Geometry.cone(TURN, (10, 30), 1.0, 23.0, 23.0)
+    field, box = Grid.for_fit(near, grid), Grid.for_fit(near, grid, wider=True)
+    assert field.shape[1] < box.shape[1] < 36 and np.hypot(*box.edges[1][:2]) < near.sod
+
+
 def test_a_volume_of_no_stated_size_shows_all_heights_that_jumping_views_see() -> None:
     views = Geometry.parallel(TURN, (10, 32), shifts=np.resize([[0.0, 10.0], [0.0, -10.0]], (48, 2)))
     result = reconstruct(project(_sample(9.0, 12.0), views).numpy(), views, "fbp")

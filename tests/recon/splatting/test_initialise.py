@@ -8,8 +8,9 @@ import pytest
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import morton_order, place, sample_gaussians, scale_to_data
+from recon.splatting.initialise import leaves_the_field, morton_order, place, sample_gaussians, scale_to_data
 from recon.splatting.splat import project
+from recon.voxels.projector import Projector
 from tests.recon.conftest import Make
 
 
@@ -39,6 +40,30 @@ def test_more_sit_where_the_density_changes(rng: np.random.Generator) -> None:
 def test_nothing_is_placed_outside_the_field(rng: np.random.Generator) -> None:
     placed = sample_gaussians(_ball(), 400, rng, field_radius=2.0)
     assert np.hypot(*placed.means.numpy()[:, :2].T).max() < 2.0 + 0.5
+
+
+@pytest.mark.parametrize(("half", "leaves"), [(8.0, False), (10.0, False), (16.0, True), (30.0, True)])
+def test_a_sample_wider_than_the_field_is_noticed(half: float, leaves: bool) -> None:
+    angles = np.linspace(0, np.pi, 8, endpoint=False)
+    views = Geometry.parallel(angles, (3, 24))
+    u = np.arange(24) - 11.5
+    chords = 2 * np.sqrt(np.maximum(half**2 - u**2, 0)).astype(np.float32)
+    assert leaves_the_field(np.broadcast_to(chords, (8, 3, 24)), views) == leaves
+
+
+def test_the_edge_near_an_axis_off_the_middle_does_not_count() -> None:
+    views = Geometry.parallel(np.linspace(0, 2 * np.pi, 8, endpoint=False), (3, 24), axis_col=4.0)
+    chords = 2 * np.sqrt(np.maximum(15.0**2 - (np.arange(24) - 4.0) ** 2, 0)).astype(np.float32)
+    assert chords[0] > 0 and not leaves_the_field(np.broadcast_to(chords, (8, 3, 24)), views)
+
+
+def test_a_sample_wider_than_the_field_gets_gaussians_up_to_the_corners(rng: np.random.Generator) -> None:
+    views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (4, 24))
+    wide, narrow = Grid((4, 24, 24)), Grid((4, 12, 12))
+    for grid, corners in ((wide, True), (narrow, False)):
+        data = Projector(views, grid).forward(np.ones(grid.shape, np.float32))
+        means = place(data, views, wide, 500, rng).means.numpy()
+        assert bool((np.hypot(*means[:, :2].T) > 12.5).any()) == corners
 
 
 def test_places_scatter_over_their_voxel_whatever_its_shape(rng: np.random.Generator) -> None:
