@@ -19,7 +19,7 @@ from recon.splatting.r2 import DEFAULT_STEPS
 
 SETTINGS = {
     "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
-    "early_stop": "early_stop", "polish": "polish", "iterations": "iterations", "tv_weight": "tv_weight",
+    "early_stop": "early_stop", "finish": "finish", "iterations": "iterations", "tv_weight": "tv_weight",
 }  # fmt: skip
 """Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
@@ -30,9 +30,9 @@ _TRAITS = {
 
 _PLANS = ("budget", "quality")
 _TIMED = ("steps", "seconds", "gaussians")
-_OF_A_FIT = (*_TIMED, "start", "loss", "device", "early_stop", "polish", "checkpoint", "resume")
+_OF_A_FIT = (*_TIMED, "start", "loss", "device", "early_stop", "finish", "checkpoint", "resume")
 # The options that exclude each of those that choose a plan.
-_CHOSEN = {"budget": ("quality", *_OF_A_FIT), "quality": ("budget", *_TIMED, "polish")}
+_CHOSEN = {"budget": ("quality", *_OF_A_FIT), "quality": ("budget", *_TIMED, "finish")}
 _FINISHED = tuple(name for name in _OF_A_FIT if name not in _TIMED)  # of scans that are finished only
 
 
@@ -161,11 +161,10 @@ _OPTIONS = (
         "leaves none.",
     ),
     click.option(
-        "--polish",
+        "--finish",
         type=click.IntRange(min=0),
-        default=0,
-        show_default=True,
-        help=f"Sweeps on voxels after the fit ({_of('polish')}), which sharpen edges: 3 gain 0.3 to 2 dB.",
+        help=f"Sweeps on voxels after the fit ({_of('finish')}), which bring back edges, cracks and pores. Default: 6; "
+        "0: none.",
     ),
     click.option(
         "--checkpoint",

@@ -125,7 +125,7 @@ def within(
     end = begin + budget * (1 - _RESERVE) - fill
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     control = RunControl(should_stop=lambda: stopped() or now() >= end, on_progress=on_progress, now=now)
-    fit = R2(seconds=max(0.0, end - now()), gaussians=placed)
+    fit = R2(seconds=max(0.0, end - now()), gaussians=placed, finish=0)  # the time is for the fit
     result = recon.reconstruct(
         data, geometry, fit, grid=grid, seed=seed, use=DataUse(held_out=held_out), control=control
     )  # fmt: skip

@@ -203,12 +203,15 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
     started_from = int(result.settings["gaussians_at_start"])
     if options.quality is not None:
         chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
-        chosen += f", {method.polish} sweeps on voxels" if method.polish else ""
     if isinstance(asked, int) and resume is None and started_from < asked:
         job.warn(f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more.")
     result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     # The sweeps follow the last step, and can be stopped as well.
-    early = job.stop_latch.stopped if method.polish else job.stop_latch.cut(result.history[-1].step, steps)
+    early = (
+        job.stop_latch.stopped
+        if method.finish_sweeps(prepared.geometry)
+        else job.stop_latch.cut(result.history[-1].step, steps)
+    )
     resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return job.outcome(result, early, chosen, **resumed)
 

@@ -27,7 +27,7 @@ class ReconOptions:
         selection: which part of the scan, and its correction.
         method: with its settings; `R2.seconds` of a followed scan count from its end.
         budget: s for everything from line integrals to volume; chooses the method and all settings.
-        quality: a preset instead of the fit's steps, Gaussians and polish.
+        quality: a preset instead of the fit's steps, Gaussians.
         device: to compute on.
         checkpoints: of the fit's state.
         filter: of the FBP that the volume is compared with.

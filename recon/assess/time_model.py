@@ -57,18 +57,16 @@ class Preset:
     Attributes:
         steps: number of steps of the fit.
         share: Gaussians at the start, relative to the default number for the volume.
-        polish: sweeps on voxels after the fit.
     """
 
     steps: int
     share: float
-    polish: int = 0
 
 
 PRESETS: dict[Quality, Preset] = {
     "preview": Preset(125, 0.5),
     "standard": Preset(1000, 1.0),
-    "best": Preset(2000, 2.0, 3),
+    "best": Preset(2000, 2.0),
 }
 
 

@@ -41,6 +41,7 @@ _WILD, _WILD_VIEWS = 10.0, 0.1
 # air of a measured walnut is 0.07 of it.
 _FARTHEST, _EMPTY = 0.95, 0.15
 
+_SWEEP_WEIGHT = 0.004  # density units
 _SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
 
 
@@ -128,7 +129,7 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     """
     straight, projections = geometry.straightened(), without_wild_pixels(projections)
     if start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles)):
-        sweeps = OsSirtTv(iterations=_SWEEPS, momentum=True)
+        sweeps = OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True)
         return solve(sweeps, Projector(straight, grid), projections)
     if geometry.is_cone:
         return Volume(fdk(projections, straight, grid, "hann"), grid)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
+from recon.base.noise import noise_level
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
@@ -172,17 +173,6 @@ def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) ->
         data, geometry, problem.grid, problem.unit, problem.backend,
         weights=weights, loss=loss, ssim_weight=ssim_weight,
     )  # fmt: skip
-
-
-def noise_level(projections: F32) -> float:
-    """Standard deviation of the noise of a pixel, from second differences along the rows, which smooth matter leaves
-    small: their median absolute value over 0.6745 √6. 0 for fewer than three columns."""
-    cols = projections.shape[-1]
-    if cols < 3:
-        return 0.0
-    some = projections[:: max(1, len(projections) // 8)]
-    bends = some[..., 2:] - 2 * some[..., 1:-1] + some[..., :-2]
-    return float(np.median(np.abs(bends))) / (0.6745 * 6**0.5)
 
 
 def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> FitProblem:

@@ -12,6 +12,7 @@ from recon.assess.time_model import PRESETS, Quality
 from recon.base.geometry import Geometry
 from recon.base.method import PRECISION, Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
 from recon.splatting.density_control import DensityPolicy
+from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start
 from recon.splatting.settings import FitSettings
@@ -40,8 +41,9 @@ class R2:
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
             that had it lowest.
-        polish: sweeps over the views after the fit that add on voxels what Gaussians cannot describe, see
-            `polish.polish`; the result's `gaussians` stay the model as it was fitted.
+        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None: 6, or
+            none for rolled or tilted views, which the voxel projector does not take. The result's `gaussians` stay the
+            model as it was fitted.
         fit: weights, rates and limits.
     """
 
@@ -55,7 +57,7 @@ class R2:
     gaussians: int | Gaussians | None = None
     start: Start = "fbp"
     early_stop: bool = False
-    polish: int = 0
+    finish: int | None = None
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:
@@ -63,8 +65,8 @@ class R2:
             raise ValueError(f"start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
         if self.steps is not None and operator.index(self.steps) < 0:
             raise ValueError(f"steps must be 0 or more, got {self.steps}")
-        if operator.index(self.polish) < 0:
-            raise ValueError(f"polish must be 0 sweeps or more, got {self.polish}")
+        if self.finish is not None and operator.index(self.finish) < 0:
+            raise ValueError(f"finish must be 0 sweeps or more, got {self.finish}")
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
             raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
 
@@ -72,6 +74,12 @@ class R2:
     def planned_steps(self) -> int | None:
         """Steps that end the fit; None where `seconds` alone do."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
+
+    def finish_sweeps(self, geometry: Geometry) -> int:
+        """Sweeps of the finish on these views."""
+        if self.finish is None:
+            return SWEEPS if geometry.is_straight else 0
+        return self.finish
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_fit(self, problem, control)
@@ -87,10 +95,10 @@ class R2:
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, now=now)
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """With the steps, Gaussians and polish of a preset, for a grid that is worth `default_count` Gaussians."""
+        """With the steps and Gaussians of a preset, for a grid that is worth `default_count` Gaussians."""
         preset = PRESETS[quality]
         count = max(1, round(preset.share * default_count))
-        return replace(self, steps=preset.steps, gaussians=count, polish=preset.polish)
+        return replace(self, steps=preset.steps, gaussians=count)
 
     def toy(self) -> Self:
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)

@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
+from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.optimise import FitState
-from recon.splatting.polish import polish
 from recon.splatting.problem import FitProblem, coarser, joined
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
+from recon.voxels.projector import data_residual
 
 if TYPE_CHECKING:
     from recon.splatting.r2 import R2
@@ -80,9 +81,10 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     """
     now, settings, geometry = control.now, method.fit, problem.geometry
     begin = now()
-    if method.polish and not geometry.is_straight:
+    sweeps = method.finish_sweeps(geometry)
+    if sweeps and not geometry.is_straight:
         raise ValueError(
-            "polish works on voxels, whose projector takes straight views only: these are rolled or tilted"
+            "finish works on voxels, whose projector takes straight views only: these are rolled or tilted"
         )
     held_out = tuple(problem.use.held_out)
     backend = backend_for(problem.device)
@@ -154,17 +156,28 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     if tracker.kept:
         state = state_from(tracker.kept, backend)
     volume, model = fit.volume_of(state, problem.grid, settings, backend), fit.gaussians_of(state, backend)
-    if method.polish:
+    if control.should_stop is not None and control.should_stop():
+        sweeps = 0
+    if sweeps:
         fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
-        volume = polish(volume, model, fitted, method.polish, settings, control.should_stop)
+        finished = finish(volume, model, fitted, sweeps, settings, control.should_stop)
+        if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
+            sweeps = 0
+        else:
+            volume = finished
     record = {
         **asdict(settings), "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,
-        "polish": method.polish, "tv_weight": tv_weight(settings, fine, state.limit),
+        "finish": sweeps, "tv_weight": tv_weight(settings, fine, state.limit),
         "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
     checkpoint = arrays_of(last, backend) | tracker.arrays()
     return MethodResult(volume, record, tuple(history), model, checkpoint)
+
+
+def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
+    """The finished volume explains the views held out worse than the fit's by more than 0.1 dB."""
+    return data_residual(finished, unseen, views) > 10 ** (0.1 / 20) * data_residual(fitted, unseen, views)
 
 
 def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

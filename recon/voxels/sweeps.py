@@ -22,6 +22,8 @@ F32 = NDArray[np.float32]
 # left out: their corrections would be divided by almost zero.
 _LEAST = 1e-3
 
+_LOOKED_AT = 9  # views of a sweep whose residual is kept
+
 
 def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
     """View indices of each subset: neighbours in angle are in different subsets, so that each covers all directions."""
@@ -34,7 +36,8 @@ class Sweeps:
     """Passes over all views, subset by subset. Memory: two volumes, and twice the projections.
 
     Attributes:
-        column_sums: [y, x, z], the largest that a subset has, 0 where too small.
+        pace: of a sweep: a typical step along the gradient of ½||A x - p||² (rays weighed).
+        residual: p - A x of some views of the last sweep [view, col, row], times the root of their weight (NaN: 0).
     """
 
     def __init__(
@@ -57,6 +60,9 @@ class Sweeps:
                 scale *= rays
             self._parts.append((part, measured, rays, scale))
         _inverse(self._step)
+        scales = sum(float(part[3].sum(dtype=np.float64)) for part in self._parts)
+        weights = data.size if weight is None else float(weight.sum(dtype=np.float64))
+        self.pace = float(self._step[self._step > 0].mean(dtype=np.float64)) * scales / weights if scales > 0 else 0.0
 
     def run(self, x: F32, relaxation: float, nonnegative: bool, rng: np.random.Generator | None) -> float:
         """One sweep over x [y, x, z], in place, the subsets in random order (None: as given).
@@ -65,14 +71,24 @@ class Sweeps:
             Σ weight (A x - p)², each ray counted before its own correction.
         """
         order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
-        total = 0.0
+        total, seen = 0.0, []
         for index in order:
             part, data, weight, scale = self._parts[index]
             model = part.forward_lines(x)
+            some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
+            seen.append(whitened(data[some] - model[some], None if weight is None else weight[some]))
             total += misfit(data, model, weight, scale)
             part.adjoint_lines(model, self._gradient)
             add_product(x, relaxation, self._step, self._gradient, nonnegative)
+        self.residual = np.concatenate(seen)
         return total
+
+
+def whitened(residual: F32, weight: F32 | None) -> F32:
+    """The residual times the root of each ray's weight; NaN where that is 0."""
+    if weight is None:
+        return residual
+    return np.where(weight > 0, residual * np.sqrt(weight), np.float32(np.nan)).astype(np.float32, copy=False)
 
 
 def _inverse(sums: F32) -> F32:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.method import TrialSettings
 from recon.kernels.cpu.vectors import combine, dot, misfit
+from recon.voxels.fbp import Filter
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import Sweeps
 
@@ -27,7 +28,8 @@ class VoxelProblem:
         nonnegative: voxels below zero are clipped.
         rng: for the order of views and subsets.
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
-        direct: the volume [y, x, z] of filtered back-projection, computed when asked for; None where it cannot be.
+        direct: the volume [y, x, z] of filtered back-projection with this filter, when asked for; None where it
+            cannot be.
     """
 
     projector: Projector
@@ -36,12 +38,16 @@ class VoxelProblem:
     nonnegative: bool
     rng: np.random.Generator
     go_on: Callable[[int, float], bool]
-    direct: Callable[[], F32 | None]
+    direct: Callable[[Filter], F32 | None]
 
     @property
     def scale(self) -> float:
         """||p||, rays weighed."""
         return math.sqrt(misfit(self.data, np.zeros_like(self.data), self.weight))
+
+    def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
+        """Data and weights of some views; the projector stays that of all views."""
+        return replace(self, data=self.data[views], weight=None if self.weight is None else self.weight[views])
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
         """Sweeps over all views in these subsets."""

@@ -74,7 +74,8 @@ def test_a_small_box_holds_what_the_whole_volume_holds_there(noisy: np.ndarray) 
     # The matter outside the box is in the views, so it must be in the model.
     z, y, x = GRID.coordinates()
     box = recon.Grid((6, 12, 10), PITCH, centre=(float(z[9:15].mean()), float(y[20:32].mean()), float(x[5:15].mean())))
-    whole, part = (recon.reconstruct(noisy, VIEWS, R2(steps=60), grid=grid).volume.data for grid in (GRID, box))
+    fit = R2(steps=60, finish=0)
+    whole, part = (recon.reconstruct(noisy, VIEWS, fit, grid=grid).volume.data for grid in (GRID, box))
     np.testing.assert_allclose(part, whole[9:15, 20:32, 5:15], atol=1e-3 * whole.max())
 
 
@@ -202,7 +203,7 @@ def test_each_argument_but_the_data_and_hooks_is_checked_against_the_method() ->
 
 @pytest.mark.parametrize(
     ("method", "iterations", "margin"),
-    [("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0), ("fista-tv", 60, 3.0),
+    [("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0), ("fista-tv", 10, 3.0),
      ("os-sirt-tv", 20, 3.0)],
 )  # fmt: skip
 def test_classical_methods_by_the_same_call_beat_fbp(

@@ -151,6 +151,29 @@ def _gradient(x: F32, smoothing: float, weights: Weights, fields: F32, out: F32,
         sums[run] = total
 
 
+@njit(**OPTIONS)
+def _total_variation(x: F32, weights: Weights, sums: NDArray[np.float64]) -> None:
+    na, nb, nc = x.shape
+    w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
+    for i in prange(na):
+        total = np.float64(0)
+        for j in range(nb):
+            row, next_plane, next_row = x[i, j], x[min(i + 1, na - 1), j], x[i, min(j + 1, nb - 1)]
+            line = _f(0)
+            for k in range(nc):
+                d0, d1, d2 = next_plane[k] - row[k], next_row[k] - row[k], row[min(k + 1, nc - 1)] - row[k]
+                line += np.sqrt((w0 * d0) ** 2 + (w1 * d1) ** 2 + (w2 * d2) ** 2)
+            total += np.float64(line)
+        sums[i] = total
+
+
+def total_variation(x: F32, weights: Weights) -> float:
+    """Σ |D x| of x [a, b, c]."""
+    sums = np.empty(x.shape[0], np.float64)
+    _total_variation(x, weights, sums)
+    return float(sums.sum())
+
+
 def gradient(x: F32, smoothing: float, weights: Weights, out: F32) -> float:
     """Gradient of Σ sqrt(|D x|² + smoothing²) into `out`; returns its 2-norm.
 

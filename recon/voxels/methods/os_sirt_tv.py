@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
 from recon.voxels.iterative import run_iterative
+from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iteration_trials
@@ -24,8 +25,8 @@ class OsSirtTv:
     """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
 
     Attributes:
-        tv_weight: the threshold of that step in density units. Best of 0.002, 0.004 and 0.008 for 60 views, for a
-            measured walnut (0.15 to 0.25 dB to its neighbours) and a simulated battery (1.0 to 1.5 dB).
+        tv_weight: None chooses it by the noise of the data and goes on doing so, see `NoiseBalance`; a number is the
+            threshold of that step in density units.
         momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
             167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
             -0.1 and -1.0 dB: noise comes in sooner, too.
@@ -38,12 +39,12 @@ class OsSirtTv:
 
     iterations: int = 40
     subsets: int = 9
-    tv_weight: float = 0.004
+    tv_weight: float | None = None
     tv_steps: int = 5
     momentum: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.tv_weight < math.inf:
+        if self.tv_weight is not None and not 0 <= self.tv_weight < math.inf:
             raise ValueError(f"tv_weight must be finite and 0 or more, got {self.tv_weight}")
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
@@ -55,12 +56,17 @@ class OsSirtTv:
         sweeps = problem.sweeps(interleaved(projector, self.subsets))
         weights = difference_weights(projector.grid)
         prox = TotalVariationProx(x.shape, weights, problem.nonnegative, self.tv_steps)
-        scale = problem.scale
+        scale, balance = problem.scale, None
         ahead = Momentum(x) if self.momentum else None
         for k in range(self.iterations):
             error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
-            # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
-            prox(x, self.tv_weight * density_unit(x))
+            if self.tv_weight is None:
+                balance = balance or NoiseBalance.of(problem, x, modelled=False)
+                balance.after_sweep(sweeps.residual)
+                prox(x, float(balance.value * sweeps.pace))
+            else:
+                # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
+                prox(x, self.tv_weight * density_unit(x))
             go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
             if not go_on or k + 1 == self.iterations:
                 break

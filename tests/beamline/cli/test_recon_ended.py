@@ -119,9 +119,19 @@ def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
 
 def test_a_fit_that_is_interrupted_in_its_last_step_is_complete(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _signal_at_step(monkeypatch, signal.SIGINT, {20})
-    result = beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--no-report")
+    result = beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--finish", "0", "--no-report")
     assert result.exit_code == 0, result.output
     assert "ended_early" not in read_reconstruction(folder / "scan_r2.h5").parameters
+
+
+def test_a_fit_that_is_interrupted_before_its_finish_has_ended_early(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _signal_at_step(monkeypatch, signal.SIGINT, {20})
+    result = beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 4, result.output
+    parameters = read_reconstruction(folder / "scan_r2.h5").parameters
+    assert parameters["ended_early"] and parameters["finish"] == 0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")

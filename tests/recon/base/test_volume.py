@@ -27,7 +27,7 @@ def _sample(width: float, height: float, seed: int = 0) -> Gaussians:
 
 
 def _fitted(data: np.ndarray, views: Geometry, grid: Grid | None = None) -> Reconstruction:
-    return reconstruct(data, views, R2(steps=60, gaussians=600), grid=grid)
+    return reconstruct(data, views, R2(steps=60, gaussians=600, finish=0), grid=grid)
 
 
 def test_a_shift_of_all_views_is_fitted_as_an_axis_elsewhere() -> None:

@@ -185,6 +185,17 @@ def test_fista_reaches_the_minimum_of_a_slow_reference() -> None:
     assert value(found.data.astype(np.float64)) == pytest.approx(value(x), rel=1e-3)
 
 
+def test_subsets_come_near_the_minimum_in_fewer_iterations() -> None:
+    projector, _, views = parallel_case(n_views=40, noise=0.03)
+    whole, few, subsets = (
+        solve(FistaTv(n, tv_weight=2e-3, subsets=m, tv_steps=5), projector, views).data
+        for n, m in ((200, 1), (4, 1), (4, 5))
+    )
+    scale = np.linalg.norm(whole)
+    assert np.linalg.norm(subsets - whole) < 0.1 * scale
+    assert np.linalg.norm(subsets - whole) < 0.5 * np.linalg.norm(few - whole)
+
+
 def test_asd_pocs_has_less_variation_at_the_residual_of_sart() -> None:
     projector, truth, views = parallel_case(n_views=6, noise=0.02)
     plain = solve(Sart(iterations=12, decay=0.9999), projector, views)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
+from recon.kernels.cpu.tv import total_variation as total_variation_cpu
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from tests.recon.voxels.tv_reference import total_variation, transposed_differences
 
@@ -65,3 +66,9 @@ def test_no_threshold_only_clips() -> None:
 def test_long_voxels_weigh_differences_by_their_length() -> None:
     assert difference_weights(Grid((2, 3, 4), 0.5, slice_pitch=2.0)) == (1.0, 1.0, 0.25)
     assert difference_weights(Grid((2, 3, 4), 0.5)) == (1.0, 1.0, 1.0)
+
+
+def test_the_sum_of_changes_equals_the_reference(rng: np.random.Generator) -> None:
+    x, weights = rng.normal(size=(7, 8, 9)).astype(np.float32), (1.0, 1.0, 0.6)
+    assert total_variation_cpu(x, weights) == pytest.approx(total_variation(x.astype(np.float64), weights), rel=1e-5)
+    assert total_variation_cpu(np.ones((1, 2, 1), np.float32), weights) == 0

@@ -1,0 +1,85 @@
+"""Ordered-subset FISTA with total variation, from any first volume."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.kernels.cpu.vectors import combine, misfit
+from recon.voxels.noise_balance import NoiseBalance
+from recon.voxels.projector import Projector
+from recon.voxels.sweeps import interleaved, whitened
+from recon.voxels.tv import TotalVariationProx, difference_weights
+from recon.voxels.voxel_problem import Momentum, VoxelProblem, largest_eigenvalue
+
+F32 = NDArray[np.float32]
+
+_LOOKED_AT = 9  # views of a sweep whose residual is looked at
+_LEAST_VIEWS = 8  # of a subset: fewer have other eigenvectors than all views, and the steps disagree
+
+
+def ordered_fista(
+    problem: VoxelProblem,
+    x: F32,
+    weight: NoiseBalance | float,
+    *,
+    sweeps: int,
+    subsets: int,
+    tv_steps: int,
+) -> F32:
+    """min ½||A x - p||² + μ TV(x), x >= 0, by steps from a subset of the views each, with momentum and restarts.
+
+        x <- prox_{μ/L TV}(y + (m / L) A_sᵀ W (p_s - A_s y)),    L >= the largest eigenvalue of AᵀWA, m subsets
+
+    (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34, 167; Beck & Teboulle 2009, SIAM J. Imaging Sci. 2, 183;
+    O'Donoghue & Candès 2015). With one subset this is FISTA and converges; with more it is faster by about their
+    number at first, and ends near the minimum. Memory: 7 volumes, 2 x the projections.
+
+    Args:
+        x: [y, x, z], not zero; overwritten.
+        weight: μ, or what chooses it after each sweep.
+        subsets: at most; each has at least eight views.
+        tv_steps: dual steps of each proximal step, which go on where the last ones ended.
+    """
+    projector = problem.projector
+    count = max(1, min(subsets, projector.geometry.n_views // _LEAST_VIEWS))
+    parts = interleaved(projector, count)
+    projectors = [projector.subset(views) if count > 1 else projector for views in parts]
+    step = 1 / _curvature(problem, projectors, parts)
+    prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, tv_steps)
+    gradient, ahead, scale = np.empty_like(x), Momentum(x), problem.scale
+    for k in range(sweeps):
+        error, seen = 0.0, []
+        for at, s in enumerate(problem.rng.permutation(count)):
+            part = problem.of_views(parts[s]) if count > 1 else problem
+            mu = weight.value if isinstance(weight, NoiseBalance) else weight
+            model = projectors[s].forward_lines(x)
+            error += misfit(part.data, model, part.weight)
+            if isinstance(weight, NoiseBalance):
+                some = slice(None, None, max(1, count * len(model) // _LOOKED_AT))
+                seen.append(whitened(model[some].copy(), None if part.weight is None else part.weight[some]))
+            if part.weight is not None:
+                model *= part.weight
+            projectors[s].adjoint_lines(model, gradient)
+            combine(1.0, x, step, gradient, x)
+            prox(x, mu * step / count)
+            if at + 1 < count:
+                ahead(x)
+        if isinstance(weight, NoiseBalance):
+            weight.after_sweep(np.concatenate(seen))
+        if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == sweeps:
+            break
+        ahead(x)
+    return x
+
+
+def _curvature(problem: VoxelProblem, projectors: Sequence[Projector], parts: Sequence[NDArray[np.intp]]) -> float:
+    """The largest eigenvalue of a subset: the one with the most weight."""
+    if problem.weight is None or len(parts) == 1:
+        return largest_eigenvalue(projectors[0], problem.weight)
+    sums = [float(problem.weight[views].sum(dtype=np.float64)) for views in parts]
+    most = int(np.argmax(sums))
+    return largest_eigenvalue(projectors[most], problem.weight[parts[most]])

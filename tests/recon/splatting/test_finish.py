@@ -1,0 +1,138 @@
+"""Finish: a small system by hand, nothing to add where nothing is missing, edges won, boxes inside the field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse, ReconProblem
+from recon.base.volume import Grid, Volume
+from recon.methods import build
+from recon.reconstruction import reconstruct
+from recon.splatting.finish import finish
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.r2 import R2
+from recon.splatting.splat import project, voxelize
+from recon.voxels.direct import Fbp
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+VIEWS = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (8, 40))
+GRID = Grid.matching(VIEWS)
+
+
+def _blob(at: float = 0.0) -> Gaussians:
+    return Gaussians.from_physical(np.array([[at, 2.0, 0.0]]), np.full((1, 3), 3.0), np.array([0.5]), density_unit=0.5)
+
+
+def _box(grid: Grid = GRID) -> F32:
+    """A piece of matter with edges: what Gaussians do badly."""
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    return (0.3 * ((abs(x + 4) < 5) & (abs(y) < 8) & (abs(z) < 3))).astype(np.float32)
+
+
+def _of(g: Gaussians, grid: Grid = GRID) -> Volume:
+    return Volume(voxelize(g, grid).numpy(), grid)
+
+
+def _problem(data: F32, weights: F32 | None = None) -> ReconProblem:
+    return ReconProblem(data, VIEWS, GRID, DataUse(weights), 0, "cpu")
+
+
+def test_a_model_that_explains_all_is_only_smoothed() -> None:
+    g = _blob()
+    volume = _of(g)
+    finished = finish(volume, g, _problem(project(g, VIEWS).numpy()), 3)
+    assert np.abs(finished.data - volume.data).max() < 0.02 * volume.data.max()
+
+
+def test_voxels_add_what_the_gaussians_lack() -> None:
+    g, missing = _blob(8.0), _box()
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)
+    truth = _of(g).data + missing
+    qualities = [psnr(truth, _of(g).data)]
+    qualities += [psnr(truth, finish(_of(g), g, _problem(data), sweeps).data) for sweeps in (1, 3, 9)]
+    assert all(later > before + 1 for before, later in pairwise(qualities))
+    assert qualities[-1] > 30
+
+
+def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
+    # A box without the blob: its views must not be spread over what is inside.
+    g = _blob(12.0)
+    small = Grid((8, 40, 18), 1.0, (0.0, 0.0, -8.0))
+    missing = _box(small)
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, small).forward(missing)
+    finished = finish(_of(g, small), g, _problem(data), 9)
+    assert psnr(missing + _of(g, small).data, finished.data) > 30
+
+
+def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
+    g = _blob(8.0)
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())
+    bad = np.zeros(data.shape, bool)
+    bad[:, 3:5, 7:9] = True
+    volumes = []
+    for value in (np.nan, np.inf):
+        volumes.append(finish(_of(g), g, _problem(np.where(bad, np.float32(value), data)), 2).data)
+    np.testing.assert_array_equal(*volumes)
+    weights = (~bad).astype(np.float32)
+    weighed = finish(_of(g), g, _problem(np.where(bad, np.float32(1), data), weights), 2).data
+    np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)
+
+
+def test_reconstruct_finishes_and_says_so() -> None:
+    data = Projector(VIEWS, GRID).forward(_box())
+    plain, finished = (reconstruct(data, VIEWS, R2(steps=60, gaussians=300, finish=n)) for n in (0, 5))
+    assert psnr(_box(), finished.volume.data) > psnr(_box(), plain.volume.data) + 0.5
+    assert (plain.settings["finish"], finished.settings["finish"]) == (0, 5)
+    # The model is the fit's, whatever voxels add.
+    assert plain.gaussians is not None and finished.gaussians is not None
+    np.testing.assert_array_equal(plain.gaussians.means, finished.gaussians.means)
+
+
+def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
+    views = Geometry.parallel(np.linspace(0, math.pi, 60, endpoint=False), (8, 64))
+    grid = Grid.matching(views)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    tooth = np.where(np.hypot(x, y) < 26, np.float32(0.04), np.float32(0))
+    crack = (abs(x - 6.5) < 1) & (abs(y) < 12)
+    truth = np.where(crack, np.float32(0), tooth)
+    noise = np.random.default_rng(7).normal(0, 0.03, (60, 8, 64)).astype(np.float32)
+    data = Projector(views, grid).forward(truth) + noise
+
+    def depth(volume: F32) -> float:
+        inside = volume[2:6][crack[2:6]].mean()
+        beside = volume[2:6][(abs(abs(x - 6.5) - 5) < 1.6)[2:6] & (abs(y) < 12)[2:6]].mean()
+        return float(1 - inside / beside)
+
+    fit = R2(steps=200, gaussians=600, finish=0)
+    filled, opened = (depth(reconstruct(data, views, replace(fit, finish=n)).volume.data) for n in (0, None))
+    assert filled < 0.6
+    assert opened > 0.85
+
+
+def test_single_rays_gone_wild_do_not_spoil_what_the_fit_withstood() -> None:
+    g = _blob(8.0)
+    data = project(g, VIEWS).numpy() + 0.1 * Projector(VIEWS, GRID).forward(_box())
+    wild = data.copy()
+    wild[4, 3, 11] = 3 * data.max()
+    clean, found = (finish(_of(g), g, _problem(views)).data for views in (data, wild))
+    assert np.abs(found - clean).max() < 0.1 * clean.max()
+
+
+def test_what_cannot_be_is_refused() -> None:
+    data = Projector(VIEWS, GRID).forward(_box())
+    with pytest.raises(ValueError, match="finish must be 0 sweeps or more, got -1"):
+        reconstruct(data, VIEWS, R2(steps=1, finish=-1))
+    with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'finish' \(r2 has\)"):
+        build(Fbp, {"finish": 2})
+    leaning = Geometry.parallel(VIEWS.angles, VIEWS.detector_shape, tilt=0.1)
+    with pytest.raises(ValueError, match=r"finish .* rolled or tilted"):
+        reconstruct(data, leaning, R2(steps=1, finish=2))

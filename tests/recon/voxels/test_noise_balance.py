@@ -1,0 +1,81 @@
+"""The weight of total variation by noise: its first value, how it follows the residual, and what it makes of a scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.iterative import solve
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.noise_balance import NoiseBalance
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 48, endpoint=False), (12, 64))
+GRID = Grid.matching(VIEWS)
+
+
+def _residual(sigma: float) -> F32:
+    return np.random.default_rng(0).normal(0, sigma, (9, 40, 40)).astype(np.float32)
+
+
+def _grains() -> tuple[F32, F32]:
+    """Grains of one density with sharp edges in a disc, and their projections, from voxels of half the size."""
+    rng = np.random.default_rng(8)
+    fine = Grid((24, 128, 128), 0.5)
+    z, y, x = np.meshgrid(*fine.coordinates(), indexing="ij")
+    volume = np.zeros(fine.shape, np.float32)
+    for _ in range(60):
+        radius, angle = 24 * np.sqrt(rng.random()), 2 * np.pi * rng.random()
+        centre = radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-6, 6)
+        near = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2
+        volume[near < rng.uniform(2, 6) ** 2] = 0.05
+    views = Geometry.parallel(VIEWS.angles, (24, 128), 0.5)
+    data = Projector(views, fine).forward(volume).reshape(48, 12, 2, 64, 2).mean(axis=(2, 4))
+    return volume.reshape(12, 2, 64, 2, 64, 2).mean(axis=(1, 3, 5)), data.astype(np.float32)
+
+
+def test_it_rises_by_the_cube_of_what_the_residual_lacks() -> None:
+    balance = NoiseBalance(first=2.0, noise=1.0)
+    assert balance.value == 2.0
+    balance.after_sweep(_residual(0.8))
+    assert balance.value == pytest.approx(2.0 / 0.8**3, rel=0.05)
+    balance.after_sweep(_residual(1.0))
+    assert balance.value == pytest.approx(2.0, rel=0.05)
+
+
+def test_it_stays_between_its_first_value_and_four_times_that() -> None:
+    balance = NoiseBalance(first=2.0, noise=1.0)
+    values = []
+    for sigma in (30.0, 0.01):
+        balance.after_sweep(_residual(sigma))
+        values.append(balance.value)
+    assert values == [2.0, 8.0]
+
+
+def test_nothing_is_changed_by_a_residual_that_says_nothing() -> None:
+    balance = NoiseBalance(first=2.0, noise=1.0)
+    balance.after_sweep(np.zeros((2, 3, 3), np.float32))
+    assert balance.value == 2.0
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.08])
+@pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=["fista-tv", "os-sirt-tv"])
+def test_its_volume_is_near_that_of_the_best_weight(method: FistaTv | OsSirtTv, sigma: float) -> None:
+    (truth, clean), projector = _grains(), Projector(VIEWS, GRID)
+    data = clean + np.random.default_rng(1).normal(0, sigma, clean.shape).astype(np.float32)
+    found = psnr(truth, solve(method, projector, data).data)
+    scale = {FistaTv: 1e-4, OsSirtTv: 1e-3}[type(method)]
+    by_hand = [psnr(truth, solve(type(method)(tv_weight=scale * w), projector, data).data) for w in (0.3, 1, 3, 10, 30)]
+    assert found > max(by_hand) - 1.0
+
+
+def test_without_noise_there_is_next_to_no_total_variation() -> None:
+    (truth, clean), projector = _grains(), Projector(VIEWS, GRID)
+    found, free = (psnr(truth, solve(FistaTv(tv_weight=w), projector, clean).data) for w in (None, 0.0))
+    assert found > free - 0.5
