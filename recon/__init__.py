@@ -20,6 +20,7 @@ from recon.methods import REGISTRY
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
+    from recon.prep.counts import Counts
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.splatting.r2 import R2
     from recon.voxels.direct import Fbp
@@ -34,6 +35,7 @@ __all__ = [
     "R2",
     "AsdPocs",
     "Cgls",
+    "Counts",
     "DataUse",
     "Fbp",
     "FistaTv",
@@ -50,6 +52,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "Counts": "recon.prep.counts",
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
     **{entry.cls: entry.module for entry in REGISTRY.values()},

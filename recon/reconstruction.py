@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -15,6 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name, with_trait
+from recon.prep.counts import Counts, line_integrals
 from recon.splatting.gaussians import Gaussians
 
 
@@ -42,7 +43,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    projections: ArrayLike | Tensor,
+    projections: ArrayLike | Tensor | Counts,
     geometry: Geometry,
     method: str | Method = DEFAULT,
     *,
@@ -56,7 +57,9 @@ def reconstruct(
 
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
-            finite are filled from their neighbours and weigh nothing.
+            finite are filled from their neighbours and weigh nothing. Or what was counted, where photons are few: the
+            method is given line integrals and weights that carry the likelihood of the counts, see
+            `recon.prep.counts.line_integrals`; `use.weights` multiply them.
         geometry: of these views.
         method: a name (see `recon.methods.names`) for a method with its default settings, or a method with settings
             of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
@@ -79,6 +82,8 @@ def reconstruct(
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)
     _refuse_one_side(geometry)
+    if isinstance(projections, Counts):
+        projections, use = _of_counts(projections, geometry, use)
     data = _line_integrals(projections, geometry)
     begin = control.now()
     found = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
@@ -111,6 +116,17 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
     if foreign:
         owners = ", ".join(f"{what} (of {', '.join(with_trait(trait))})" for what, trait in foreign)
         raise ValueError(f"method {method.name!r} does not take {owners}: leave that out, or choose another method")
+
+
+def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
+    """Line integrals, and their weights beside those that were given."""
+    shape, expected = np.shape(counts.counts), (geometry.n_views, *geometry.detector_shape)
+    if shape != expected:
+        raise ValueError(f"counts have shape {shape}, the geometry says {expected} [view, row, col]")
+    if use.weights is not None and np.shape(use.weights) != shape:
+        raise ValueError(f"weights have shape {np.shape(use.weights)}, the counts {shape}")
+    data, weights = line_integrals(counts)
+    return data, replace(use, weights=weights if use.weights is None else weights * use.weights)
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

@@ -1,0 +1,171 @@
+"""Counts: photons counted behind a sample, and their likelihood as line integrals with weights, for any method.
+
+The logarithm of few counts is biased (E log n < log E n), and zero has none. The likelihood has neither fault.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+# Smoothing of the counts that the likelihood is expanded around, in pixels: from 1, 1.5, 2 and 3 by the error of the
+# expansion on three samples at 10 to 10 000 photons, see docs/exploration.md. So are the other two.
+_SIGMA, _SPREAD = 1.5, 2.0
+_DETAIL = 1.5  # variance over that of counting beyond which a place has detail
+_FEWEST = 0.25  # photons: the least that a ray is taken to expect
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """What a detector counted, and what it counts without the sample and without the beam.
+
+    The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, J. Opt. Soc. Am. A 10, 1014; Yavuz & Fessler
+    1998): (counts - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is
+    variance / gain². Flat and dark are taken as known: means of many frames.
+
+    Attributes:
+        counts: [view, row, col], any real type.
+        flat: counts with the beam and without the sample, [row, col] or [view, row, col].
+        dark: counts without the beam, a number or [row, col].
+        gain: counts a photon, see `photon_transfer`.
+        variance: of a pixel of one dark frame, counts², a number or [row, col]: readout, and photons of no use.
+    """
+
+    counts: ArrayLike
+    flat: ArrayLike
+    dark: ArrayLike = 0.0
+    gain: float = 1.0
+    variance: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.counts)
+        if len(shape) != 3 or 0 in shape:
+            raise ValueError(f"counts must be [view, row, col] with at least one pixel, got shape {shape}")
+        for name, allowed in (
+            ("flat", (shape, shape[1:])), ("dark", ((), shape[1:])), ("variance", ((), shape[1:]))
+        ):  # fmt: skip
+            found = np.shape(getattr(self, name))
+            if found not in allowed:
+                raise ValueError(
+                    f"{name} has shape {found}, counts of shape {shape} take {' or '.join(map(str, allowed))}"
+                )
+        if not 0 < self.gain < np.inf:
+            raise ValueError(f"gain is the counts of one photon, finite and above 0, got {self.gain}")
+        if not np.asarray(self.variance).min() >= 0:
+            raise ValueError(f"variance must be 0 or more, got {np.asarray(self.variance).min()}")
+        if not (np.asarray(self.flat) > np.asarray(self.dark)).any():
+            raise ValueError("the flat is nowhere above the dark: there is no beam")
+
+    def photons(self, view: int) -> tuple[F64, F64, F64]:
+        """Of a view's pixels [row, col]: photons counted and photons without the sample, both above v, and v.
+
+        Pixels where the flat is not above the dark have 0 photons without the sample; NaN counts stay NaN.
+        """
+        dark = np.asarray(self.dark, np.float64)
+        flat = np.asarray(self.flat)
+        bright = np.asarray(flat if flat.ndim == 2 else flat[view], np.float64)
+        counted = (np.asarray(np.asarray(self.counts)[view], np.float64) - dark) / self.gain
+        beam = np.maximum((bright - dark) / self.gain, 0.0)
+        extra = np.broadcast_to(np.asarray(self.variance, np.float64) / self.gain**2, counted.shape)
+        return np.maximum(counted, -extra), beam, extra
+
+
+def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64]:
+    """Line integrals and weights whose weighed squares expand the likelihood to second order, element by element.
+
+    With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
+    Σ λ - n ln λ has at p0 the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information:
+    p~ = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh & Nelder
+    1989, section 2.5). Zero counts are as good as any.
+    """
+    seen = beam * np.exp(-around)
+    return around - (photons - seen) / seen, seen * seen / (seen + extra)
+
+
+def line_integrals(counts: Counts) -> tuple[F32, F32]:
+    """Line integrals and weights [view, row, col] that carry the likelihood of counts to any method.
+
+    Each view is expanded around its own counts, smoothed where they show nothing but the noise of counting (Lee 1980,
+    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). Where counts are many, it is the logarithm, weighed by the counts.
+    The weights are the inverse variances of the line integrals. Pixels that are not finite or have no beam get NaN and
+    weight 0.
+    """
+    shape = np.shape(counts.counts)
+    data, weights = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for view in range(shape[0]):
+        data[view], weights[view] = of_view(*counts.photons(view))
+    if not weights.any():
+        raise ValueError("no pixel has both a beam and a finite count: there is nothing to reconstruct")
+    return data, weights
+
+
+def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
+    """As `line_integrals`, of one view [row, col]: what `Counts.photons` gives."""
+    good = np.isfinite(photons) & (beam > 0)
+    light = np.where(good, beam, 1.0)
+    level = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
+    p, w = expanded(np.where(good, photons, level), light, extra, -np.log(level / light))
+    return np.where(good, p, np.nan), np.where(good, w, 0)
+
+
+def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[float, float]:
+    """Counts a photon, and the variance of a pixel of a dark frame (counts²), from repeated frames [frame, row, col].
+
+    The variance of light grows by `gain` with its mean (photon transfer: Janesick 2007). Differences of successive
+    frames, scaled to equal means, see no fixed pattern and no drift of the beam. Medians over the pixels of what each
+    has see no defects. Blur after the photons (a scintillator's glow, resampling) lowers the variance: then the gain
+    is too small and the photons are too many.
+
+    Args:
+        darks: None: the detector gives 0 without beam, and has no noise of its own.
+
+    Raises:
+        ValueError: for fewer than two frames, or flats whose variance does not grow with the light.
+    """
+    bright, bright_variance = _mean_and_variance(flats, "flats", scaled=True)
+    dark, dark_variance = (
+        (np.zeros(1), np.zeros(1)) if darks is None else _mean_and_variance(darks, "darks", scaled=False)
+    )
+    light, noise = bright - dark, bright_variance - dark_variance
+    lit = light > 0.1 * np.median(light)
+    # A ratio of sums over the pixels with light, without the hundredth with the largest variances: hot ones.
+    lit &= bright_variance <= np.percentile(bright_variance, 99)
+    gain = float(noise[lit].sum() / light[lit].sum()) if lit.any() else 0.0
+    if not gain > 0:
+        raise ValueError(
+            f"the variance of the flats does not grow with their light (gain {gain:.3g} counts a photon): give the gain"
+        )
+    return gain, float(np.median(dark_variance))
+
+
+def _expected(n: F64, beam: F64, extra: F64) -> F64:
+    """Photons expected in each pixel [row, col]: counts smoothed where they show no detail, always above 0."""
+    mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
+    left = 1 - 0.75 / (np.pi * _SIGMA**2)  # of white noise's variance, in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
+    found = _smooth((n - mean) ** 2, _SPREAD) / left
+    counting = _smooth(n + extra, _SPREAD)
+    detail = np.clip(1 - _DETAIL * counting / np.maximum(found, 1e-12), 0, 1)
+    return np.maximum(mean + detail * (n - mean), _FEWEST)
+
+
+def _smooth(image: F64, sigma: float) -> F64:
+    return np.asarray(ndimage.gaussian_filter(image, sigma, mode="nearest"))
+
+
+def _mean_and_variance(frames: ArrayLike, name: str, *, scaled: bool) -> tuple[F64, F64]:
+    """Each pixel's mean and variance over frames, the latter from differences of successive ones."""
+    stack = np.asarray(frames)
+    if stack.ndim != 3 or len(stack) < 2:
+        raise ValueError(f"{name} must be [frame, row, col] with two frames or more, got shape {stack.shape}")
+    mean, total = stack.mean(axis=0, dtype=np.float64), np.zeros(stack.shape[1:])
+    level = stack.mean(axis=(1, 2), dtype=np.float64)
+    factors = level.mean() / level if scaled and level.min() > 0 else np.ones(len(stack))
+    for a, b, fa, fb in zip(stack[:-1], stack[1:], factors[:-1], factors[1:], strict=True):
+        total += (a * fa - b * fb) ** 2
+    return mean, total / (2 * (len(stack) - 1))
