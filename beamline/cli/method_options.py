@@ -163,7 +163,7 @@ _OPTIONS = (
     click.option(
         "--finish",
         type=click.IntRange(min=0),
-        help=f"Sweeps on voxels after the fit ({_of('finish')}), which bring back edges, cracks and pores. Default: 6; "
+        help=f"Sweeps on voxels after the fit ({_of('finish')}), which bring back edges, cracks and pores. Default: 8; "
         "0: none.",
     ),
     click.option(

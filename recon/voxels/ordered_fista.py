@@ -18,7 +18,7 @@ from recon.voxels.voxel_problem import Momentum, VoxelProblem, largest_eigenvalu
 F32 = NDArray[np.float32]
 
 _LOOKED_AT = 9  # views of a sweep whose residual is looked at
-_LEAST_VIEWS = 8  # of a subset: fewer have other eigenvectors than all views, and the steps disagree
+_LEAST_VIEWS = 12  # of a subset: fewer have other eigenvectors than all views, and the steps disagree
 
 
 def ordered_fista(
@@ -41,7 +41,7 @@ def ordered_fista(
     Args:
         x: [y, x, z], not zero; overwritten.
         weight: μ, or what chooses it after each sweep.
-        subsets: at most; each has at least eight views.
+        subsets: at most; each has at least twelve views.
         tv_steps: dual steps of each proximal step, which go on where the last ones ended.
     """
     projector = problem.projector

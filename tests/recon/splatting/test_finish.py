@@ -16,7 +16,7 @@ from recon.base.method import DataUse, ReconProblem
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import finish
+from recon.splatting.finish import finish, ring_offsets
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
@@ -69,7 +69,7 @@ def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
     small = Grid((8, 40, 18), 1.0, (0.0, 0.0, -8.0))
     missing = _box(small)
     data = project(g, VIEWS).numpy() + Projector(VIEWS, small).forward(missing)
-    finished = finish(_of(g, small), g, _problem(data), 9)
+    finished = finish(_of(g, small), g, _problem(data), 16)
     assert psnr(missing + _of(g, small).data, finished.data) > 30
 
 
@@ -116,6 +116,18 @@ def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
     filled, opened = (depth(reconstruct(data, views, replace(fit, finish=n)).volume.data) for n in (0, None))
     assert filled < 0.6
     assert opened > 0.85
+
+
+def test_what_stays_in_a_pixel_over_all_views_is_a_ring_and_what_moves_is_not(rng: np.random.Generator) -> None:
+    rings = np.zeros((6, 50), np.float32)
+    rings[:, 12], rings[2, 30] = 0.5, -0.4
+    noise = rng.normal(0, 0.2, (60, 6, 50)).astype(np.float32)
+    crack = np.zeros((60, 6, 50), np.float32)
+    crack[np.arange(60), :, (25 + 20 * np.cos(np.arange(60) / 10)).astype(int)] = 1.5
+    found = ring_offsets(noise + rings + crack)
+    np.testing.assert_allclose(found[rings != 0], rings[rings != 0], atol=0.12)
+    assert np.count_nonzero(found[rings == 0]) < 0.02 * rings.size
+    assert not ring_offsets((noise + rings)[:10]).any()  # too few views to tell
 
 
 def test_single_rays_gone_wild_do_not_spoil_what_the_fit_withstood() -> None:

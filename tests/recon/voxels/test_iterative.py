@@ -206,7 +206,7 @@ def test_asd_pocs_has_less_variation_at_the_residual_of_sart() -> None:
     assert error(smooth, truth) < error(plain, truth)
 
 
-@pytest.mark.parametrize("method", [FistaTv(tv_weight=2e-3), OsSirtTv(tv_weight=0.01)])
+@pytest.mark.parametrize("method", [FistaTv(iterations=100, tv_weight=2e-3), OsSirtTv(tv_weight=0.01)])
 def test_tv_suits_a_piecewise_constant_object(method: IterativeMethod) -> None:
     projector, truth, views = parallel_case(n_views=7, noise=0.02)
     sirt = error(solve(Sirt(), projector, views), truth)
