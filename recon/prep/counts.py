@@ -92,8 +92,8 @@ def line_integrals(counts: Counts) -> tuple[F32, F32]:
     """Line integrals and weights [view, row, col] that carry the likelihood of counts to any method.
 
     Each view is expanded around its own counts, smoothed where they show nothing but the noise of counting (Lee 1980,
-    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). Where counts are many, it is the logarithm, weighed by the counts.
-    The weights are the inverse variances of the line integrals. Pixels that are not finite or have no beam get NaN and
+    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). Where counts are many, it is the logarithm.
+    The weights are the inverse variances of the line integrals, by the smoothed counts. Pixels that are not finite or have no beam get NaN and
     weight 0.
     """
     shape = np.shape(counts.counts)
@@ -109,8 +109,10 @@ def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
     """As `line_integrals`, of one view [row, col]: what `Counts.photons` gives."""
     good = np.isfinite(photons) & (beam > 0)
     light = np.where(good, beam, 1.0)
-    level = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
-    p, w = expanded(np.where(good, photons, level), light, extra, -np.log(level / light))
+    level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
+    p, _ = expanded(np.where(good, photons, level), light, extra, -np.log(level / light))
+    # Weights that follow each ray's own noise would hide noise from whoever whitens by them.
+    _, w = expanded(smooth, light, extra, -np.log(smooth / light))
     return np.where(good, p, np.nan), np.where(good, w, 0)
 
 
@@ -144,14 +146,14 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
     return gain, float(np.median(dark_variance))
 
 
-def _expected(n: F64, beam: F64, extra: F64) -> F64:
-    """Photons expected in each pixel [row, col]: counts smoothed where they show no detail, always above 0."""
+def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
+    """Photons expected in each pixel [row, col], above 0: counts smoothed where they show no detail, and everywhere."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
     left = 1 - 0.75 / (np.pi * _SIGMA**2)  # of white noise's variance, in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
     found = _smooth((n - mean) ** 2, _SPREAD) / left
     counting = _smooth(n + extra, _SPREAD)
     detail = np.clip(1 - _DETAIL * counting / np.maximum(found, 1e-12), 0, 1)
-    return np.maximum(mean + detail * (n - mean), _FEWEST)
+    return np.maximum(mean + detail * (n - mean), _FEWEST), np.maximum(mean, _FEWEST)
 
 
 def _smooth(image: F64, sigma: float) -> F64:

@@ -49,6 +49,7 @@ def _db(volume: F32, truth: F32) -> float:
 
 
 @pytest.mark.bench
+@pytest.mark.timeout(1800)
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
 def test_few_photons() -> None:
     """dB (volume's sum over the truth's) at each number of photons without the sample; OS-SIRT-TV at its best."""
