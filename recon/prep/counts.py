@@ -92,9 +92,9 @@ def line_integrals(counts: Counts) -> tuple[F32, F32]:
     """Line integrals and weights [view, row, col] that carry the likelihood of counts to any method.
 
     Each view is expanded around its own counts, smoothed where they show nothing but the noise of counting (Lee 1980,
-    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). Where counts are many, it is the logarithm.
-    The weights are the inverse variances of the line integrals, by the smoothed counts. Pixels that are not finite or have no beam get NaN and
-    weight 0.
+    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). Where counts are many, it is the logarithm. The weights are the
+    inverse variances of the line integrals, by the smoothed counts. Pixels that are not finite or have no beam get NaN
+    and weight 0.
     """
     shape = np.shape(counts.counts)
     data, weights = np.empty(shape, np.float32), np.empty(shape, np.float32)

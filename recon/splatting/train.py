@@ -91,7 +91,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     used, kept_back = _split(geometry.n_views, held_out, method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
-        weights = weights / np.float32(np.mean(weights[weights > 0], dtype=np.float64))
+        weights = weights / np.float32(_usual(weights, data))
     blank = kept_back[~data[kept_back].any(axis=(1, 2))]
     if blank.size:
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
@@ -178,6 +178,20 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
 def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
     """The finished volume explains the views held out worse than the fit's by more than 0.1 dB."""
     return data_residual(finished, unseen, views) > 10 ** (0.1 / 20) * data_residual(fitted, unseen, views)
+
+
+def _usual(weights: F32, data: F32) -> float:
+    """The weight of a typical ray through matter: the mean of all that weigh, each as often as its line integral.
+
+    Where rays past the sample weigh most, as by photons, a mean of all rays would leave the sample to total variation.
+    """
+    top = max(float(np.percentile(data.reshape(-1)[:: max(1, data.size // 100_003)], 99)), 0.0)
+    matter, weighed = 0.0, 0.0
+    for view, weight in zip(data, weights, strict=True):
+        depth = np.clip(view, 0, top) * (weight > 0)
+        matter += float(depth.sum(dtype=np.float64))
+        weighed += float((depth * weight).sum(dtype=np.float64))
+    return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))
 
 
 def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
