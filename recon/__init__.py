@@ -20,6 +20,7 @@ from recon.methods import REGISTRY
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
+    from recon.auto import Auto
     from recon.prep.counts import Counts
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.splatting.r2 import R2
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = [
     "R2",
     "AsdPocs",
+    "Auto",
     "Cgls",
     "Counts",
     "DataUse",
@@ -52,6 +54,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "Auto": "recon.auto",
     "Counts": "recon.prep.counts",
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",

@@ -27,7 +27,7 @@ class Reconstruction:
         volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
         seconds: wall time of the reconstruction.
         history: the record of the fit or the iterations, empty for a direct method.
-        method: its name.
+        method: its name; of a choice (`recon.Auto`), that of the method chosen.
         gaussians: the model behind the volume of a fit.
         settings: every parameter that was used.
         checkpoint: the state of a fit, which `RunControl.resume` takes; see `checkpoint.arrays_of`.
@@ -88,7 +88,7 @@ def reconstruct(
     begin = control.now()
     found = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
     return Reconstruction(
-        found.volume, control.now() - begin, found.history, chosen.name, found.gaussians,
+        found.volume, control.now() - begin, found.history, found.method or chosen.name, found.gaussians,
         MappingProxyType(dict(found.settings)), found.checkpoint,
     )  # fmt: skip
 

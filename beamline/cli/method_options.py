@@ -11,6 +11,7 @@ from click.core import ParameterSource
 
 from beamline.cli.options import POSITIVE
 from recon.assess.time_model import PRESETS, parse_budget
+from recon.auto import Auto
 from recon.base.method import Method
 from recon.methods import build, by_name, has_setting, taking, with_trait
 from recon.splatting.initialise import Start
@@ -64,12 +65,19 @@ def method_with(name: str, options: Mapping[str, Any]) -> Method:
     """The method of this name, with those of the options that are settings of it.
 
     Args:
-        name: in `recon.methods`.
+        name: in `recon.methods`, or of `recon.Auto`.
         options: values by option; None stands for the method's own.
     """
+    if name == Auto.name:
+        return Auto()
     method = by_name(name)
     paths = {option: SETTINGS.get(option, option) for option, value in options.items() if value is not None}
     return build(method, {path: options[option] for option, path in paths.items() if has_setting(method, path)})
+
+
+def options_of_a_method(ctx: click.Context) -> list[str]:
+    """Those of the options of methods that the user gave."""
+    return [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
 
 
 def takers(option: str) -> tuple[str, ...]:
@@ -87,10 +95,10 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
 
     Args:
         ctx: of a command with `method_options`; only options that its user gave count.
-        method: its name in `recon.methods`.
+        method: its name, as in `method_with`.
         follow: the scan is still running.
     """
-    given = [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    given = options_of_a_method(ctx)
     if {"steps", "seconds"} <= set(given):
         raise click.UsageError("--steps and --seconds exclude each other. Give one of them.")
     for plan in _PLANS:

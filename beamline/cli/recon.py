@@ -13,7 +13,13 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
-from beamline.cli.method_options import SETTINGS, method_options, method_with, refuse_contradictions
+from beamline.cli.method_options import (
+    SETTINGS,
+    method_options,
+    method_with,
+    options_of_a_method,
+    refuse_contradictions,
+)
 from beamline.cli.options import NOT_NEGATIVE, SEED, json_option
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal, results
@@ -26,6 +32,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
 from drivers.clock import SystemClock
 from recon.assess.time_model import Quality
+from recon.auto import Auto
 from recon.methods import DEFAULT, names
 from recon.voxels.fbp import Filter
 
@@ -42,10 +49,10 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @click.option(
     "-m",
     "--method",
-    type=click.Choice(names()),
-    default=DEFAULT,
-    show_default=True,
-    help="r2: Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels.",
+    type=click.Choice((Auto.name, *names())),
+    help="auto: the one of r2, os-sirt-tv, fista-tv and fbp that predicts views held out best; r2: Gaussians fitted to "
+    "the views; fbp: filtered back-projection; the others: iterations on voxels. Default: auto; r2 with --follow and "
+    "with options of the fit.",
 )
 @selection_options
 @method_options
@@ -82,7 +89,7 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @json_option
 def recon(
     file: Path,
-    method: str,
+    method: str | None,
     budget: float | None,
     quality: Quality | None,
     device: str,
@@ -106,7 +113,10 @@ def recon(
     stops with the volume reached so far (exit code 4), the second discards it.
     """
     settings = {name: values.pop(name) for name in SETTINGS}
-    refuse_contradictions(click.get_current_context(), method, follow)
+    context = click.get_current_context()
+    if method is None:
+        method = DEFAULT if follow or options_of_a_method(context) else Auto.name
+    refuse_contradictions(context, method, follow)
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})

@@ -173,7 +173,10 @@ def _by_method(job: _Job) -> ReconOutcome:
     """Run a method that has no presets and no checkpoints."""
     result = job.run(job.options.method, RunControl(on_progress=job.listener()))
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    return job.outcome(result, job.stop_latch.cut(reached, planned))
+    chosen = ""
+    if "chosen_because" in result.settings:
+        chosen = f"{result.method}: {result.settings['chosen_because']}"
+    return job.outcome(result, job.stop_latch.cut(reached, planned), chosen)
 
 
 def _by_fit(job: _Job, method: R2) -> ReconOutcome:

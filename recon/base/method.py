@@ -107,7 +107,8 @@ class ReconProblem:
 class MethodResult:
     """What a method returns; the attributes are those of `recon.Reconstruction`.
 
-    `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import.
+    `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import. `method` is the name of
+    the method that another one chose.
     """
 
     volume: Volume
@@ -115,6 +116,7 @@ class MethodResult:
     history: tuple[Progress, ...] = ()
     gaussians: Any = None
     checkpoint: Mapping[str, NDArray[Any]] | None = None
+    method: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,114 @@
+"""The automatic choice: what predicts unseen views best, on which part of a scan, and what it says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import recon
+from recon.auto import Auto
+from recon.base.method import MethodResult, ReconProblem, RunControl
+from recon.base.volume import Volume
+from recon.voxels.direct import Fbp
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (40, 32))
+GRID = recon.Grid.matching(VIEWS)
+
+
+@pytest.fixture(scope="module")
+def truth() -> F32:
+    z, y, x = np.meshgrid(*GRID.coordinates(), indexing="ij")
+    ball = np.where(x**2 + (y - 3) ** 2 + (z / 2) ** 2 < 60, np.float32(0.05), np.float32(0))
+    return np.where((abs(x) < 1) & (abs(y) < 6), np.float32(0), ball)
+
+
+@pytest.fixture(scope="module")
+def data(truth: F32) -> F32:
+    noise = np.random.default_rng(0).normal(0, 0.01, (24, 40, 32))
+    return Projector(VIEWS, GRID).forward(truth) + noise.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Scaled(Fbp):
+    """FBP times a factor: a method of known quality."""
+
+    factor: float = 1.0
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        found = super().run(problem, control)
+        volume = Volume(found.volume.data * np.float32(self.factor), found.volume.grid)
+        return replace(
+            found, volume=volume, settings={"factor": self.factor, "rows": problem.geometry.detector_shape[0]}
+        )
+
+
+def test_it_takes_the_method_that_predicts_unseen_views_best_and_says_so(data: F32) -> None:
+    auto = Auto((Scaled(factor=0.5), Scaled(factor=1.0), Scaled(factor=1.5)))
+    found = recon.reconstruct(data, VIEWS, auto)
+    assert found.method == "fbp" and found.settings["factor"] == 1.0
+    assert found.settings["rows"] == 40  # the whole scan in the end
+    assert found.settings["chosen_method"] == "fbp"
+    assert "held out, rows " in found.settings["chosen_because"]
+
+
+def test_a_blurred_volume_is_not_preferred_to_a_sharp_one(data: F32, truth: F32) -> None:
+    found = recon.reconstruct(data, VIEWS, Auto((FistaTv(iterations=3, tv_weight=0.05), FistaTv())))
+    assert found.settings["tv_weight"] is None
+
+
+def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
+    @dataclass(frozen=True)
+    class Refusing(Fbp):
+        def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+            raise ValueError("not these")
+
+    assert recon.reconstruct(data, VIEWS, Auto((Refusing(), Scaled()))).settings["factor"] == 1.0
+    with pytest.raises(ValueError, match="fbp: not these"):
+        recon.reconstruct(data, VIEWS, Auto((Refusing(),)))
+
+
+@pytest.mark.parametrize(
+    ("views", "why"),
+    [
+        (VIEWS.select(np.arange(0, 24, 2)), "12 views are too few"),
+        (replace(VIEWS, tilt=np.full(24, 0.02)), "rolled or tilted"),
+    ],
+)
+def test_where_nothing_can_be_tried_the_first_one_runs(data: F32, views: recon.Geometry, why: str) -> None:
+    @dataclass(frozen=True)
+    class Blank(Fbp):
+        def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+            return MethodResult(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
+
+    found = recon.reconstruct(data[: views.n_views], views, Auto((Blank(), Scaled())))
+    assert why in found.settings["chosen_because"]
+
+
+def test_a_cone_is_tried_at_half_the_resolution() -> None:
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    views = recon.Geometry.cone(turn, (64, 64), 1.0, 200.0, 300.0)
+    grid = recon.Grid.matching(views)
+    ball = np.zeros(grid.shape, np.float32)
+    ball[24:40, 20:44, 22:40] = 0.02
+    found = recon.reconstruct(Projector(views, grid).forward(ball), views, Auto((Scaled(factor=0.3), Scaled())))
+    assert found.settings["factor"] == 1.0 and "joined 2 x 2" in found.settings["chosen_because"]
+
+
+def test_a_stop_ends_the_trials(data: F32) -> None:
+    control = recon.RunControl(should_stop=lambda: True)
+    found = recon.reconstruct(data, VIEWS, Auto((Scaled(), Scaled(factor=2.0))), control=control)
+    assert found.settings["chosen_because"] == "stopped before the choice"
+
+
+def test_progress_counts_the_trials(data: F32) -> None:
+    seen: list[Any] = []
+    control = recon.RunControl(on_progress=seen.append)
+    recon.reconstruct(data, VIEWS, Auto((Scaled(), Scaled(factor=2.0))), control=control)
+    assert [(p.step, p.steps) for p in seen] == [(1, 2), (2, 2)]
