@@ -172,7 +172,8 @@ def compose(
     settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
-        f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}.",
+        f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}. A "
+        "smoother volume has more of both, though it may show less: look for cracks and pores in the pictures.",
     ]
     if _grew(made):
         footnotes.append(

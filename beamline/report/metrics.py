@@ -1,4 +1,4 @@
-"""Figures of merit as people read them: label, unit, digits and which direction is better."""
+"""Figures of merit as people read them: label, unit, digits, and which direction is better if any is."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ class Metric:
     label: str
     unit: str
     digits: int
-    better: str
+    direction: str
 
 
 METRICS = {
-    "psnr": Metric("PSNR", "dB", 2, "higher"),
-    "ssim3d": Metric("SSIM 3D", "", 4, "higher"),
-    "nrmse": Metric("NRMSE", "", 4, "lower"),
-    "snr": Metric("SNR", "dB", 2, "higher"),
-    "cnr": Metric("CNR", "dB", 2, "higher"),
-    "residual": Metric("Data residual, views used", "", 4, "lower"),
-    "residual_held_out": Metric("Data residual, views held out", "", 4, "lower"),
-    "seconds": Metric("Time", "s", 1, "lower"),
+    "psnr": Metric("PSNR", "dB", 2, "higher is better"),
+    "ssim3d": Metric("SSIM 3D", "", 4, "higher is better"),
+    "nrmse": Metric("NRMSE", "", 4, "lower is better"),
+    "snr": Metric("SNR", "dB", 2, "smoother has more"),
+    "cnr": Metric("CNR", "dB", 2, "smoother has more"),
+    "residual": Metric("Data residual, views used", "", 4, "lower is better"),
+    "residual_held_out": Metric("Data residual, views held out", "", 4, "lower is better"),
+    "seconds": Metric("Time", "s", 1, "lower is better"),
 }
 
 
