@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 
 from recon.base.masks import masked
 from recon.base.method import ReconProblem
-from recon.base.noise import median_deviation
+from recon.base.noise import median_deviation, noise_level
 from recon.base.volume import Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
@@ -33,7 +33,7 @@ SWEEPS = 8
 
 _SUBSETS, _TV_STEPS = 9, 3
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
-_OUTSIDE = 0.03  # of the projections: voxels differ from Gaussians by less than 0.01
+_DIFFERENT = 0.6  # of the noise
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
@@ -58,9 +58,11 @@ def finish(
 ) -> Volume:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
-    The sweeps see the measured views, not what the fit leaves of them. Where there is matter outside the box, which
-    only the Gaussians hold, they see p - G + A x: measured views p less the views G of the Gaussians plus the
-    projection A x of the box's voxels at the start.
+    The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 1 dB on noisy data.
+    But where the projection of the voxels differs from that of the Gaussians by more than 0.6 of the noise, because
+    pixels are coarse, the noise is low or matter lies outside the box, they see p - G + A x: measured views p less the
+    views G of the Gaussians plus the projection A x of the voxels at the start. Else they would bend the volume to
+    explain what no voxels can (-3.5 dB on a teapot of 10⁵ photons).
 
     Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`. Measured on 15 small scans: 1
@@ -89,7 +91,7 @@ def finish(
     start = Volume(np.maximum(volume.data, 0), volume.grid)
     inside = projector.forward(start.data)
     model -= inside
-    if np.linalg.norm(model) > _OUTSIDE * np.linalg.norm(inside):
+    if float(np.std(model, dtype=np.float64)) > _DIFFERENT * noise_level(data):
         data = data - model
     del model, inside
     return solve(
