@@ -15,21 +15,30 @@ from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
 from recon.assess.time_model import CURVES, Choice, Speeds, choose, parts_of
 from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Progress, RunControl
 from recon.base.volume import Grid
 from recon.calibrate import calibrate
 from recon.reconstruction import Reconstruction
+from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
 from recon.splatting.splat import voxelize
 from recon.voxels.direct import Fbp, has_direct_method
 from recon.voxels.fbp import Filter
+from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.projector import Projector
+from recon.voxels.tv import TotalVariationProx, difference_weights
 
 Now = Callable[[], float]
 
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
 _RESERVE = 0.02  # of the budget, for what no part has measured
 _SLAB = 16  # slices
+_FINISH_SHARE = 0.5  # of what is left after placing, at most
+_TIMED_VIEWS = 8
+# What goes before the sweeps of a finish, in sweeps: the largest eigenvalue of a subset, projections and an FBP.
+_EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +132,35 @@ def within(
     voxelize(placed, slab)
     fill = (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
     end = begin + budget * (1 - _RESERVE) - fill
+    sweeps, finishing = finish_within(_FINISH_SHARE * (end - now()), geometry, grid, now)
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     control = RunControl(should_stop=lambda: stopped() or now() >= end, on_progress=on_progress, now=now)
-    fit = R2(seconds=max(0.0, end - now()), gaussians=placed, finish=0)  # the time is for the fit
+    fit = R2(seconds=max(0.0, end - now() - finishing), gaussians=placed, finish=sweeps)
     result = recon.reconstruct(
         data, geometry, fit, grid=grid, seed=seed, use=DataUse(held_out=held_out), control=control
     )  # fmt: skip
     return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
+
+
+def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Now) -> tuple[int, float]:
+    """Sweeps of a fit's finish that `seconds` suffice for, at most `SWEEPS`, and the seconds that they will take.
+
+    A few views are projected there and back, and one proximal step of total variation is taken, to measure it. Fewer
+    than two sweeps are none: what goes before them takes as long.
+    """
+    if not geometry.is_straight or seconds <= 0:
+        return 0, 0.0
+    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _TIMED_VIEWS))[:_TIMED_VIEWS])
+    projector = Projector(some, grid)
+    begin = now()
+    x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
+    projected = now()
+    TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
+    parts = subsets_of(geometry, SUBSETS)
+    sweep = (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
+    before = (_EIGENVALUE_ROUNDS / parts + _FIRST_SWEEPS) * sweep
+    sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
+    return (sweeps, before + sweeps * sweep) if sweeps >= 2 else (0, 0.0)
 
 
 def _named(choice: Choice, fit: str = "") -> str:

@@ -31,7 +31,8 @@ F32 = NDArray[np.float32]
 SWEEPS = 8
 """Default number of sweeps over the views."""
 
-_SUBSETS, _TV_STEPS = 9, 3
+SUBSETS, TV_STEPS = 9, 3
+
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
 _DIFFERENT = 0.6  # of the noise
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
@@ -45,7 +46,7 @@ class _FromModel:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = NoiseBalance.of(problem, x, modelled=True)
-        return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
 
 
 def finish(

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.geometry import Geometry
 from recon.kernels.cpu.vectors import combine, misfit
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.projector import Projector
@@ -45,7 +46,7 @@ def ordered_fista(
         tv_steps: dual steps of each proximal step, which go on where the last ones ended.
     """
     projector = problem.projector
-    count = max(1, min(subsets, projector.geometry.n_views // _LEAST_VIEWS))
+    count = subsets_of(projector.geometry, subsets)
     parts = interleaved(projector, count)
     projectors = [projector.subset(views) if count > 1 else projector for views in parts]
     step = 1 / _curvature(problem, projectors, parts)
@@ -74,6 +75,11 @@ def ordered_fista(
             break
         ahead(x)
     return x
+
+
+def subsets_of(geometry: Geometry, most: int) -> int:
+    """How many subsets `ordered_fista` makes of these views."""
+    return max(1, min(most, geometry.n_views // _LEAST_VIEWS))
 
 
 def _curvature(problem: VoxelProblem, projectors: Sequence[Projector], parts: Sequence[NDArray[np.intp]]) -> float:

@@ -64,6 +64,7 @@ def test_the_time_is_used_and_not_exceeded(
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    monkeypatch.setattr(module, "finish_within", lambda *_: (0, 0.0))  # its seconds are not ticks
     done = _spend(prepared, budget, Ticking(0.01))
     assert done.choice.fits
     assert 0.9 * budget < done.seconds <= budget
@@ -71,6 +72,13 @@ def test_the_time_is_used_and_not_exceeded(
     assert f"of {budget:.3g} s" in done.summary(budget)
     assert done.settings(budget)["measured_step_s"] == 0.01
     assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
+
+
+def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for(prepared: PreparedProjections) -> None:
+    views, grid = prepared.geometry, Grid.matching(prepared.geometry)
+    # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation, 6 sweeps before the first.
+    found = [module.finish_within(seconds, views, grid, Ticking(1.0)) for seconds in (0.0, 36.0, 41.0, 60.0, 1e3)]
+    assert found == [(0, 0.0), (0, 0.0), (2, 40.0), (6, 60.0), (8, 70.0)]
 
 
 def test_a_slow_machine_takes_fbp_of_joined_pixels(
