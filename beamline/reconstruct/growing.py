@@ -30,9 +30,10 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
 from drivers.frame import FrameKind
-from recon.base.method import Progress
+from recon.base.method import DataUse, Progress, ReconProblem
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections, joined
+from recon.splatting.finish import finish
 from recon.splatting.stream import StreamingFit
 
 _FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
@@ -241,9 +242,15 @@ class ScanFollower:
             self._say(self._fit.finish(seconds, listen))
         except ValueError as error:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
-        volume = self._fit.snapshot()
+        volume, gaussians = self._fit.snapshot(), self._fit.gaussians
+        sweeps = self._options.streaming.finish_sweeps(prepared.geometry)
+        if sweeps and gaussians is not None and not stop_latch():
+            data, geometry = prepared.projections.data, prepared.geometry
+            problem = ReconProblem(data, geometry, volume.grid, DataUse(), self._options.seed, "cpu")
+            volume = finish(volume, gaussians, problem, sweeps, self._fit.settings, stop_latch)
         settings: dict[str, object] = {
             **asdict(self._fit.settings),
+            "finish": sweeps,
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
             **({"ended_early": True} if stop_latch.stopped else {}),

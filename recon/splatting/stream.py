@@ -55,6 +55,10 @@ class StreamingMethod(Method, Protocol):
     @property
     def seconds(self) -> float | None: ...
 
+    def finish_sweeps(self, geometry: Geometry) -> int:
+        """Sweeps on voxels after the last round."""
+        ...
+
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit of views with the geometry of `template`, whose angles are ignored."""
         ...
