@@ -71,7 +71,9 @@ def test_from_trigger_to_judged_volume(here: Path) -> None:
     record = read_reconstruction(folder / "recon.h5")
     assert record.metrics["psnr"] == done["psnr"]
     assert record.parameters["command"] == "beamline demo"
-    assert {"ssim_weight", "tv_weight", "rates", "policy_every", "seconds_after_scan", "finish"} <= set(record.parameters)
+    assert {"ssim_weight", "tv_weight", "rates", "policy_every", "seconds_after_scan", "finish"} <= set(
+        record.parameters
+    )
     page = (folder / "report.html").read_text(encoding="utf-8")
     for said in ("PSNR", "FBP", "R²-Gaussian", "30/30", "24 of 24 views", "Rotation axis"):
         assert said in page

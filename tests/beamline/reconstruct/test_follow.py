@@ -148,7 +148,9 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
 
     record = read_reconstruction(tmp_path / "recon.h5")
     assert record.parameters["n_views"] == 30
-    assert {"ssim_weight", "tv_weight", "rates", "policy_every", "seconds_after_scan", "finish"} <= set(record.parameters)
+    assert {"ssim_weight", "tv_weight", "rates", "policy_every", "seconds_after_scan", "finish"} <= set(
+        record.parameters
+    )
     assert record.metrics == pytest.approx(metrics)
     truth = SCAN.truth(record.volume.grid)
     assert psnr(truth, record.volume.data) > 20
