@@ -46,15 +46,6 @@ def noise_level(images: F32) -> float:
     return low * float(gains[min(at, gains.size - 1)]) ** (axes / 2)
 
 
-def fine_noise(images: F32) -> float:
-    """Standard deviation of white noise with the same differences of third order: noise at high frequencies only.
-
-    Args:
-        images: as in `noise_level`.
-    """
-    return _differences(_sample(images), _LOW)
-
-
 def median_deviation(images: NDArray[np.floating[Any]]) -> float:
     """Standard deviation of a normal variable with the same median of absolute values."""
     finite = images[np.isfinite(images)]
@@ -70,7 +61,7 @@ def _long_axes(images: F32) -> list[int]:
 
 
 def _differences(images: F32, order: int) -> float:
-    """`fine_noise` of any order; NaN marks pixels that do not count."""
+    """Standard deviation of white noise with the same differences of this order; NaN marks pixels that do not count."""
     axes = _long_axes(images)
     if not axes:
         return 0.0
