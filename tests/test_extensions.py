@@ -116,7 +116,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look
+from beamline.monitor.check import Flag, Level, Look, Policy
 
 
 @dataclass(frozen=True)
@@ -125,6 +125,7 @@ class Dummy:
     bit: ClassVar[int] = 11
     unit: ClassVar[str] = "frames"
     meaning: ClassVar[str] = "the frame is one of a pair"
+    policy: ClassVar[Policy] = Policy.LOG
     every: Annotated[int, Field(ge=2, description="frames between two flags")] = 3
 
     def start(self):

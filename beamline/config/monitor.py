@@ -6,13 +6,14 @@ configured without an edit here.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from pydantic import create_model, model_validator
+from pydantic import Field, create_model, model_validator
 
 from beamline.config.section import Section
-from beamline.monitor.check import Check
+from beamline.monitor.check import Check, Policy
 from beamline.monitor.checks import CHECKS
 
 
@@ -21,6 +22,8 @@ class MonitorBase(Section):
 
     on_alarm: Literal["log", "stop"] = "log"
     """An alarm of a check is logged, or it stops the scan."""
+    act_after: Annotated[int, Field(ge=1)] = 10
+    """Frames in a row with an alarm before the check's policy pauses or aborts the scan."""
 
     @model_validator(mode="before")
     @classmethod
@@ -46,13 +49,28 @@ def _limits_of(check: Check) -> Any:
     return section, section()
 
 
+def _policies() -> Any:
+    """The section with the policy of each check, and its default, as pydantic.create_model takes a field."""
+    keys: dict[str, Any] = {check.name: (Policy, check.policy) for check in CHECKS}
+    section = create_model("Policies", __base__=Section, __doc__="What alarms of each check do to a scan.", **keys)
+    return section, section()
+
+
 if TYPE_CHECKING:
     MonitorSection = MonitorBase
 else:
     _LIMITS = {check.name: _limits_of(check) for check in CHECKS if fields(check)}
-    MonitorSection = create_model("MonitorSection", __base__=MonitorBase, __doc__="Section `monitor`.", **_LIMITS)
+    MonitorSection = create_model(
+        "MonitorSection", __base__=MonitorBase, __doc__="Section `monitor`.", policy=_policies(), **_LIMITS
+    )
 
 
 def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:
     """All checks, with the limits that the configuration gives them."""
     return tuple(replace(check, **dict(getattr(monitor, check.name, ()))) for check in CHECKS)
+
+
+def policies(monitor: MonitorBase) -> Mapping[str, Policy]:
+    """What alarms of each check do to a scan, by the check's name."""
+    section: Section = monitor.policy  # type: ignore[attr-defined]  # made above, from the registry
+    return {name: Policy(policy) for name, policy in section}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light, thinned
 from drivers.frame import Frame, FrameKind
@@ -46,6 +46,7 @@ class Bands:
     bit: ClassVar[int] = 3
     unit: ClassVar[str] = "fraction of the row's light"
     meaning: ClassVar[str] = "rows lost light against their own past while the other rows did not: a dark band"
+    policy: ClassVar[Policy] = Policy.LOG
 
     alarm: Annotated[
         float,

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import edge_light, light, more_light
 from drivers.frame import Frame, FrameKind
@@ -43,6 +43,7 @@ class Beam:
     bit: ClassVar[int] = 0
     unit: ClassVar[str] = "fraction of the reference light"
     meaning: ClassVar[str] = "the light differs from that of the flats, or of the first projections"
+    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, description="fraction by which the light may change, either way")] = 0.02
     alarm: Annotated[float, Field(ge=0, description="fraction of the light whose loss is an alarm")] = 0.10

@@ -20,9 +20,23 @@ from drivers.frame import Frame
 State = TypeVar("State")
 
 
+Region = tuple[int, int, int, int]
+"""Pixels of a frame: (first row, row after the last, first column, column after the last)."""
+
+
 class Level(StrEnum):
+    INFO = "info"  # a fact about the scan; the frame is not marked in the file
     WARN = "warn"  # look at it when you have time
     ALARM = "alarm"  # the data are suffering now
+
+
+class Policy(StrEnum):
+    """What alarms of a check do to the scan."""
+
+    LOG = "log"  # write it down: file, events, report
+    WARN = "warn"  # and say it on the terminal
+    PAUSE = "pause"  # and hold the scan until the operator or the check says that it may go on
+    ABORT = "abort"  # and end the scan
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,7 @@ class Flag:
         score: the measured figure, in the check's unit.
         limit: the figure that it exceeds.
         advice: what it means and what to do.
+        region: where in the frame; None: everywhere, or nowhere in particular.
     """
 
     check: str
@@ -44,6 +59,7 @@ class Flag:
     score: float
     limit: float
     advice: str
+    region: Region | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +103,14 @@ class Check(Protocol):
         bit: in the bitmask of a frame in a file, 0 ... 15. Never changed and never used again: old files hold it.
         unit: of the score and, unless a limit says otherwise, of the limits.
         meaning: what the flag says of a frame, one sentence for the legend of a file.
+        policy: what its alarms do to a scan, unless the configuration says otherwise.
     """
 
     name: ClassVar[str]
     bit: ClassVar[int]
     unit: ClassVar[str]
     meaning: ClassVar[str]
+    policy: ClassVar[Policy]
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def start(self) -> Any:

@@ -43,9 +43,11 @@ _BITS = {check.name: check.bit for check in CHECKS}
 
 
 def bitmask(flags: Iterable[Flag]) -> int:
-    """The flags of a frame as 32 bits; see ALARM_SHIFT."""
+    """The flags of a frame as 32 bits; see ALARM_SHIFT. An INFO has no bit: nothing is wrong with the frame."""
     bits = 0
     for flag in flags:
+        if flag.level is Level.INFO:
+            continue
         bit = 1 << _BITS[flag.check]
         bits |= bit | (bit << ALARM_SHIFT if flag.level is Level.ALARM else 0)
     return bits

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import thinned
 from drivers.frame import Frame, FrameKind
@@ -37,6 +37,7 @@ class Dark:
     bit: ClassVar[int] = 6
     unit: ClassVar[str] = "counts of drift, or fraction of the flats' counts"
     meaning: ClassVar[str] = "a dark differs from the first one, or darks are nearly as bright as flats"
+    policy: ClassVar[Policy] = Policy.LOG
 
     drift: Annotated[float, Field(ge=0, description="counts by which a dark may differ from the first one")] = 5.0
     light: Annotated[float, Field(ge=0, description="fraction of the flats' mean from which a dark has light")] = 0.5

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import edges, thinned, transmission
 from drivers.frame import Frame, FrameKind
@@ -41,6 +41,7 @@ class Mass:
     bit: ClassVar[int] = 5
     unit: ClassVar[str] = "relative change"
     meaning: ClassVar[str] = "the total absorption differs from that of the first projections, several views in a row"
+    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, description="relative change of the total absorption")] = 0.03
     frames: Annotated[int, Field(ge=1, description="projections in a row beyond the limit that make a finding")] = 3

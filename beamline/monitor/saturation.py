@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.frame import Frame, FrameKind
 
@@ -29,6 +29,7 @@ class Saturation:
     bit: ClassVar[int] = 1
     unit: ClassVar[str] = "fraction of the pixels"
     meaning: ClassVar[str] = "more pixels are saturated than in the darks"
+    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
     alarm: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it is an alarm")] = 1e-3

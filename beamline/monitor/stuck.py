@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.frame import Frame
 
@@ -26,6 +26,7 @@ class Stuck:
     bit: ClassVar[int] = 2
     unit: ClassVar[str] = "repetitions"
     meaning: ClassVar[str] = "the image equals the one before, pixel for pixel: the camera delivered a frame twice"
+    policy: ClassVar[Policy] = Policy.LOG
 
     def start(self) -> StuckState:
         return StuckState()

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.frame import Frame, FrameKind
 
@@ -28,6 +28,7 @@ class Timing:
     bit: ClassVar[int] = 4
     unit: ClassVar[str] = "trigger periods"
     meaning: ClassVar[str] = "the frame came early or late, or triggers before it gave no frame (fly scans)"
+    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
 

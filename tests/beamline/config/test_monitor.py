@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from beamline.config.load import config_folder, load, resolved_yaml, schema
-from beamline.config.monitor import configured_checks
+from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
 from beamline.monitor.beam import Beam
+from beamline.monitor.check import Policy
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.mass import Mass
 
@@ -38,14 +39,20 @@ def test_limits_reach_their_check_and_no_other() -> None:
             "monitor.beam.wran=0.1",
             r"is not a known key \(did you mean warn\?\); legal keys there: warn, alarm, lost",
         ),
-        ("monitor.bean={warn: 0.1}", r"monitor\.bean is not .*beam.*legal keys there: on_alarm, beam, saturation"),
+        ("monitor.bean={warn: 0.1}", r"monitor\.bean is not .*beam.*legal keys there: on_alarm, act_after, policy"),
         ("monitor.timing=0.3", r"monitor\.timing is 0\.3; expected a group of keys: warn"),
+        ("monitor.policy.beam=halt", r"monitor\.policy\.beam is 'halt'; expected log \| warn \| pause \| abort"),
         ("monitor.on_alarm=stopp", r"monitor\.on_alarm is 'stopp' \(did you mean stop\?\); expected log \| stop"),
     ],
 )
 def test_a_limit_that_cannot_be_is_refused_with_the_legal_ones(word: str, message: str) -> None:
     with pytest.raises(ConfigError, match=f"^--set {word.split('=')[0]}.*{message}"):
         load(config_folder() / "demo.yaml", [word], {})
+
+
+def test_each_check_has_a_policy_and_by_default_its_own() -> None:
+    read = policies(load(config_folder() / "demo.yaml", ["monitor.policy.beam=pause"], {}).monitor)
+    assert read == {check.name: check.policy for check in CHECKS} | {"beam": Policy.PAUSE}
 
 
 def test_files_of_earlier_versions_are_read_or_refused_with_the_new_key(tmp_path: Path) -> None:
