@@ -162,12 +162,12 @@ with h5py.File(result.path) as file:
     said = [int(legend[name][row]) for name in ("bit", "alarm_bit")]
     said += [legend[name].asstr()[row] for name in ("unit", "meaning")]
     bits = [int(b) & (1 << 11 | 1 << 27) for b in file["entry/frame_log/flags"][()]]
-info = describe(result.path)["attributes"]["flags"]
+info = describe(result.path)["flags"]
 assert "monitor.dummy.every is 1; expected a whole number >= 2" in refused
-assert result.flags["dummy"] == 5 and "dummy" in flags
+assert result.flags["dummy"] == {"alarm": 5} and "dummy" in flags
 assert said == [11, 27, "frames", "the frame is one of a pair"]
 assert bits == [0, 1 << 11 | 1 << 27] * 5
-assert "dummy 5" in info
+assert info["dummy"] == {"alarm": 5}
 """,
 )
 

@@ -18,6 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing
 from beamline.storage.describe import describe
+from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.validate import validate as findings_of
@@ -40,6 +41,8 @@ def info(file: Path, as_json: bool, **said: Any) -> None:
     if as_json:
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
+    if facts["flags"] is not None:
+        facts["flags"] = counted(facts["flags"])
     width = max(len(name) for name in (*facts, *attributes)) + 2
     for name, value in (facts | attributes).items():
         click.echo(f"{name:<{width}}{_text(value)}")

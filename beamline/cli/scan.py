@@ -15,6 +15,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.config.load import Config, load
+from beamline.core.errors import AlarmError
 from beamline.core.events import Event, Sink
 from beamline.core.stop import StopRequest
 from beamline.instrument.operator import ask_operator
@@ -22,6 +23,7 @@ from beamline.scan.live_process import LiveCommand, follow_command
 from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
+from beamline.storage.flag_legend import counted
 from drivers.clock import SystemClock
 from recon.methods import streams
 
@@ -47,7 +49,7 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
     Exit code: 0 done, 2 wrong configuration or violated limit, 3 device failed, 4 stopped, 5 frames missing or disk
-    error, 130 aborted, or interrupted before the first frame.
+    error, 7 complete but frames have an alarm of the monitor, 130 aborted, or interrupted before the first frame.
     """
     with json_events(as_json) as json_sinks:
         config = load(file, overrides)
@@ -63,6 +65,12 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
             )
     if not as_json:
         click.echo(_results(result))
+    if result.alarmed_frames:
+        raise AlarmError(
+            f"The scan is complete, but {result.alarmed_frames} of {result.n_frames} frames have an alarm of the "
+            f"monitor: {counted(result.flags)}. `beamline recon` leaves such views out. Look at {result.path.parent}; "
+            "repeat the scan where too many are lost."
+        )
 
 
 def _dry_run(config: Config, json_sinks: Sequence[Sink]) -> None:
@@ -110,8 +118,7 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
 def _results(result: RunResult) -> str:
     lines = [f"{'scan':<10}{result.path}", f"{'frames':<10}{result.n_frames}"]
     if result.flags:
-        counts = ", ".join(f"{check} {n}" for check, n in sorted(result.flags.items()))
-        lines.append(f"{'flagged':<10}{counts} frames; see {result.path.parent}")
+        lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
     return "\n".join(lines)

@@ -64,7 +64,7 @@ def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str |
 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --views, --rows, --bin, --axis, --pixel-size-um, --cone, --air and the options of `scan_options`."""
+    """Adds --views, --rows, --bin, --axis, --pixel-size-um, --cone, --air, --flags and what `scan_options` adds."""
     for option in reversed(_AFTER):
         command = option(command)
     command = scan_options(command)
@@ -86,6 +86,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         cone=rest.pop("cone"),
         correction=CorrectionSettings(air=rest.pop("air")),
         seed=seed,
+        use_flags=rest.pop("flags") == "use",
     )
     return SourceOptions(file, **rest), selection
 
@@ -140,5 +141,12 @@ _AFTER = (
         default="auto",
         show_default=True,
         help="Number of columns at the left and right edge that show air in every view.",
+    ),
+    click.option(
+        "--flags",
+        type=click.Choice(["use", "ignore"]),
+        default="use",
+        show_default=True,
+        help="use: views with an alarm of the monitor are left out, with a warning weigh half; ignore: all are alike.",
     ),
 )

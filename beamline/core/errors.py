@@ -43,6 +43,12 @@ class QualityError(BeamlineError):
     exit_code = 6
 
 
+class AlarmError(BeamlineError):
+    """Finished and written, but the monitor raised alarms: some frames are not what they should be."""
+
+    exit_code = 7
+
+
 INTERRUPTED = 130
 
 

@@ -38,9 +38,10 @@ def sentence(event: Event) -> str | None:
         case "snapshot":
             return f"Volume from {data['n_views']} views so far: {data['path']}"
         case "scan_done":
+            alarms = f", {data['alarmed_frames']} WITH AN ALARM" if data.get("alarmed_frames") else ""
             return (
-                f"Scan {data['status']}: {data['n_frames']} frames, {size(data['bytes'])}, {data['seconds']:.1f} s: "
-                f"{data['path']}"
+                f"Scan {data['status']}: {data['n_frames']} frames{alarms}, {size(data['bytes'])}, "
+                f"{data['seconds']:.1f} s: {data['path']}"
             )
         case "recon_done":
             return f"Volume: {data.get('output', '')}"

@@ -53,5 +53,6 @@ def hold_out(prepared: PreparedProjections, share: int, *, most: int | None = No
             projections, data=projections.data[used], view_ids=projections.view_ids[used], air=projections.air[used]
         ),
         geometry=geometry.select(used),
+        view_weights=None if prepared.view_weights is None else prepared.view_weights[used],
         held_out=(projections.data[held], geometry.select(held)),
     )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, Warn
+from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.selection import (
     Selection,
     check_axis,
@@ -21,7 +22,8 @@ from beamline.projections.selection import (
 )
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.validate import beam_present, quantity_said, references_present, source_findings
+from beamline.storage.rules.flags import frames_flagged
+from beamline.storage.rules.validate import beam_present, quantity_said, references_present, scan_findings
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.prep.align import AxisEstimate, find_axis
@@ -45,6 +47,8 @@ class PreparedProjections:
         n_projections: how many views the scan has.
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
+        view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
+        left_out: views with an alarm of the monitor, which are not among those that the selection chose from.
     """
 
     projections: Projections
@@ -55,6 +59,19 @@ class PreparedProjections:
     n_projections: int
     length_unit: str
     quantity: str
+    view_weights: NDArray[np.float32] | None = None
+    left_out: int = 0
+
+    def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
+        """Weights [view, row, col], read-only; None: one for all rays.
+
+        Args:
+            others: views after these, which weigh 1.
+        """
+        if self.view_weights is None:
+            return None
+        weights = np.concatenate((self.view_weights, np.ones(others, np.float32)))
+        return np.broadcast_to(weights[:, None, None], (weights.size, *self.geometry.detector_shape))
 
 
 def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) -> PreparedProjections:
@@ -69,8 +86,9 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
+    usable = flagged_views(source, selection, warn)
     check(source, warn)
-    scan_frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    scan_frames = usable.frames
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
     correction = ScanCorrection(source, selection, warn)
     axis_col, axis = selection.axis_col, None
@@ -88,7 +106,21 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
     if rest.size:
         others = correction.at_once(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
         held_out = others.data, geometry_of(source, selection, axis_col, source.angles[others.view_ids])
-    return assemble(source, selection, projections, (axis_col, axis), warn, held_out)
+    return assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
+
+
+def flagged_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
+    """The views that may be used, by the flags of the monitor, and says what that means for this scan.
+
+    Raises:
+        DataError: too few views are left.
+    """
+    if selection.use_flags:
+        refuse(source, frames_flagged(source))
+    usable = usable_views(source, selection.use_flags)
+    if usable.said:
+        warn(usable.said)
+    return usable
 
 
 def check(source: ScanSource, warn: Warn) -> None:
@@ -97,7 +129,7 @@ def check(source: ScanSource, warn: Warn) -> None:
     Raises:
         DataError: with what to do about it.
     """
-    findings = source_findings(source)
+    findings = scan_findings(source)
     refuse(source, findings)
     for finding in findings:
         if finding.severity == "warning":
@@ -109,6 +141,7 @@ def assemble(
     selection: Selection,
     projections: Projections,
     axis: tuple[float, AxisEstimate | None],
+    usable: UsableViews,
     warn: Warn,
     held_out: tuple[NDArray[np.float32], Geometry] | None = None,
 ) -> PreparedProjections:
@@ -116,6 +149,7 @@ def assemble(
 
     Args:
         axis: the column, and how it was found; None where it was given.
+        usable: the views that were chosen from.
 
     Raises:
         DataError: fewer than two views, or nothing in the beam.
@@ -137,6 +171,8 @@ def assemble(
         n_projections=int((source.image_key == FrameKind.PROJECTION).sum()),
         length_unit="px" if pixel_size(source, selection) is None else "mm",
         quantity=source.quantity,
+        view_weights=usable.weights_of(projections.view_ids),
+        left_out=usable.left_out,
     )
 
 

@@ -28,6 +28,7 @@ class Selection:
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
         correction: of counts to line integrals.
         seed: of random view selections.
+        use_flags: views with an alarm of the monitor are left out, those with a warning weigh less.
     """
 
     views: str = "all"
@@ -38,6 +39,7 @@ class Selection:
     cone: tuple[float, float] | None = None
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
     seed: int = 0
+    use_flags: bool = True
 
 
 def choose_views(

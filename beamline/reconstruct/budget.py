@@ -136,9 +136,8 @@ def within(
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     control = RunControl(should_stop=lambda: stopped() or now() >= end, on_progress=on_progress, now=now)
     fit = R2(seconds=max(0.0, end - now() - finishing), gaussians=placed, finish=sweeps)
-    result = recon.reconstruct(
-        data, geometry, fit, grid=grid, seed=seed, use=DataUse(held_out=held_out), control=control
-    )  # fmt: skip
+    use = DataUse(prepared.ray_weights(len(held_out)), held_out)
+    result = recon.reconstruct(data, geometry, fit, grid=grid, seed=seed, use=use, control=control)
     return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
 
 

@@ -147,13 +147,14 @@ class _Job:
         held_out: Sequence[int] = ()
         if method.traits.held_out:
             data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
+        weights = prepared.ray_weights(len(held_out))
         control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
         with self.refused(f" by {method.name}"):
             # Compilation must not count in the time of the run, nor in its estimate of the time left.
             warm_up(method, prepared.geometry, device=self.options.device)
             return recon.reconstruct(
                 data, geometry, method, grid=self.grid, seed=self.options.seed, device=self.options.device,
-                use=DataUse(held_out=held_out), control=control,
+                use=DataUse(weights, held_out), control=control,
             )  # fmt: skip
 
     def outcome(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:

@@ -13,11 +13,13 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.prepare import (
     PreparedProjections,
     assemble,
     check,
     correction_blockers,
+    flagged_views,
     locate_axis,
     refuse,
     stated_axis,
@@ -75,7 +77,7 @@ class ScanFollower:
         """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
         n = self.source.refresh()
         grown, self._frames = n > self._frames, n
-        views = np.flatnonzero(self.source.image_key == FrameKind.PROJECTION)
+        views = usable_views(self.source, self._options.selection.use_flags).frames
         if views.size == 0:
             self._taken = n
             return grown
@@ -216,10 +218,11 @@ class ScanFollower:
         Raises:
             DataError: a scan without two views that can be used, or whose views hold no matter.
         """
+        usable = flagged_views(self.source, self._options.selection, self._warn)
         check(self.source, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
         self._correct_again()
-        prepared = self._prepared(self.axis_col)
+        prepared = self._prepared(self.axis_col, usable)
         self._sink(
             Event(
                 "state",
@@ -246,7 +249,8 @@ class ScanFollower:
         sweeps = self._options.streaming.finish_sweeps(prepared.geometry)
         if sweeps and gaussians is not None and not stop_latch():
             data, geometry = prepared.projections.data, prepared.geometry
-            problem = ReconProblem(data, geometry, volume.grid, DataUse(), self._options.seed, "cpu")
+            use = DataUse(prepared.ray_weights())
+            problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
             volume = finish(volume, gaussians, problem, sweeps, self._fit.settings, stop_latch)
         settings: dict[str, object] = {
             **asdict(self._fit.settings),
@@ -259,10 +263,10 @@ class ScanFollower:
         made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter)
         return made, prepared
 
-    def _prepared(self, axis_col: float) -> PreparedProjections:
+    def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         projections = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
         self._parts = [projections]
-        return assemble(self.source, self._options.selection, projections, (axis_col, self.axis), self._warn)
+        return assemble(self.source, self._options.selection, projections, (axis_col, self.axis), usable, self._warn)
 
 
 def _quiet(text: str) -> None:

@@ -16,7 +16,9 @@ from beamline.report import figures
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, residual_curve
+from beamline.storage.flag_legend import counted
 from beamline.storage.readers.open import ScanSource
+from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.writers.recon_file import Value
 from drivers.frame import FrameKind
 from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
@@ -128,7 +130,7 @@ def facts_of(source: ScanSource) -> ScanFacts:
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
     pitch, energy = source.pixel_size_mm, source.energy_kev
-    missing, flagged = (int(attributes.get(name, 0)) for name in ("missing_triggers", "flagged_frames"))
+    missing, flags = int(attributes.get("missing_triggers", 0)), source.flags
     table = {
         "file": source.path.name,
         "format": source.format,
@@ -139,10 +141,11 @@ def facts_of(source: ScanSource) -> ScanFacts:
         "pixel size": "not known" if pitch is None else f"{pitch * 1e3:.4g} µm",
         "energy": "not known" if energy is None else f"{energy:g} keV",
         "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
+        "flagged by the monitor": "no monitor looked at it" if flags is None else counted(flags.counts()),
     }
     table |= {str(k): _text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n = int(source.image_key.size)
-    remarks = [f"The monitor flagged {flagged} frames during the scan."] if flagged else []
+    remarks = [finding.message for finding in frames_flagged(source)]
     return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks)
 
 

@@ -50,7 +50,7 @@ class Recorder:
 
     Attributes:
         n_frames: written so far.
-        flagged: frames flagged so far, by check.
+        alarmed_frames: frames so far with an alarm of any check.
     """
 
     def __init__(
@@ -70,7 +70,8 @@ class Recorder:
         self._active: set[tuple[str, Level]] = set()
         self._monitor_off = False
         self.n_frames = 0
-        self.flagged: Counter[str] = Counter()
+        self._flagged: Counter[tuple[str, Level]] = Counter()
+        self.alarmed_frames = 0
         self._failure: Exception | None = None
         low, high = WAITING_FRAMES
         self._waiting: Queue[Frame | None] = Queue(min(max(WAITING_BYTES // timeline.frame_bytes, low), high))
@@ -100,6 +101,14 @@ class Recorder:
         if self._thread.is_alive():
             raise self._stalled()
         self._raise_failure()
+
+    @property
+    def flags(self) -> dict[str, dict[str, int]]:
+        """Frames flagged so far: their number by check, then by level."""
+        found: dict[str, dict[str, int]] = {}
+        for (check, level), n in sorted(self._flagged.items()):
+            found.setdefault(check, {})[str(level)] = n
+        return found
 
     @property
     def hangs(self) -> bool:
@@ -161,7 +170,8 @@ class Recorder:
 
     def _report(self, flags: tuple[Flag, ...]) -> None:
         """Count flags; emit a `flag` event where a check begins to flag or its level changes, not for every frame."""
-        self.flagged.update(flag.check for flag in flags)
+        self._flagged.update((flag.check, flag.level) for flag in flags)
+        self.alarmed_frames += any(flag.level is Level.ALARM for flag in flags)
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:

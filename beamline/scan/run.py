@@ -65,7 +65,8 @@ class RunResult:
         path: the scan file; its folder holds everything else.
         n_frames: rows of the file.
         missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
-        flags: frames that each of the monitor's checks flagged.
+        flags: frames that the monitor flagged: their number by check, then by level.
+        alarmed_frames: frames with an alarm.
         seconds: real time of the whole run.
         bytes: size of the scan file.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
@@ -74,7 +75,8 @@ class RunResult:
     path: Path
     n_frames: int
     missing: tuple[int, ...]
-    flags: Mapping[str, int]
+    flags: Mapping[str, Mapping[str, int]]
+    alarmed_frames: int
     seconds: float
     bytes: int
     recon: Mapping[str, Any] | None
@@ -198,7 +200,8 @@ class _Run:
             path=writer.path,
             n_frames=writer.committed,
             missing=tuple(missing),
-            flags=dict(recorder.flagged),
+            flags=recorder.flags,
+            alarmed_frames=recorder.alarmed_frames,
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
             recon=None,

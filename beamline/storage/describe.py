@@ -23,8 +23,8 @@ def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
 def describe_source(source: ScanSource) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
 
-    Angles are in degrees. `findings` are the messages of errors and warnings, `reconstructable` whether no error
-    stands against a reconstruction.
+    Angles are in degrees. `flags` are frames by check and level. `findings` are the messages of errors and warnings,
+    `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     findings = source_findings(source)
@@ -45,6 +45,7 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
         "exposure_s": attributes.pop("exposure_s", None),
         "finished": source.finished,
         "missing_triggers": attributes.pop("missing_triggers", None),
+        **_flags(source),
         "attributes": attributes,
         "findings": [finding.message for finding in findings if finding.severity != "info"],
         "reconstructable": all(finding.severity != "error" for finding in findings),
@@ -57,6 +58,14 @@ def _angles(source: ScanSource) -> dict[str, float | None]:
         return {"first_angle_deg": None, "last_angle_deg": None, "step_deg": None}
     step = float(np.median(np.diff(np.unique(angles)))) if np.unique(angles).size > 1 else None
     return {"first_angle_deg": float(angles[0]), "last_angle_deg": float(angles[-1]), "step_deg": step}
+
+
+def _flags(source: ScanSource) -> dict[str, Any]:
+    flags = source.flags
+    if flags is None:
+        return {"flagged_frames": None, "alarmed_frames": None, "flags": None}
+    flagged, alarmed = int(flags.flagged.sum()), int(flags.alarmed.sum())
+    return {"flagged_frames": flagged, "alarmed_frames": alarmed, "flags": flags.counts()}
 
 
 def _size(path: Path) -> int:

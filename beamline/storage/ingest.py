@@ -141,13 +141,13 @@ def _copy(
 
 def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
     """Pixels and what is known of each frame; a scan of ours (also one whose writer died) keeps its log."""
+    flags = np.zeros(source.image_key.size, np.int64) if source.flags is None else source.flags.bits
     if source.dtype == np.uint16:
-        for frame in source.frames():
-            yield (
-                frame.counts,
-                layout.Record(frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time),
-            )
+        for frame, bits in zip(source.frames(), flags.tolist(), strict=True):
+            known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
+            yield frame.counts, layout.Record(*known, bits)
         return
     keys, angles, exposures = source.image_key, source.angles, source.exposures
     for i in range(keys.size):
-        yield source.read([i])[0], layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
+        record = layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]), flags=int(flags[i]))
+        yield source.read([i])[0], record

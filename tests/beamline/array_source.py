@@ -20,6 +20,7 @@ class ArraySource:
     axis_col: float | None = None
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
+    flags = None
     finished = True
 
     def __init__(

@@ -11,6 +11,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS, bitmask
+from beamline.monitor.digest import digest
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
 from recon.base.volume import Grid
 
@@ -89,3 +94,16 @@ def frames_of(scan: TwoCylinders, *, time: float = 1.8e9, period: float = 0.1) -
         Frame(image.astype(np.uint16), kind, i, i, i, angle, time + period * i, 0.05)
         for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True))
     ]
+
+
+def write_flagged(path: Path, frames: list[Frame], levels: Mapping[int, Level], pixel_size_mm: float = 1.0) -> Path:
+    """The frames as our scan file, in which the first check of the monitor flagged rows at these levels."""
+    with NXtomoWriter(
+        path, ScanInfo("flagged", pixel_size_mm=pixel_size_mm), frames[0].counts.shape, clock=SystemClock()
+    ) as writer:
+        for frame in frames:
+            said = (
+                [Flag(CHECKS[0].name, levels[frame.index], frame.index, 1.0, 0.0, "")] if frame.index in levels else []
+            )
+            writer.append(frame, digest(frame.counts), bitmask(said))
+    return path

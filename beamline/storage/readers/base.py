@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.flag_legend import FrameFlags
 from drivers.frame import Frame, FrameKind
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
@@ -37,6 +38,7 @@ class ScanSource(Protocol):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         attributes: whatever else the file says, for the record.
+        flags: of the monitor, by frame; None where no monitor looked at the frames.
         finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
 
@@ -66,6 +68,8 @@ class ScanSource(Protocol):
     def cone(self) -> tuple[float, float] | None: ...
     @property
     def attributes(self) -> Attributes: ...
+    @property
+    def flags(self) -> FrameFlags | None: ...
     @property
     def finished(self) -> bool: ...
 
@@ -138,6 +142,10 @@ class ScanReader(ABC):
     @property
     def attributes(self) -> Attributes:
         return self.facts
+
+    @property
+    def flags(self) -> FrameFlags | None:
+        return None
 
     @abstractmethod
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.flag_legend import FLAGS, flagged_by, read_legend
+from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, Opening, Quantity, ScanReader, count_in_blocks, frame_indices
 from beamline.storage.readers.nexus_places import choose, find
@@ -109,7 +109,7 @@ class NXtomoSource(ScanReader):
 
     @property
     def attributes(self) -> dict[str, str | float | int]:
-        """What else the file says: sample, title, times, status, missing triggers, flagged frames by check."""
+        """What else the file says: sample, title, times, status, missing triggers."""
         entry = self._places.entry
         said: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
@@ -132,13 +132,11 @@ class NXtomoSource(ScanReader):
                 item.refresh()
             said["status"] = hdf5.text(self._file[layout.STATUS][()]) or "running"
             said["missing_triggers"] = int(self._file[layout.MISSING].shape[0])
-            flags = self._file[FLAGS]
-            flags.refresh()
-            bits = flags[: self.n]
-            said["flagged_frames"] = int(np.count_nonzero(bits))
-            if found := flagged_by(bits, read_legend(self._file)):
-                said["flags"] = ", ".join(f"{name} {n}" for name, n in found.items())
         return said
+
+    @property
+    def flags(self) -> FrameFlags | None:
+        return read_flags(self._file, self.n) if self._ours else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the frames asked for, in that order."""

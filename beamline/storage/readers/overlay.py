@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.angle_table import assign
 from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanReader, ScanSource, frame_indices
 from drivers.frame import Frame, FrameKind
@@ -78,6 +79,11 @@ class Overlay(ScanReader):
     @property
     def attributes(self) -> Attributes:
         return self._base.attributes
+
+    @property
+    def flags(self) -> FrameFlags | None:
+        flags = self._base.flags
+        return None if flags is None else flags.after(len(self._front))
 
     @property
     def finished(self) -> bool:

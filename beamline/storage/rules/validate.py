@@ -17,10 +17,11 @@ from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from drivers.frame import FrameKind
 
-__all__ = ["Finding", "reconstruction_blockers", "source_findings", "validate"]
+__all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
 
 SAMPLES = 4  # frames of a kind that are looked at
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
@@ -44,6 +45,11 @@ def validate(scan: SourceOptions | Path | str) -> list[Finding]:
 
 
 def source_findings(source: ScanSource) -> list[Finding]:
+    """What the rules of this module find in an open scan, and what its monitor flagged."""
+    return [*scan_findings(source), *frames_flagged(source)]
+
+
+def scan_findings(source: ScanSource) -> list[Finding]:
     """What the rules of this module find in an open scan."""
     return [finding for rule in SOURCE_RULES for finding in rule(source)]
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from beamline.cli.recon import repeated, report_beside
+from beamline.monitor.check import Level
 from beamline.storage.writers.recon_file import read_reconstruction
+from recon.assess.metrics import psnr
 from recon.splatting.r2 import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scans import frames_of, write_flagged
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -134,3 +138,19 @@ def test_names() -> None:
     assert report_beside(Path("runs/x/recon.h5")) == Path("runs/x/report.html")
     assert report_beside(Path("walnut_r2.h5")) == Path("walnut_r2.html")
     assert repeated(["recon", "my scan.h5"]) == "beamline recon 'my scan.h5'"
+
+
+def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None:
+    """A third of the views black and flagged: the volume is as good as from the other views, and lost with all."""
+    levels = {4 + i: Level.ALARM for i in range(8, 18)}
+    frames = [replace(f, counts=np.full_like(f.counts, 101)) if f.index in levels else f for f in frames_of(SCAN)]
+    write_flagged(folder / "flagged.h5", frames, levels, SCAN.pixel_size_mm)
+    plain = ("-m", "sirt", "--iterations", "40", "--axis", "20.7", "--air", "none", "--no-report")
+    for name in ("use", "ignore"):
+        result = beamline("recon", "flagged.h5", *plain, "--flags", name, "-o", f"{name}.h5")
+        assert result.exit_code == 0, result.output
+        assert ("10 have an alarm and are left out" in result.stderr) is (name == "use")
+    used, ignored = (read_reconstruction(folder / f"{name}.h5") for name in ("use", "ignore"))
+    truth = SCAN.truth(used.volume.grid)
+    assert psnr(truth, used.volume.data) > psnr(truth, ignored.volume.data) + 10
+    assert (used.parameters["flags"], used.parameters["views_left_out"], used.parameters["n_views"]) == ("use", 10, 20)

@@ -258,3 +258,18 @@ def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monk
     assert recon is not None
     parsed = recon.make_context("recon", command[4:]).params  # and the command understands it
     assert (parsed["seconds"], parsed["axis"], parsed["output"]) == (7.0, 80.5, Path("recon.h5"))
+
+
+def test_7_a_complete_scan_with_alarms_says_so_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    on(monkeypatch, FakeInstrument(Faults(repeats={9, 10, 11})))
+    result = scan("-o", str(tmp_path))
+    assert result.exit_code == 7
+    assert result.stdout.splitlines()[-1].startswith("flagged   stuck 3 alarm; see ")
+    assert "Scan complete: 17 frames, 3 WITH AN ALARM" in result.stderr
+    assert "complete, but 3 of 17 frames have an alarm of the monitor: stuck 3 alarm" in result.stderr.splitlines()[-1]
+    assert rows(tmp_path) == 17
+    on(monkeypatch, FakeInstrument(Faults(repeats={9})))
+    as_json = scan("-o", str(tmp_path / "again"), "--json")
+    done = json.loads(as_json.stdout.splitlines()[-1])
+    assert (as_json.exit_code, done["event"], done["alarmed_frames"]) == (7, "done", 1)
+    assert done["flags"] == {"stuck": {"alarm": 1}}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,8 @@ import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError
 from beamline.core.events import Event
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS, bitmask
 from beamline.monitor.digest import digest
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
@@ -86,6 +88,7 @@ def _schedule(
     status: str | None = "complete",
     axis_col: float | None = None,
     pause: float = 0.0,
+    alarms: Set[int] = frozenset(),
 ) -> None:
     """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
     last one; status None never finishes it."""
@@ -96,7 +99,8 @@ def _schedule(
         writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
 
     def append(frame: Frame) -> Callable[[], None]:
-        return lambda: writers[0].append(frame, digest(frame.counts))
+        flags = bitmask([Flag(CHECKS[0].name, Level.ALARM, frame.index, 1.0, 0.0, "")] if frame.index in alarms else [])
+        return lambda: writers[0].append(frame, digest(frame.counts), flags)
 
     start = clock.time + begin
     clock.due.append((start, create))
@@ -158,6 +162,18 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record.history["n_views"], views)
     assert "<html" in (tmp_path / "report.html").read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "report.html", "scan.h5"]
+
+
+@pytest.mark.parametrize("use_flags", [True, False])
+def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
+    clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
+    selection = Selection(axis_col=SCAN.axis_col, use_flags=use_flags)
+    follow(_options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    parameters = read_reconstruction(tmp_path / "recon.h5").parameters
+    assert set(parameters["view_frames"]) == set(range(4, 34)) - (alarms if use_flags else set())  # type: ignore[arg-type]
+    assert parameters["views_left_out"] == 5 * use_flags
+    assert sum("with an alarm" in str(event.data) or "have an alarm" in str(event.data) for event in events) == 1
 
 
 @pytest.mark.parametrize("late", [FrameKind.FLAT, FrameKind.DARK])

@@ -244,7 +244,8 @@ def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
     assert ran.error is None
     assert ran.result is not None
     assert ran.folder is not None
-    assert ran.result.flags == {"stuck": 3}
+    assert ran.result.flags == {"stuck": {"alarm": 3}}
+    assert ran.result.alarmed_frames == ran.of("scan_done")[0].data["alarmed_frames"] == 3
     assert [(e.data["check"], e.data["view"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
     with h5py.File(ran.folder / "scan.h5") as file:
         flags = file["entry/frame_log/flags"][()]
@@ -372,8 +373,10 @@ def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_pa
     result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
     assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
     with open_scan(result.path) as source:
-        selection = Selection(axis_col=19.5, correction=CorrectionSettings(air="none"))
-        prepared = prepare_projections(source, selection, pytest.fail)
+        selection = Selection(axis_col=19.5, correction=CorrectionSettings(air="none"), use_flags=False)
+        said: list[str] = []
+        prepared = prepare_projections(source, selection, said.append)
+        assert len(said) == 1 and said[0].startswith("--flags ignore")
         assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
     u = (np.arange(40) - 19.5) * pitch
     expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))

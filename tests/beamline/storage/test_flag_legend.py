@@ -17,7 +17,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
-from beamline.storage.flag_legend import LEGEND, FlagBit, flagged_by, read_legend
+from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, read_legend
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import StandingClock
@@ -47,11 +47,14 @@ def test_a_scan_holds_name_bits_unit_and_meaning_of_every_check(path: Path) -> N
         np.testing.assert_array_equal(legend["alarm_bit"][()] - legend["bit"][()], ALARM_SHIFT)
 
 
-def test_info_names_the_checks_also_of_a_file_without_a_legend(path: Path) -> None:
-    assert describe(path)["attributes"]["flags"] == "beam 2, mass 1"
+def test_info_counts_by_check_and_level_also_in_a_file_without_a_legend(path: Path) -> None:
+    expected = {"beam": {"warn": 1, "alarm": 1}, "mass": {"warn": 1}}
+    facts = describe(path)
+    assert (facts["flags"], facts["flagged_frames"], facts["alarmed_frames"]) == (expected, 2, 1)
+    assert counted(facts["flags"]) == "beam 1 warn 1 alarm, mass 1 warn"
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         del file[LEGEND]
-    assert describe(path)["attributes"]["flags"] == "beam 2, mass 1"
+    assert describe(path)["flags"] == expected
 
 
 def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: Path) -> None:
@@ -59,7 +62,7 @@ def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: 
         names = file[f"{LEGEND}/name"]
         names[0] = "a check of a later version"
         assert read_legend(file)[0] == FlagBit("a check of a later version", 0)
-    assert describe(path)["attributes"]["flags"] == "a check of a later version 2, mass 1"
+    assert counted(describe(path)["flags"]) == "a check of a later version 1 warn 1 alarm, mass 1 warn"
 
 
 def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:
@@ -71,9 +74,18 @@ def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:
         assert subprocess.run(words, capture_output=True, text=True, check=True).stdout.split() == NAMES
 
 
-@given(st.lists(st.sets(st.sampled_from(NAMES)), max_size=20))
-def test_counting_undoes_the_bitmask(found: list[set[str]]) -> None:
-    bits = np.array([bitmask(Flag(name, Level.ALARM, 0, 1, 0, "") for name in names) for names in found], np.uint32)
-    counts = {name: sum(name in names for names in found) for name in NAMES}
-    legend = [FlagBit(check.name, check.bit) for check in CHECKS]
-    assert flagged_by(bits, legend) == {name: n for name, n in counts.items() if n}
+LEVELS = (Level.WARN, Level.ALARM)
+
+
+@given(st.lists(st.dictionaries(st.sampled_from(NAMES), st.sampled_from(LEVELS)), max_size=20))
+def test_counting_undoes_the_bitmask(found: list[dict[str, Level]]) -> None:
+    each = [bitmask(Flag(name, level, 0, 1, 0, "") for name, level in frame.items()) for frame in found]
+    flags = FrameFlags(np.array(each, np.uint32), tuple(FlagBit(check.name, check.bit) for check in CHECKS))
+    for name in NAMES:
+        for level in LEVELS:
+            n = sum(frame.get(name) is level for frame in found)
+            assert flags.counts().get(name, {}).get(str(level), 0) == n
+    assert flags.flagged.tolist() == [bool(frame) for frame in found]
+    assert flags.alarmed.tolist() == [Level.ALARM in frame.values() for frame in found]
+    assert flags.after(3).alarmed.tolist() == [False] * 3 + flags.alarmed.tolist()
+    assert flags.of(flags.alarmed).flagged.all()

@@ -1,0 +1,62 @@
+"""Views by their flags: those with an alarm of the monitor are left out, those with a warning weigh less."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage.flag_legend import counted
+from beamline.storage.readers.base import ScanSource
+from drivers.frame import FrameKind
+
+WARNED_WEIGHT = 0.5
+"""Weight of a view with a warning: as if its noise had twice the variance. A warning says that the view differs by more
+than noise, not that it is wrong; views are too few to do without."""
+
+
+@dataclass(frozen=True, eq=False)
+class UsableViews:
+    """The views of a scan that a reconstruction may use.
+
+    Attributes:
+        frames: int64 [view], their rows in the file.
+        weights: float32 [frame of the file], of each row that is a view; None: one for all.
+        left_out: views with an alarm, which are not among them.
+        said: what was done, in a line; empty where no view is flagged.
+    """
+
+    frames: NDArray[np.int64]
+    weights: NDArray[np.float32] | None = None
+    left_out: int = 0
+    said: str = ""
+
+    def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
+        """[view] weights of some rows of the file; None where they all weigh the same."""
+        if self.weights is None or np.ptp(self.weights[rows]) == 0:
+            return None
+        return self.weights[rows]
+
+
+def usable_views(source: ScanSource, use_flags: bool) -> UsableViews:
+    """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike."""
+    views, flags = source.image_key == FrameKind.PROJECTION, source.flags
+    rows = np.flatnonzero(views)
+    if flags is None or not flags.flagged[rows].any():
+        return UsableViews(rows)
+    alarmed = views & flags.alarmed
+    warned = views & flags.flagged & ~alarmed
+    if not use_flags:
+        n = f"{alarmed.sum()} views with an alarm and {warned.sum()} with a warning"
+        said = f"--flags ignore: {n} are used as they are."
+        return UsableViews(rows, said=said)
+    parts = []
+    if alarmed.any():
+        parts.append(f"{alarmed.sum()} have an alarm and are left out ({counted(flags.of(alarmed).counts())})")
+    weights = None
+    if warned.any():
+        parts.append(f"{warned.sum()} have a warning and weigh half ({counted(flags.of(warned).counts())})")
+        weights = np.where(warned, np.float32(WARNED_WEIGHT), np.float32(1))
+    said = f"Of {rows.size} views {', '.join(parts)}. --flags ignore takes all alike."
+    return UsableViews(np.flatnonzero(views & ~alarmed), weights, int(alarmed.sum()), said)

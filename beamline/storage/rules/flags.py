@@ -1,0 +1,39 @@
+"""What the monitor flagged in a scan, as a finding: alarms are a warning, and an error where too few views are left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from beamline.core.text import spans
+from beamline.storage.flag_legend import counted
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.finding import Finding
+from drivers.frame import FrameKind
+
+FEWEST_VIEWS = 10
+"""Views without an alarm that a volume takes at least, where some have one: so few are a sketch of the sample."""
+
+
+def frames_flagged(source: ScanSource) -> Iterator[Finding]:
+    """Number of flagged frames by check and level, and the rows of those with an alarm."""
+    flags = source.flags
+    if flags is None or not flags.flagged.any():
+        return
+    rows = np.flatnonzero(flags.alarmed)
+    message = f"The monitor flagged {flags.flagged.sum()} of {flags.bits.size} frames: {counted(flags.counts())}."
+    if not rows.size:
+        yield Finding("info", "flags", message)
+        return
+    message += f" Rows with an alarm: {spans(rows.tolist())}."
+    views = source.image_key == FrameKind.PROJECTION
+    left, lost = int((views & ~flags.alarmed).sum()), int((views & flags.alarmed).sum())
+    if lost and left < FEWEST_VIEWS:
+        message += (
+            f" {left} of {views.sum()} views have none, {FEWEST_VIEWS} are needed: repeat the scan. `beamline recon "
+            "--flags ignore` takes all views all the same."
+        )
+        yield Finding("error", "flags", message)
+        return
+    yield Finding("warning", "flags", f"{message} A reconstruction leaves such views out.")
