@@ -87,6 +87,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         correction=CorrectionSettings(air=rest.pop("air")),
         seed=seed,
         use_flags=rest.pop("flags") == "use",
+        accept_references=rest.pop("references") == "accept",
     )
     return SourceOptions(file, **rest), selection
 
@@ -148,5 +149,13 @@ _AFTER = (
         default="use",
         show_default=True,
         help="use: views with an alarm of the monitor are left out, with a warning weigh half; ignore: all are alike.",
+    ),
+    click.option(
+        "--references",
+        type=click.Choice(["check", "accept"]),
+        default="check",
+        show_default=True,
+        help="check: groups of darks and flats that are saturated, dark, uneven or lit are left out, and refused where "
+        "no other is left; accept: all are used as they are.",
     ),
 )

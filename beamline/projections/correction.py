@@ -13,6 +13,7 @@ from beamline.core.errors import DataError
 from beamline.projections.read import read_binned, read_references
 from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import reference_groups
 from drivers.frame import FrameKind
 from recon.prep.correct import Correction, Projections, References
 
@@ -29,7 +30,7 @@ class ScanCorrection:
     """
 
     def __init__(self, source: ScanSource, selection: Selection, warn: Warn) -> None:
-        """Read the reference frames that the scan has.
+        """Read the reference frames that the scan has; groups with a fault only where no other is left.
 
         Raises:
             ConfigError: rows or binning that do not fit the detector.
@@ -40,7 +41,9 @@ class ScanCorrection:
         self._n_references = _count_references(source)
         self._references: References | None = None
         if source.quantity == "counts":
-            self._references = read_references(source, self.rows, self.binning)
+            groups = reference_groups(source)
+            used = groups if selection.accept_references else groups.good()
+            self._references = read_references(source, used, self.rows, self.binning)
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 

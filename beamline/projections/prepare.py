@@ -23,7 +23,8 @@ from beamline.projections.selection import (
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
-from beamline.storage.rules.validate import beam_present, quantity_said, references_present, scan_findings
+from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.prep.align import AxisEstimate, find_axis
@@ -87,7 +88,7 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
         ConfigError: the selection does not fit the scan.
     """
     usable = flagged_views(source, selection, warn)
-    check(source, warn)
+    check(source, selection, warn)
     scan_frames = usable.frames
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
     correction = ScanCorrection(source, selection, warn)
@@ -123,13 +124,18 @@ def flagged_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     return usable
 
 
-def check(source: ScanSource, warn: Warn) -> None:
+def check(source: ScanSource, selection: Selection, warn: Warn) -> None:
     """Refuse a finished scan that cannot be reconstructed; warn of what else its file lacks.
 
     Raises:
         DataError: with what to do about it.
     """
     findings = scan_findings(source)
+    if selection.accept_references:
+        for finding in references_usable(source):
+            warn(f"--references accept: {finding.message}")
+    else:
+        findings += references_usable(source)
     refuse(source, findings)
     for finding in findings:
         if finding.severity == "warning":
@@ -184,9 +190,10 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
         raise DataError(f"{source.path} cannot be reconstructed. {finding.message}")
 
 
-def correction_blockers(source: ScanSource) -> list[Finding]:
+def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
     """Why the frames of a scan that is still growing cannot be corrected."""
-    return [finding for rule in (quantity_said, references_present, beam_present) for finding in rule(source)]
+    rules = (quantity_said, references_present, *(() if selection.accept_references else (references_usable,)))
+    return [finding for rule in rules for finding in rule(source)]
 
 
 def stated_axis(source: ScanSource) -> float:

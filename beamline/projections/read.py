@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import ReferenceGroups
 from drivers.frame import FrameKind
 from recon.prep.correct import References
 
@@ -44,21 +45,16 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def read_references(source: ScanSource, rows: slice, binning: int) -> References:
+def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, binning: int) -> References:
     """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
 
     The light of flats with an exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat,
     where both are known. The dark is one for all: the file's rules tell where it was exposed otherwise.
     """
-    dark_frames = np.flatnonzero(source.image_key == FrameKind.DARK)
-    flat_frames = np.flatnonzero(source.image_key == FrameKind.FLAT)
-    dark = _mean(source, dark_frames, rows, binning)
+    dark = _mean(source, np.concatenate(groups.darks), rows, binning)
     scale = light_scale(source.image_key, source.exposures)
-    # Flats with no projection between them were taken together.
-    views_before = np.cumsum(source.image_key == FrameKind.PROJECTION)[flat_frames]
-    groups = np.split(flat_frames, np.flatnonzero(np.diff(views_before)) + 1)
     flats = []
-    for group in groups:
+    for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group])
         flats.append((float(group.mean()), (mean + (1 - scale[group].mean()) * dark).astype(np.float32)))
     return References(dark.astype(np.float32), tuple(flats))

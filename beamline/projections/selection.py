@@ -29,6 +29,7 @@ class Selection:
         correction: of counts to line integrals.
         seed: of random view selections.
         use_flags: views with an alarm of the monitor are left out, those with a warning weigh less.
+        accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
     """
 
     views: str = "all"
@@ -40,6 +41,7 @@ class Selection:
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
     seed: int = 0
     use_flags: bool = True
+    accept_references: bool = False
 
 
 def choose_views(

@@ -82,7 +82,7 @@ class ScanFollower:
             self._taken = n
             return grown
         if self._correction is None:
-            blockers = correction_blockers(self.source)
+            blockers = correction_blockers(self.source, self._options.selection)
             if not ended and (self._late or any(finding.rule == "references" for finding in blockers)):
                 self._wait_for_references()
                 return grown
@@ -219,7 +219,7 @@ class ScanFollower:
             DataError: a scan without two views that can be used, or whose views hold no matter.
         """
         usable = flagged_views(self.source, self._options.selection, self._warn)
-        check(self.source, self._warn)
+        check(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
         self._correct_again()
         prepared = self._prepared(self.axis_col, usable)

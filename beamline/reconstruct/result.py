@@ -123,6 +123,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "view_angles_deg": np.degrees(geometry.angles),
         "n_views": geometry.n_views,
         "n_projections": prepared.n_projections,
+        "references": "accept" if selection.accept_references else "check",
         "flags": "use" if selection.use_flags else "ignore",
         "views_left_out": prepared.left_out,
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),

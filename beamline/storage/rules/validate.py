@@ -19,6 +19,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
+from beamline.storage.rules.references import references_usable
 from drivers.frame import FrameKind
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
@@ -45,8 +46,8 @@ def validate(scan: SourceOptions | Path | str) -> list[Finding]:
 
 
 def source_findings(source: ScanSource) -> list[Finding]:
-    """What the rules of this module find in an open scan, and what its monitor flagged."""
-    return [*scan_findings(source), *frames_flagged(source)]
+    """What the rules of this module find in an open scan, what is wrong with its references, and what is flagged."""
+    return [*scan_findings(source), *references_usable(source), *frames_flagged(source)]
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
@@ -130,22 +131,6 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
             )
 
 
-def beam_present(source: ScanSource) -> Iterator[Finding]:
-    """Flats are brighter than darks: a closed shutter or a lost beam leaves nothing to reconstruct."""
-    flats, darks = _sample(source, FrameKind.FLAT), _sample(source, FrameKind.DARK)
-    if source.quantity != "counts" or flats is None or darks is None:
-        return
-    flat, dark = _median(flats), _median(darks)
-    noise = max(1.4826 * _median(np.abs(darks - dark)), 0.5)  # robust: hot pixels do not count
-    if not flat - dark > BEAM_SIGMA * noise:
-        yield Finding(
-            "error",
-            "no-beam",
-            f"There is no beam in it: the flats (median {flat:g}) are not brighter than the darks (median {dark:g}, "
-            f"noise {noise:.2g}). It must not be reconstructed; was the shutter open?",
-        )
-
-
 def exposures_agree(source: ScanSource) -> Iterator[Finding]:
     """Darks are exposed as long as the projections, and the projections alike; flats may have an exposure of their own,
     for their light is scaled to the projections'."""
@@ -210,7 +195,6 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     angles_spread,
     quantity_said,
     references_present,
-    beam_present,
     exposures_agree,
     pixels_measured,
     series_complete,
@@ -226,11 +210,6 @@ def _sample(source: ScanSource, kind: FrameKind) -> NDArray[Any] | None:
     chosen = np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))
     middle = source.shape[0] // 2
     return source.read(rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
-
-
-def _median(values: NDArray[Any]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else np.nan
 
 
 def _as_hdf5(path: Path) -> list[Finding]:

@@ -101,7 +101,7 @@ def test_the_fixtures_are_described(folder: Path, shared_data: Path) -> None:
         result = _beamline("info", str(shared_data / "fixtures" / name))
         assert result.exit_code == 0, result.output
         assert "reconstructable" in result.stdout
-    assert "There is no beam in it" in result.stdout
+    assert "there is no beam in them" in result.stdout
 
 
 def _stack(folder: Path) -> Path:

@@ -23,8 +23,9 @@ def test_only_what_was_asked_for_is_read() -> None:
     selection = Selection(views="first:5", rows=(1, 3), axis_col=20.7, correction=CorrectionSettings(air="none"))
     correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
     correction.at_once(np.arange(2, 7))
-    assert {rows for _, rows in source.was_read} == {2}
-    assert sorted(f for frames, _ in source.was_read for f in frames) == [0, 1, 2, 3, 4, 5, 6]
+    assert {rows for frames, rows in source.was_read if min(frames) >= 2} == {2}
+    assert max(len(frames) for frames, rows in source.was_read if rows == 4) == 1  # a whole reference, to judge it
+    assert {f for frames, _ in source.was_read for f in frames} == {0, 1, 2, 3, 4, 5, 6}
 
 
 @pytest.mark.parametrize("air", ["auto", "none", (3, 3)])

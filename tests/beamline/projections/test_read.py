@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.projections.read import read_binned, read_references
+from beamline.storage.rules.references import ReferenceGroups, groups_of
+from drivers.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 
 
@@ -46,7 +48,9 @@ def test_bins_are_means_of_what_is_finite(rows: int, cols: int, binning: int, ho
 def test_flats_are_grouped_by_the_views_between_them() -> None:
     keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
     data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
-    references = read_references(ArraySource(data, keys, np.zeros(12)), slice(0, 2), 1)  # type: ignore[arg-type]
+    source = ArraySource(data, keys, np.zeros(12))
+    darks, flats = (groups_of(source.image_key, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
+    references = read_references(source, ReferenceGroups(darks, flats, ()), slice(0, 2), 1)  # type: ignore[arg-type]
     assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
         (1.5, 1.5),
         (7.0, 7.0),

@@ -216,7 +216,7 @@ def huge_pixels(file: h5py.File) -> None:
         (not_finished, "warning", "unfinished", "14 frames can be trusted"),
         (stopped, "warning", "unfinished", "'stopped'"),
         (lost_triggers, "warning", "missing-frames", "2 triggers"),
-        (no_beam, "error", "no-beam", "was the shutter open"),
+        (no_beam, "error", "bad-references", "Was the shutter open"),
         (dead_projections, "error", "pixels", "is 65535"),
         (huge_pixels, "error", "pixel-size", "4600 mm"),
     ],
@@ -309,7 +309,7 @@ def test_describe(write: Write, frames: list[Frame]) -> None:
 def test_the_beamless_scan_is_refused(shared_data: Path) -> None:
     with open_scan(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx") as source:
         blockers = reconstruction_blockers(source)
-    assert [finding.rule for finding in blockers] == ["no-beam"]
+    assert [finding.rule for finding in blockers] == ["bad-references"]
     assert "must not be reconstructed" in blockers[0].message
     assert describe(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx")["reconstructable"] is False
 

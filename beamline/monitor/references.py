@@ -1,0 +1,273 @@
+"""Darks and flats judged as groups: saturated, without light, uneven, or lit though they should be dark.
+
+A volume is lost by bad references as surely as by bad views, so they are judged before the first projection is taken,
+and once more before a file is reconstructed. All functions are pure: values of frames in, faults with figures out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from beamline.core.text import spans
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.preview import thinned
+from drivers.frame import FrameKind
+
+NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+LEAST_NOISE = 0.5  # counts: what rounding hides
+BRIGHT = 90.0  # percentile of a frame's blocks that stands for its light
+UNLIT = 0.05  # of the bright part's light: a place with less has none
+CHANGE_SIGMAS = 8.0  # beyond which a change between two flats is no noise
+WORST = 99.0  # percentile of the changes between two flats that counts: a zinger is no change
+
+
+@dataclass(frozen=True)
+class ReferenceLimits:
+    """Limits of the references, each with its reason.
+
+    saturated: as the alarm of the check `saturation`: a cosmic ray hits a pixel or two, one in a thousand is exposure.
+    beam: a flat at the darks' level has no light; three times the noise of a pixel is the least that can be told.
+    lost: as the check `beam`: half of the light does not go by drift, top-up or decay of the ring's current.
+    uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
+    unlit: a beam may be narrower than the detector, but not so that most of it is dark.
+    lit: darks that are lit have a share of the flats' level and, since light brings its noise, of their variance;
+        an offset has the first alone and readout noise the second. A fifth of both is neither.
+    """
+
+    saturated: Annotated[float, Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")] = 1e-3
+    beam: Annotated[float, Field(ge=0, description="light of a flat over the noise of a pixel of the darks")] = 3.0
+    lost: Annotated[float, Field(gt=0, lt=1, description="light that is gone, of the brightest group of flats")] = 0.5
+    uneven: Annotated[float, Field(gt=0, description="relative change of the light between flats of a group")] = 0.1
+    unlit: Annotated[float, Field(gt=0, le=1, description="fraction of the frame that flats leave dark")] = 0.5
+    lit: Annotated[float, Field(gt=0, lt=1, description="level and variance of darks over those of flats")] = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What is kept of a dark or a flat.
+
+    Attributes:
+        row: in the file.
+        kind: DARK or FLAT.
+        exposure: s, NaN where unknown.
+        saturated: fraction of the pixels at or above the saturation value.
+        blocks: float32, means of blocks of pixels; a part of the preview where that is large.
+        block: pixels a side of a block.
+    """
+
+    row: int
+    kind: FrameKind
+    exposure: float
+    saturated: float
+    blocks: NDArray[np.float32]
+    block: int
+
+    @classmethod
+    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> Reference:
+        blocks = np.array(digest.preview[thinned(digest.preview)])
+        return cls(row, kind, exposure, digest.saturated_fraction, blocks, block)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a group.
+
+    Attributes:
+        what: "saturated", "dark", "lost", "uneven", "unlit" or "lit".
+        score, limit: the figure, and the limit that it breaks.
+        message: both in words, and what to do.
+    """
+
+    what: str
+    score: float
+    limit: float
+    message: str
+
+
+@dataclass(frozen=True)
+class JudgedGroup:
+    """References that were taken together.
+
+    Attributes:
+        kind: DARK or FLAT.
+        rows: all of them, in the file.
+        faults: none for a good group.
+    """
+
+    kind: FrameKind
+    rows: tuple[int, ...]
+    faults: tuple[Fault, ...]
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind.name.lower()}s {spans(self.rows)}"
+
+    def described(self) -> str:
+        """Its name, and its faults in words."""
+        return f"The {self.name}: {' '.join(fault.message for fault in self.faults)}"
+
+
+Group = Sequence[Reference]
+
+
+def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None) -> tuple[JudgedGroup, ...]:
+    """Judge groups of darks and flats, each by itself and beside the others.
+
+    Args:
+        groups: of one kind each, none empty, in the order of the file.
+    """
+    limits = limits or ReferenceLimits()
+    base = min((group for group in groups if group[0].kind is FrameKind.DARK), key=_level, default=None)
+    flats = [group for group in groups if group[0].kind is FrameKind.FLAT]
+    known = [group for group in flats if _saturated(group, base, limits) is None] or flats
+    bright = max(known, key=lambda group: _light(group, base), default=None)
+    found = []
+    for group in groups:
+        if group[0].kind is FrameKind.DARK:
+            faults = [] if bright is None else [_lit(group, bright, base or group, limits)]
+        else:
+            faults = [_saturated(group, base, limits), _without_beam(group, base, bright or group, limits)]
+            if not any(faults):
+                faults = [_uneven(group, base, limits), _unlit(group, base, limits)]
+        rows = tuple(reference.row for reference in group)
+        found.append(JudgedGroup(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
+    return tuple(found)
+
+
+def full_scale(largest: float) -> float:
+    """The count at which a detector saturates whose largest count is known: the end of its 8, 10, 12, 14 or 16 bits."""
+    return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if 2**bits > largest), np.inf)
+
+
+def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
+    hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
+    score = float(np.median([flat.saturated for flat in flats])) - hot
+    if score <= limits.saturated:
+        return None
+    said = (
+        f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
+        "Shorten the exposure or add a filter: `beamline tune` says how far."
+    )
+    return Fault("saturated", score, limits.saturated, said)
+
+
+def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: ReferenceLimits) -> Fault | None:
+    if darks is None:
+        return None
+    if not _has_light(flats, darks, limits):
+        light, noise = _level(flats) - _level(darks), max(_noise(darks), LEAST_NOISE)
+        said = (
+            f"there is no beam in them: their level {_level(flats):.6g} is {light:.3g} above the darks' "
+            f"{_level(darks):.6g}, and a pixel has a noise of {noise:.2g} (limit {limits.beam:g} times that). Was the "
+            "shutter open for them, and closed for the darks?"
+        )
+        return Fault("dark", light / noise, limits.beam, said)
+    most = _light(bright, darks)
+    gone = 1 - _light(flats, darks) / most
+    if gone <= limits.lost:
+        return None
+    where = spans([reference.row for reference in bright])
+    said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.lost:.0%}): the beam was lost."
+    return Fault("lost", gone, limits.lost, said)
+
+
+def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
+    """The light of each flat against the group's mean, as a whole and place by place."""
+    if len(flats) < 2:
+        return None
+    light = np.stack([(flat.blocks - _offset(darks)) / _seconds(flat) for flat in flats])
+    mean = light.mean(axis=0)
+    lit = mean > UNLIT * np.nanpercentile(mean, BRIGHT)
+    if not lit.any():
+        return None
+    ratio = light[:, lit] / mean[lit]
+    levels = np.median(ratio, axis=1)
+    local = np.abs(ratio / levels[:, None] - 1)
+    noise = NORMAL * np.median(local)
+    level = float(np.ptp(levels))
+    place = float(np.percentile(local, WORST, axis=1).max())
+    if level > limits.uneven:
+        said = (
+            f"their light changes by {level:.0%} from flat to flat (limit {limits.uneven:.0%}): the beam was unstable."
+        )
+        return Fault("uneven", level, limits.uneven, said)
+    if place > max(limits.uneven, CHANGE_SIGMAS * noise):
+        said = (
+            f"in places their light changes by {place:.0%} from flat to flat (limit {limits.uneven:.0%}): something "
+            "moved in the beam. Is the sample out?"
+        )
+        return Fault("uneven", place, limits.uneven, said)
+    return None
+
+
+def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
+    light = np.mean([flat.blocks - _offset(darks) for flat in flats], axis=0)
+    score = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean())
+    if score <= limits.unlit:
+        return None
+    said = (
+        f"{score:.0%} of the frame has no light in them (limit {limits.unlit:.0%}): move beam and detector onto one "
+        "another, or read fewer pixels."
+    )
+    return Fault("unlit", score, limits.unlit, said)
+
+
+def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fault | None:
+    if not _has_light(flats, base, limits):
+        return None  # both have the same light: which of them is wrong cannot be told, and the flats' fault says it
+    level = _level(darks) / _level(flats) if _level(flats) > 0 else np.inf
+    noise, of_flats = _noise(darks), _noise(flats)
+    known = of_flats > 0  # else the frames have no noise, which only simulated ones have not
+    variance = (noise / of_flats) ** 2 if known else level
+    score = min(level, variance)
+    limit = limits.lit if known else max(limits.lit, 0.5)
+    if score <= limit or _level(darks) <= 0:
+        return None
+    said = (
+        f"there is light in them: their level {_level(darks):.6g} is {level:.0%} of the flats' {_level(flats):.6g}"
+        + (f" and their variance {variance:.0%}" if known else "")
+        + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
+    )
+    return Fault("lit", score, limit, said)
+
+
+def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
+    return _level(flats) - _level(darks) > limits.beam * max(_noise(darks), LEAST_NOISE)
+
+
+def _level(group: Group) -> float:
+    """Counts of the bright part of a frame: a beam may be narrower than the detector."""
+    return float(np.median([np.nanpercentile(reference.blocks, BRIGHT) for reference in group]))
+
+
+def _offset(darks: Group | None) -> NDArray[np.float32] | float:
+    return 0.0 if darks is None else np.asarray(np.mean([dark.blocks for dark in darks], axis=0))
+
+
+def _seconds(reference: Reference) -> float:
+    return reference.exposure if reference.exposure > 0 else 1.0
+
+
+def _light(group: Group, darks: Group | None) -> float:
+    """Counts above the darks, a second where the exposure is known."""
+    offset = 0.0 if darks is None else _level(darks)
+    return float(np.median([(np.nanpercentile(flat.blocks, BRIGHT) - offset) / _seconds(flat) for flat in group]))
+
+
+def _noise(group: Group) -> float:
+    """Standard deviation of a pixel from frame to frame; of a single frame, from place to place."""
+    if len(group) == 1:
+        blocks, pairs = group[0].blocks, 1.0
+        change = blocks - np.nanmedian(blocks)
+    else:
+        # Neighbours in time share slow drift and all fixed pattern.
+        before, after = (np.stack([r.blocks for r in part]) for part in (group[:-1], group[1:]))
+        change, pairs = after - before, 2.0
+        change = change - np.nanmedian(change, axis=(1, 2), keepdims=True)
+    return float(NORMAL * np.nanmedian(np.abs(change)) / np.sqrt(pairs) * group[0].block)

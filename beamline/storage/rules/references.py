@@ -1,0 +1,98 @@
+"""Darks and flats of a file: which were taken together, which groups are good, and what is said about the others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.digest import digest
+from beamline.monitor.references import JudgedGroup, Reference, ReferenceLimits, full_scale, judge
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.finding import Finding
+from drivers.frame import FrameKind
+
+SAMPLES = 4  # frames of a group that are looked at
+BLOCK = 4  # pixels a side
+
+Frames = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceGroups:
+    """Darks and flats of a scan, by groups.
+
+    Attributes:
+        darks, flats: rows of each group, in the order of the file.
+        judged: what was found of each of them, the darks first.
+    """
+
+    darks: tuple[Frames, ...]
+    flats: tuple[Frames, ...]
+    judged: tuple[JudgedGroup, ...]
+
+    def good(self) -> ReferenceGroups:
+        """The groups without a fault; of a kind that has none, all groups."""
+        ok = [not group.faults for group in self.judged]
+        dark_ok, flat_ok = ok[: len(self.darks)], ok[len(self.darks) :]
+        return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)
+
+    def lacking(self) -> tuple[JudgedGroup, ...]:
+        """The groups of a kind of which none is good."""
+        return tuple(
+            group for group in self.judged if all(other.faults for other in self.judged if other.kind is group.kind)
+        )
+
+
+def _kept(groups: tuple[Frames, ...], ok: list[bool]) -> tuple[Frames, ...]:
+    return tuple(group for group, good in zip(groups, ok, strict=True) if good) if any(ok) else groups
+
+
+def groups_of(image_key: NDArray[np.int32], kind: FrameKind) -> tuple[Frames, ...]:
+    """Rows of the references of a kind, by groups: those with no projection between them were taken together."""
+    rows = np.flatnonzero(image_key == kind)
+    before = np.cumsum(image_key == FrameKind.PROJECTION)[rows]
+    return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
+
+
+def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
+    """The groups of references of a scan of counts, judged by a few frames of each."""
+    darks, flats = (groups_of(source.image_key, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
+    looked_at = [[_reference(source, int(row)) for row in _some(group)] for group in (*darks, *flats)]
+    found = judge(looked_at, limits)
+    whole = [JudgedGroup(j.kind, tuple(g.tolist()), j.faults) for j, g in zip(found, (*darks, *flats), strict=True)]
+    return ReferenceGroups(darks, flats, tuple(whole))
+
+
+def references_usable(source: ScanSource) -> Iterator[Finding]:
+    """Flats that are lit, whole and even, and darks that are dark; a bad group beside a good one is left out."""
+    if source.quantity == "counts":
+        yield from reference_findings(reference_groups(source))
+
+
+def reference_findings(groups: ReferenceGroups) -> Iterator[Finding]:
+    """An error for each group of a kind of which none is good, a warning for others that have a fault."""
+    lacking = groups.lacking()
+    for group in groups.judged:
+        if group in lacking:
+            message = (
+                f"{group.described()} It must not be reconstructed: take new {group.kind.name.lower()}s, or give "
+                f"others with --{group.kind.name.lower()}s; `beamline recon --references accept` uses these all the "
+                "same."
+            )
+            yield Finding("error", "bad-references", message)
+        elif group.faults:
+            yield Finding("warning", "bad-references", f"{group.described()} The other ones are used instead.")
+
+
+def _some(group: Frames) -> Frames:
+    return group[np.unique(np.linspace(0, group.size - 1, SAMPLES).astype(int))]
+
+
+def _reference(source: ScanSource, row: int) -> Reference:
+    image = source.read([row])[0]
+    saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
+    found = digest(image, saturation, BLOCK)
+    return Reference.of(row, FrameKind(int(source.image_key[row])), float(source.exposures[row]), found, BLOCK)

@@ -1,0 +1,150 @@
+"""Groups of darks and flats with one fault each: the fault is found with its figure, and good groups have none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from beamline.monitor.digest import digest
+from beamline.monitor.references import JudgedGroup, Reference, ReferenceLimits, full_scale, judge
+from drivers.frame import FrameKind
+
+SHAPE = (64, 80)
+OFFSET, READ, GAIN = 100.0, 3.0, 2.0  # counts, counts, counts a photon
+PHOTONS = 5000.0
+FULL = 65535
+
+Images = list[NDArray[np.float64]]
+
+
+def frames(n: int, photons: float | NDArray[np.float64], seed: int, gain: float = GAIN) -> Images:
+    rng = np.random.default_rng(seed)
+    light = np.broadcast_to(np.asarray(photons, float), SHAPE)
+    hot = np.zeros(SHAPE)
+    hot[3, 5] = hot[40, 7] = FULL
+    return [
+        np.clip(OFFSET + hot + gain * rng.poisson(light) + rng.normal(0, READ, SHAPE), 0, FULL).round()
+        for _ in range(n)
+    ]
+
+
+def group(images: Images, kind: FrameKind, first: int = 0, exposure: float = 0.1) -> list[Reference]:
+    return [
+        Reference.of(first + i, kind, exposure, digest(image.astype(np.uint16), FULL), 4)
+        for i, image in enumerate(images)
+    ]
+
+
+def darks(photons: float = 0.0, n: int = 5) -> list[Reference]:
+    return group(frames(n, photons, 1), FrameKind.DARK)
+
+
+def flats(images: Images, first: int = 10) -> list[Reference]:
+    return group(images, FrameKind.FLAT, first)
+
+
+def faults(found: tuple[JudgedGroup, ...]) -> list[list[str]]:
+    return [[fault.what for fault in group.faults] for group in found]
+
+
+def profile() -> NDArray[np.float64]:
+    """A beam narrower than the detector, with stripes."""
+    r, c = np.indices(SHAPE)
+    stripes = 1 + 0.1 * np.sin(r / 3)
+    return PHOTONS * stripes * np.exp(-(((r - 30) / 20) ** 2) - ((c - 40) / 60) ** 2)
+
+
+@pytest.mark.parametrize("photons", [PHOTONS, 30.0, 30_000.0, profile()])
+@pytest.mark.parametrize("n", [1, 2, 10])
+def test_good_references_have_no_fault(photons: float | NDArray[np.float64], n: int) -> None:
+    assert faults(judge([darks(n=n), flats(frames(n, photons, 2))])) == [[], []]
+
+
+def saturated(images: Images) -> Images:
+    return [image * 20 for image in images]
+
+
+def dimmed(images: Images) -> Images:
+    return frames(len(images), 0.2, 3)
+
+
+def flickering(images: Images) -> Images:
+    return [OFFSET + (image - OFFSET) * (1 - 0.05 * i) for i, image in enumerate(images)]
+
+
+def crossed(images: Images) -> Images:
+    """A sample on its way out of the beam in the first flat."""
+    first = images[0].copy()
+    first[:, :10] = OFFSET + 0.5 * (first[:, :10] - OFFSET)
+    return [first, *images[1:]]
+
+
+def slit(images: Images) -> Images:
+    dark = frames(len(images), 0.0, 4)
+    return [np.where(np.arange(SHAPE[0])[:, None] < 24, image, d) for image, d in zip(images, dark, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what", "said"),
+    [
+        (saturated, "saturated", "of their pixels are saturated (limit 0.10%)"),
+        (dimmed, "dark", "there is no beam in them"),
+        (flickering, "uneven", "changes by 22% from flat to flat (limit 10%)"),
+        (crossed, "uneven", "something moved in the beam"),
+        (slit, "unlit", "62% of the frame has no light"),
+    ],
+)
+def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], Images], what: str, said: str) -> None:
+    found = judge([darks(), flats([np.clip(i, 0, FULL) for i in spoil(frames(5, PHOTONS, 2))])])
+    assert faults(found) == [[], [what]]
+    (fault,) = found[1].faults
+    assert said in fault.message
+    assert fault.score > fault.limit or what == "dark"
+    assert found[1].described().startswith("The flats 10-14: ")
+
+
+@pytest.mark.parametrize("share", [0.25, 0.6])
+def test_darks_with_light_are_told_from_darks_with_an_offset(share: float) -> None:
+    """Light brings its noise: 25 photons on an offset of 100 counts are no lit darks, a leaking shutter is."""
+    found = judge([darks(share * PHOTONS), flats(frames(5, PHOTONS, 2))])
+    assert faults(found) == [["lit"], []]
+    assert "there is light in them" in found[0].faults[0].message
+    faint = judge([darks(), flats(frames(5, 25.0, 2))])
+    assert faults(faint) == [[], []]
+
+
+def test_darks_and_flats_with_the_same_light_are_the_flats_fault() -> None:
+    found = judge([darks(PHOTONS), flats(frames(5, PHOTONS, 2))])
+    assert faults(found) == [[], ["dark"]]
+    assert "open for them, and closed for the darks" in found[1].faults[0].message
+
+
+def test_a_group_that_lost_the_beam_is_judged_by_the_others() -> None:
+    dim = flats(frames(5, 0.02 * PHOTONS, 5), first=200)
+    good = flats(frames(5, PHOTONS, 2))
+    assert faults(judge([darks(), good, dim])) == [[], [], ["lost"]]
+    assert faults(judge([darks(), dim])) == [[], []]  # by itself it is a dim flat
+    # Twice the exposure, half the beam: the same counts, and still half of the light is not gone by more than the limit
+    half = [replace(flat, exposure=0.2) for flat in flats(frames(5, PHOTONS, 6), first=200)]
+    assert faults(judge([darks(), good, half])) == [[], [], []]
+    third = [replace(flat, exposure=0.3) for flat in half]
+    assert faults(judge([darks(), good, third])) == [[], [], ["lost"]]
+
+
+def test_limits_are_what_they_say() -> None:
+    flickers = flats(flickering(frames(5, PHOTONS, 2)))
+    assert faults(judge([darks(), flickers], ReferenceLimits(uneven=0.3))) == [[], []]
+    assert faults(judge([darks(0.25 * PHOTONS), flats(frames(5, PHOTONS, 2))], ReferenceLimits(lit=0.5))) == [[], []]
+
+
+@given(st.integers(0, 65535))
+def test_a_detector_saturates_at_the_end_of_its_bits(count: int) -> None:
+    scale = full_scale(count)
+    assert scale >= count and np.log2(scale + 1) in (8, 10, 12, 14, 16)
+    assert count > scale / 4 or scale == 255
