@@ -1,7 +1,7 @@
 """The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes.
 
 Exit codes: 0 done; 1 defect (with a traceback); 2 usage or configuration; 3 device; 4 stopped with reduced data;
-5 data or disk; 6 finished but a quality limit failed; 7 scan complete, but with alarms of the monitor; 130 interrupted.
+5 data or disk; 6 a quality limit failed; 7 scan complete, but with alarms of the monitor; 130 interrupted.
 """
 
 from __future__ import annotations

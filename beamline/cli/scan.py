@@ -49,7 +49,8 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
     Exit code: 0 done, 2 wrong configuration or violated limit, 3 device failed, 4 stopped, 5 frames missing or disk
-    error, 7 complete but frames have an alarm of the monitor, 130 aborted, or interrupted before the first frame.
+    error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, 130 aborted, or
+    interrupted before the first frame.
     """
     with json_events(as_json) as json_sinks:
         config = load(file, overrides)

@@ -8,6 +8,7 @@ from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_valid
 
 from beamline.config.devices import DeviceSection
 from beamline.config.monitor import MonitorSection
+from beamline.config.references import ReferencesSection
 from beamline.config.section import Section
 from beamline.plan.plan import Mode, Place
 from recon.methods import DEFAULT, names
@@ -157,6 +158,7 @@ class Config(Section):
     optics: Optics
     storage: Storage = Storage()
     monitor: MonitorSection = MonitorSection()
+    references: ReferencesSection = ReferencesSection()
     recon: Recon = Recon()
     simulation: Simulation | None = None
 

@@ -31,6 +31,12 @@ class ScanStopped(BeamlineError):  # noqa: N818 - an outcome, not a defect
     exit_code = 4
 
 
+class ReferencesError(ScanStopped):
+    """Stopped before the first projection, because the darks or flats cannot be used."""
+
+    exit_code = 6
+
+
 class DataError(BeamlineError):
     """Bad data or disk: unreadable input, lost frames, no free space."""
 

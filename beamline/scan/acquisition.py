@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamline.core.errors import BeamlineError, InstrumentError, ScanStopped
+from beamline.core.errors import BeamlineError, InstrumentError, ReferencesError, ScanStopped
 from beamline.core.events import Emit
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import spans
@@ -38,6 +38,8 @@ class Acquisition:
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: takes (event, data) for block_started, block_done and warning.
+        refusal: asked once, before the first projection, when all frames before it were taken over: why no projection
+            should be taken; None: they may be.
     """
 
     def __init__(
@@ -49,9 +51,11 @@ class Acquisition:
         clock: Clock,
         stop: StopRequest,
         emit: Emit = lambda event, data: None,
+        refusal: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
         self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit)
+        self._refusal, self._refused = refusal, ""
         self._done: list[TakenBlock] = []
         self.unsafe = False
         """A device failed while the instrument was made safe: stage, camera or shutter may be as during the scan."""
@@ -76,6 +80,7 @@ class Acquisition:
         Raises:
             LedgerError: frames are missing, or some have no trigger; all others were delivered with their angles.
             ScanStopped: a stop was requested, and the scan has ended in order.
+            ReferencesError: no projection was taken, by the `refusal`.
             ScanAborted: an abort, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """
@@ -103,6 +108,9 @@ class Acquisition:
                 raise ScanAborted(f"Aborted: {self._stop.reason}.")
             if self._stop.stopping and not self._still_needed(block):
                 continue
+            if block.kind is FrameKind.PROJECTION and (refused := self._refusal()):
+                self._refused = refused
+                return
             done = TakenBlock(block, Taken())
             self._done.append(done)
             what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.n, "first_row": self.n_frames}
@@ -187,6 +195,8 @@ class Acquisition:
         planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
+        if self._refused:
+            raise ReferencesError(self._refused)
         if self._stop.stopping:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before anything was acquired: {self._stop.reason}.")

@@ -21,6 +21,7 @@ from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import Monitor, look
 from beamline.plan.plan import Timeline
+from beamline.scan.references import ReferenceLog
 from drivers.frame import Frame
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
@@ -51,6 +52,7 @@ class Recorder:
     Attributes:
         n_frames: written so far.
         alarmed_frames: frames so far with an alarm of any check.
+        references: the darks and flats so far.
     """
 
     def __init__(
@@ -72,9 +74,12 @@ class Recorder:
         self.n_frames = 0
         self._flagged: Counter[tuple[str, Level]] = Counter()
         self.alarmed_frames = 0
+        self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
         low, high = WAITING_FRAMES
-        self._waiting: Queue[Frame | None] = Queue(min(max(WAITING_BYTES // timeline.frame_bytes, low), high))
+        self._waiting: Queue[Frame | threading.Event | None] = Queue(
+            min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
+        )
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -87,8 +92,23 @@ class Recorder:
         self._enqueue(frame)
         self._raise_failure()
 
+    def wait(self) -> None:
+        """Wait until every frame that was put is written, and go on.
+
+        Raises:
+            DataError: one could not be written.
+        """
+        reached = threading.Event()
+        self._enqueue(reached)
+        written = -1
+        while not reached.wait(STALL):
+            if written == self.n_frames:
+                raise self._stalled()
+            written = self.n_frames
+        self._raise_failure()
+
     def finish(self) -> None:
-        """Wait until every frame that was put is written.
+        """Wait until every frame that was put is written; no other may follow.
 
         Raises:
             DataError: one could not be written.
@@ -115,8 +135,8 @@ class Recorder:
         """A frame is still being written; after `finish` this means that the disk does not answer."""
         return self._thread.is_alive()
 
-    def _enqueue(self, item: Frame | None) -> None:
-        """Queue a frame, or None after the last one."""
+    def _enqueue(self, item: Frame | threading.Event | None) -> None:
+        """Queue a frame, an event to be set when its turn comes, or None after the last frame."""
         try:
             self._waiting.put(item, timeout=STALL)
         except Full:
@@ -139,6 +159,9 @@ class Recorder:
 
     def _run(self) -> None:
         while (frame := self._waiting.get()) is not None:
+            if isinstance(frame, threading.Event):
+                frame.set()
+                continue
             if self._failure is not None:
                 continue  # frames after a failure are discarded, so that `put` does not wait for a place in the queue
             try:
@@ -150,6 +173,7 @@ class Recorder:
         found = digest(frame.counts, self._monitor.context.saturation, self._preview_bin)
         flags = self._look(frame, found)
         self._writer.append(frame, found, bitmask(flags))
+        self.references.add(frame, found)
         self.n_frames += 1
         self._report(flags)
         data = self._progress.update(frame, self.n_frames)

@@ -6,18 +6,20 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, resolved_yaml
-from beamline.core.errors import DataError, ScanStopped, exit_code, user_message
+from beamline.config.references import reference_limits
+from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.narration import UserLog
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import Instrument, connect
+from beamline.plan.plan import Block
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
 from beamline.scan.ledger import LedgerError
@@ -105,6 +107,7 @@ def run_scan(
     Raises:
         ConfigError: the plan breaks a limit; nothing has moved and no folder was made.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
+        ReferencesError: darks or flats cannot be used; no projection was taken.
         DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
             the file; the event `scan_done` says how much, and `failed` why.
     """
@@ -147,6 +150,8 @@ class _Run:
     stop: StopRequest
     emit: Emit
     began: float
+    told: set[str] = field(default_factory=set)
+    """Groups of references whose faults were told."""
 
     def go(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
@@ -177,7 +182,7 @@ class _Run:
         self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
     ) -> RunResult:
         recorder = self._recorder(writer)
-        acquisition = self._acquisition()
+        acquisition = self._acquisition(recorder)
         labels = LabelLog()
         self._enter(State.ACQUIRING)
         with self._beam_log() as beam:
@@ -185,6 +190,7 @@ class _Run:
         self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
         disk = _failure_of(recorder.finish)
         error = self._worse(error, disk)
+        self._reference_faults(recorder)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
         missing = acquisition.missing
         # A write that does not return holds HDF5's lock: closing the file would wait for it.
@@ -208,7 +214,8 @@ class _Run:
         )
         self.emit("scan_done", {**asdict(result), "status": status})
         if follower is not None:
-            recon = follower.finish(self._give_up(unfinished is not None), lambda: self.stop.aborting)
+            useless = unfinished is not None or isinstance(error, ReferencesError)
+            recon = follower.finish(self._give_up(useless), lambda: self.stop.aborting)
             result = replace(result, recon=recon)
         if error is not None:
             raise error
@@ -222,10 +229,11 @@ class _Run:
                     labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
 
-    def _give_up(self, unfinished: bool) -> Callable[[], bool]:
-        """The live reconstruction ends early after an abort, a stop that came after the scan, or with a broken file."""
+    def _give_up(self, useless: bool) -> Callable[[], bool]:
+        """The live reconstruction ends early after an abort, a stop that came after the scan, or with a file that is
+        broken or has no projections."""
         stopped = self.stop.stopping
-        return lambda: unfinished or self.stop.aborting or (self.stop.stopping and not stopped)
+        return lambda: useless or self.stop.aborting or (self.stop.stopping and not stopped)
 
     def _worse(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
         """The error that the run ends with; a stop or lost frames yield to any other. The other becomes a warning."""
@@ -261,12 +269,33 @@ class _Run:
             stop_on_alarm=self.config.monitor.on_alarm == "stop",
         )
 
-    def _acquisition(self) -> Acquisition:
+    def _acquisition(self, recorder: Recorder) -> Acquisition:
         ready, instrument = self.ready, self.instrument
-        settle = ready.plan.settle
         return Acquisition(
-            instrument.devices, ready.timeline, ready.settings, settle, instrument.clock, self.stop, self.emit
+            instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
+            self.emit, lambda: self._refusal(recorder),
+        )  # fmt: skip
+
+    def _refusal(self, recorder: Recorder) -> str | None:
+        """Why no projection should be taken after these darks and flats; None where none, or the operator wants it."""
+        recorder.wait()
+        blocks = self.ready.timeline.blocks
+        faults = self._reference_faults(recorder, blocks[: blocks.index(self.ready.timeline.views)])
+        if not faults or self.config.references.on_fault == "log":
+            return None
+        return (
+            f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
+            f"The shutter is closed; the {recorder.n_frames} darks and flats are in the file. references.on_fault: "
+            "log takes the scan all the same."
         )
+
+    def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:
+        """What is wrong with the darks and flats so far, by group; of a new one it is a warning."""
+        faults = recorder.references.faults(reference_limits(self.config.references), planned)
+        for group in faults.keys() - self.told:
+            self.told.add(group)
+            self.emit("warning", {"message": faults[group]})
+        return faults
 
     def _beam_log(self) -> BeamLog:
         chosen = self.config.devices.beam_monitor

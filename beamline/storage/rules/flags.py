@@ -36,4 +36,6 @@ def frames_flagged(source: ScanSource) -> Iterator[Finding]:
         )
         yield Finding("error", "flags", message)
         return
-    yield Finding("warning", "flags", f"{message} A reconstruction leaves such views out.")
+    if lost:
+        message += f" A reconstruction leaves the {lost} views among them out."
+    yield Finding("warning", "flags", message)

@@ -31,6 +31,7 @@ def small(views: int, *overrides: str) -> Config:
         f"scan.angles.views={views}",
         "scan.period_s=0.01",
         "scan.exposure_s=0.005",
+        "references.on_fault=log",  # the camera's pictures show its counters, not the beam
         f"scan.darks.count={DARKS}",
         f"scan.flats.count={FLATS}",
         "scan.flats.at=start",

@@ -50,6 +50,7 @@ SMALL = (
     f"scan.angles={{scheme: fixed, views: {VIEWS}, start_deg: {FIRST}, span_deg: {STEP * VIEWS}}}",
     "scan.period_s=0.1",
     "scan.exposure_s=0.005",
+    "references.on_fault=log",  # the camera's pictures show its counters, not the beam
     f"scan.darks.count={DARKS}",
     f"scan.flats={{count: {FLATS}, at: start, exposure_s: null}}",
     "storage.flush_every=100",
@@ -255,7 +256,9 @@ class Scanned:
 
     @property
     def warnings(self) -> list[str]:
-        return [event.data["message"] for event in self.events if event.event == "warning"]
+        """Without those on darks and flats, which show no beam here."""
+        said = [event.data["message"] for event in self.events if event.event == "warning"]
+        return [message for message in said if not message.startswith(("The darks", "The flats", "None of the"))]
 
     def of(self, name: str) -> list[Event]:
         return [event for event in self.events if event.event == name]

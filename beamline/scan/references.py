@@ -1,0 +1,47 @@
+"""References of a running scan: darks and flats are noted as they are recorded, and judged before the projections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.references import Reference, ReferenceLimits, judge
+from beamline.plan.plan import Block
+from drivers.frame import Frame, FrameKind
+
+REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
+
+
+class ReferenceLog:
+    """What is needed of the darks and flats of a scan to judge them, group by group.
+
+    Args:
+        preview_bin: of the digests' previews.
+    """
+
+    def __init__(self, preview_bin: int) -> None:
+        self._preview_bin = preview_bin
+        self._groups: list[list[Reference]] = []
+        self._before = FrameKind.INVALID
+
+    def add(self, frame: Frame, digest: FrameDigest) -> None:
+        """Take note of a frame, in the order of the file."""
+        if frame.kind in REFERENCES:
+            if frame.kind is not self._before:
+                self._groups.append([])
+            found = Reference.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin)
+            self._groups[-1].append(found)
+        self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
+
+    def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
+        """What is wrong with the groups so far, by the name of the group; a sentence or more each.
+
+        Args:
+            planned: blocks that are over by now; references of which no frame came are missing.
+        """
+        missing = {
+            block.kind.name: f"None of the {block.n} {block.kind.name.lower()}s planned before the views came."
+            for block in planned
+            if block.kind in REFERENCES and not any(group[0].kind is block.kind for group in self._groups)
+        }
+        return missing | {group.name: group.described() for group in judge(self._groups, limits) if group.faults}

@@ -1,0 +1,101 @@
+"""Bad darks and flats stop a scan before its first projection: a named end, a safe instrument, a readable file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from beamline.config.load import config_folder, load
+from beamline.config.references import reference_limits
+from beamline.core.errors import ConfigError, ReferencesError
+from beamline.core.events import Event
+from beamline.monitor.references import ReferenceLimits
+from beamline.scan.run import State, run_scan
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import validate
+from drivers.frame import FrameKind
+from tests.beamline import fakes
+from tests.beamline.fakes import FakeInstrument, Faults
+from tests.beamline.ran import Ran
+
+
+@pytest.mark.parametrize(
+    ("light", "dark", "faults", "said"),
+    [
+        (210, 200, Faults(), "The flats 3-4: there is no beam in them"),
+        (20000, 15000, Faults(), "The darks 0-2: there is light in them"),
+        (20000, 200, Faults(lost={3, 4}), "None of the 2 flats planned before the views came"),
+    ],
+)
+def test_no_projection_is_taken_after_references_that_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, light: int, dark: int, faults: Faults, said: str
+) -> None:
+    monkeypatch.setitem(fakes.LEVEL, True, light)
+    monkeypatch.setitem(fakes.LEVEL, False, dark)
+    ran = Ran(tmp_path, FakeInstrument(faults))
+    assert isinstance(ran.error, ReferencesError)
+    assert said in str(ran.error) and "references.on_fault: log" in str(ran.error)
+    assert [event.data["kind"] for event in ran.of("block_started")] == ["dark", "flat"]
+    (done,), (failed,) = ran.of("scan_done"), ran.of("failed")
+    assert (done.data["status"], failed.data["exit_code"]) == ("stopped", 6)
+    assert ran.states == [State.PREPARING, State.ACQUIRING, State.STOPPING, State.FAILED]
+    assert any(event.data["message"].startswith(said) for event in ran.of("warning"))
+    ran.assert_safe()
+    assert ran.instrument.is_in
+    with open_scan(done.data["path"]) as source:
+        assert source.finished and len(list(source.frames())) == done.data["n_frames"]
+
+
+def test_the_operator_may_want_the_scan_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(fakes.LEVEL, False, 15000)
+    ran = Ran(tmp_path, FakeInstrument(), "references.on_fault=log")
+    assert ran.error is None and ran.result is not None and ran.result.n_frames == 19
+    assert len([event for event in ran.of("warning") if "there is light" in event.data["message"]]) == 1
+
+
+def test_a_limit_of_the_configuration_is_the_one_that_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(fakes.LEVEL, False, 15000)
+    ran = Ran(tmp_path, FakeInstrument(), "references.lit=0.9")
+    assert ran.error is None and ran.of("warning") == []
+
+
+def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lose_the_beam(number: int) -> None:
+        if number == 16:  # three darks, two flats, twelve views
+            monkeypatch.setitem(fakes.LEVEL, True, 210)
+
+    ran = Ran(tmp_path, FakeInstrument(on_frame=lose_the_beam))
+    assert ran.error is None
+    assert [e.data["message"][:46] for e in ran.of("warning")] == ["The flats 17-18: there is no beam in them: the"]
+
+
+def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> None:
+    """Its flats are saturated everywhere with 95 ms: the electrolyte would read 0.14 instead of 0.48 1/mm."""
+    words = [
+        "scan.exposure_s=0.095",
+        "simulation.clock=virtual",
+        "scan.darks.count=3",
+        "scan.flats={count: 3, at: start}",
+    ]
+    words += ["devices.camera.roi=[1140, 1968, 24, 160]"]
+    events: list[Event] = []
+    with pytest.raises(ReferencesError, match=r"flats 3-5: 100\.00% of their pixels are saturated \(limit 0\.10%\)"):
+        run_scan(load(config_folder() / "demo.yaml", words, {}), tmp_path, [events.append])
+    (folder,) = tmp_path.iterdir()
+    found = {(finding.severity, finding.rule) for finding in validate(folder / "scan.h5")}
+    assert ("error", "bad-references") in found
+    with open_scan(folder / "scan.h5") as source:
+        assert not (source.image_key == FrameKind.PROJECTION).any()
+
+
+def test_limits_are_typed_and_have_the_defaults_of_the_judge() -> None:
+    path = config_folder() / "demo.yaml"
+    assert reference_limits(load(path, (), {}).references) == ReferenceLimits()
+    assert reference_limits(load(path, ["references.lit=0.5"], {}).references) == ReferenceLimits(lit=0.5)
+    for word, message in (
+        ("references.lit=2", r"references\.lit is 2; expected a number > 0 and < 1"),
+        ("references.on_fault=go", r"references\.on_fault is 'go'.*expected stop \| log"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load(path, [word], {})
