@@ -157,6 +157,8 @@ def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Now) -> t
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
     parts = subsets_of(geometry, SUBSETS)
     sweep = (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
+    if geometry.is_cone:
+        sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
     before = (_EIGENVALUE_ROUNDS / parts + _FIRST_SWEEPS) * sweep
     sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
     return (sweeps, before + sweeps * sweep) if sweeps >= 2 else (0, 0.0)

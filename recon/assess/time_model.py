@@ -65,8 +65,8 @@ class Preset:
 
 PRESETS: dict[Quality, Preset] = {
     "preview": Preset(125, 0.5),
-    "standard": Preset(1000, 1.0),
-    "best": Preset(2000, 2.0),
+    "standard": Preset(500, 1.0),
+    "best": Preset(1500, 2.0),
 }
 
 

@@ -26,6 +26,8 @@ _POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
 # Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many: +1.0, +0.7, -0.6 dB
 # on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
 _MANY_VIEWS, _HALF = 0.3, 0.45
+# +0.1 to +2.8 dB against no such factor on seven of eight cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
+_UNMODELLED = 2.5
 _TOO_NOISY = 1.5  # times what a model leaves: such noise is none
 
 
@@ -54,12 +56,14 @@ class NoiseBalance:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, modelled: bool) -> NoiseBalance:
+    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, unmodelled: float = 0.0) -> NoiseBalance:
         """For a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
             modelled: the start is a model of the sample. Then what it leaves of the data bounds the noise, which fine
                 structure, or a scan of few rows, makes too large.
+            unmodelled: standard deviation of what no voxels explain of the views, in units of the noise. It is large
+                at few rays, so that the first weight rises with its square.
         """
         data = whitened(problem.data, problem.weight)
         noise = noise_level(data)
@@ -71,7 +75,7 @@ class NoiseBalance:
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
-        return cls(share, noise * _by_views(problem.projector.geometry))
+        return cls(share * (1 + (_UNMODELLED * unmodelled) ** 2), noise * _by_views(problem.projector.geometry))
 
     def after_sweep(self, residual: F32) -> None:
         """Adapt the weight to the residual (some views [view, col, row], whitened)."""
