@@ -67,12 +67,12 @@ def finish(
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
     The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 2 dB wherever voxels
-    can explain the views. Where they cannot, because pixels are coarse, the noise is low or matter lies outside the box,
-    they would bend the volume (-6 dB on a teapot of 10⁵ photons, -12 dB on a region of interest). So where the
+    can explain the views. Where they cannot, because pixels are coarse, the noise is low or matter lies outside the
+    box, they would bend the volume (-6 dB on a teapot of 10⁵ photons, -12 dB on a region of interest). So where the
     projection of the voxels at the start differs from that of the Gaussians by more than 0.6 of the noise, and the
-    sweeps leave more than 1.4 times the noise, the sweeps are tried anew on p - G + A x: measured views p less the views
-    G of the Gaussians plus the projection A x of the voxels at the start; what voxels cannot explain then counts as
-    noise. Of the two volumes the one is taken that explains its views better.
+    sweeps leave more than 1.4 times the noise, the sweeps are tried anew on p - G + A x: measured views p less the
+    views G of the Gaussians plus the projection A x of the voxels at the start; what voxels cannot explain then counts
+    as noise. Of the two volumes the one is taken that explains its views better.
 
     Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`. Measured on 26 small scans: 0.5
@@ -134,7 +134,8 @@ def ring_offsets(residual: F32) -> F32:
 
     The median over the views of what a model leaves of them, less its own neighbourhood along the row, and along the
     column: the wall of a can around the axis stays in all views, too, but in all rows alike (-1.1 dB on a battery). 0
-    where it does not stand out of its scatter by three standard errors. Of few views it cannot be told from the sample: then it is 0.
+    where it does not stand out of its scatter by three standard errors. Of few views it cannot be told from the sample:
+    then it is 0.
 
     Args:
         residual: views less a model's views, [view, row, col].
