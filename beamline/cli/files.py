@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +12,18 @@ import click
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan_options import scan_options
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink, fan_out
+from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.validate import validate as findings_of
-from drivers.clock import Clock, SystemClock
+from drivers.clock import SystemClock
 
 _PATH = click.Path(path_type=Path)
-_SAY_EVERY = 0.2  # s between words on how far an ingest is
 
 
 @click.command()
@@ -126,7 +124,7 @@ def ingest(
             energy_kev=energy_kev,
             sample=sample,
             no_data=no_data,
-            progress=_progress(fan_out(*(json_sinks or [terminal])), clock),
+            progress=counting("ingest", fan_out(*(json_sinks or [terminal])), clock),
         )
         seconds = clock.now() - began
         for sink in json_sinks:
@@ -136,21 +134,3 @@ def ingest(
     click.echo(f"output   {done.path} ({done.definition})")
     click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
     click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")
-
-
-def _progress(sink: Sink, clock: Clock) -> Callable[[int, int], None]:
-    """A listener that says how far the frames are, a few times a second."""
-    began, said = clock.now(), -math.inf
-
-    def listen(n: int, total: int) -> None:
-        nonlocal said
-        now = clock.now()
-        if now - said < _SAY_EVERY and n < total:
-            return
-        said = now
-        rate = n / max(now - began, 1e-9)
-        sink(
-            Event("progress", now, {"stage": "ingest", "n": n, "of": total, "per_s": rate, "eta_s": (total - n) / rate})
-        )
-
-    return listen

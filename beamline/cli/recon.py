@@ -117,6 +117,8 @@ def recon(
     if method is None:
         method = DEFAULT if follow or options_of_a_method(context) else Auto.name
     refuse_contradictions(context, method, follow)
+    if follow and values["flags"] == "judge":
+        raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})

@@ -86,7 +86,8 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         cone=rest.pop("cone"),
         correction=CorrectionSettings(air=rest.pop("air")),
         seed=seed,
-        use_flags=rest.pop("flags") == "use",
+        use_flags=rest["flags"] != "ignore",
+        judge=rest.pop("flags") == "judge",
         accept_references=rest.pop("references") == "accept",
     )
     return SourceOptions(file, **rest), selection
@@ -145,10 +146,11 @@ _AFTER = (
     ),
     click.option(
         "--flags",
-        type=click.Choice(["use", "ignore"]),
+        type=click.Choice(["use", "judge", "ignore"]),
         default="use",
         show_default=True,
-        help="use: views with an alarm of the monitor are left out, with a warning weigh half; ignore: all are alike.",
+        help="use: views with an alarm of the monitor are left out, with a warning weigh half; judge: by what the "
+        "monitor says of them now, also where the file has no flags; ignore: all are alike.",
     ),
     click.option(
         "--references",

@@ -6,7 +6,7 @@ import errno
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -14,12 +14,15 @@ from typing import Any, Self, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from beamline.core.events import Event
+from beamline.core.events import Event, Sink
 from beamline.core.narration import sentence
 from beamline.report.metrics import METRICS, formatted
+from drivers.clock import Clock
 from drivers.manual import Ask
 from recon.methods import BASELINE
 
+SAY_EVERY = 0.2
+"""s between events on how far many frames are."""
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
 
@@ -73,7 +76,7 @@ class Terminal:
     def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
-        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs"):
+        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs", "monitor"):
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
         elif event.event == "progress" and event.data.get("stage") == "tradeoff":
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))
@@ -148,6 +151,22 @@ def fit(data: Mapping[str, Any]) -> str:
     if data.get("eta_s") is not None:
         parts.append(f"{_clock_time(data['eta_s'])} left")
     return ", ".join(parts)
+
+
+def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]:
+    """A listener that says how far the frames are, a few times a second."""
+    began, said = clock.now(), -math.inf
+
+    def listen(n: int, total: int) -> None:
+        nonlocal said
+        now = clock.now()
+        if now - said < SAY_EVERY and n < total:
+            return
+        said = now
+        rate = n / max(now - began, 1e-9)
+        sink(Event("progress", now, {"stage": stage, "n": n, "of": total, "per_s": rate, "eta_s": (total - n) / rate}))
+
+    return listen
 
 
 def results(data: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.flag_legend import counted
+from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
 from drivers.frame import FrameKind
 
@@ -39,9 +39,13 @@ class UsableViews:
         return self.weights[rows]
 
 
-def usable_views(source: ScanSource, use_flags: bool) -> UsableViews:
-    """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike."""
-    views, flags = source.image_key == FrameKind.PROJECTION, source.flags
+def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:
+    """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike.
+
+    Args:
+        judged: flags that count in place of the file's.
+    """
+    views, flags = source.image_key == FrameKind.PROJECTION, source.flags if judged is None else judged
     rows = np.flatnonzero(views)
     if flags is None or not flags.flagged[rows].any():
         return UsableViews(rows)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.flags import UsableViews, usable_views
+from beamline.projections.replay import judged_flags
 from beamline.projections.selection import (
     Selection,
     check_axis,
@@ -116,9 +117,10 @@ def flagged_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     Raises:
         DataError: too few views are left.
     """
+    judged = judged_flags(source) if selection.judge and source.finished else None
     if selection.use_flags:
-        refuse(source, frames_flagged(source))
-    usable = usable_views(source, selection.use_flags)
+        refuse(source, frames_flagged(source, judged))
+    usable = usable_views(source, selection.use_flags, judged)
     if usable.said:
         warn(usable.said)
     return usable

@@ -29,6 +29,7 @@ class Selection:
         correction: of counts to line integrals.
         seed: of random view selections.
         use_flags: views with an alarm of the monitor are left out, those with a warning weigh less.
+        judge: the monitor looks at the frames of the file now, and its flags count in place of the file's.
         accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
     """
 
@@ -41,6 +42,7 @@ class Selection:
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
     seed: int = 0
     use_flags: bool = True
+    judge: bool = False
     accept_references: bool = False
 
 

@@ -124,7 +124,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "n_views": geometry.n_views,
         "n_projections": prepared.n_projections,
         "references": "accept" if selection.accept_references else "check",
-        "flags": "use" if selection.use_flags else "ignore",
+        "flags": "judge" if selection.judge else "use" if selection.use_flags else "ignore",
         "views_left_out": prepared.left_out,
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
         "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from drivers.frame import Frame, FrameKind
 
 
 class ArraySource:
@@ -22,6 +25,7 @@ class ArraySource:
     attributes: dict[str, Any] = {}  # noqa: RUF012
     flags = None
     finished = True
+    plan: dict[str, Any] = {}  # noqa: RUF012
 
     def __init__(
         self,
@@ -40,3 +44,11 @@ class ArraySource:
         block = self._data[frames, rows]
         self.was_read.append((np.arange(len(self._data))[frames].tolist(), block.shape[1]))
         return block
+
+    def refresh(self) -> int:
+        return len(self._data)
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        for i in range(first, len(self._data)):
+            kind, angle = FrameKind(int(self.image_key[i])), float(self.angles[i])
+            yield Frame(self._data[i], kind, i, i, -1, angle, np.nan, float(self.exposures[i]))

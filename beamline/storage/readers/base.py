@@ -39,6 +39,7 @@ class ScanSource(Protocol):
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         attributes: whatever else the file says, for the record.
         flags: of the monitor, by frame; None where no monitor looked at the frames.
+        plan: what the operator asked for, as our files record it; empty where it is not known.
         finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
 
@@ -71,14 +72,16 @@ class ScanSource(Protocol):
     @property
     def flags(self) -> FrameFlags | None: ...
     @property
+    def plan(self) -> Mapping[str, Any]: ...
+    @property
     def finished(self) -> bool: ...
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
         ...
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames one after the other, as a camera gave them. DataError where pixels are not uint16 counts."""
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """The frames from `first` on, as a camera gave them. DataError where pixels are not uint16 counts."""
         ...
 
     def refresh(self) -> int:
@@ -147,6 +150,10 @@ class ScanReader(ABC):
     def flags(self) -> FrameFlags | None:
         return None
 
+    @property
+    def plan(self) -> Mapping[str, Any]:
+        return {}
+
     @abstractmethod
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
@@ -159,8 +166,8 @@ class ScanReader(ABC):
         """Number of frames that can be read; a format that grows looks again."""
         return int(self.image_key.size)
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames one after the other. A format without framestamps and times yields -1 and NaN for them.
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """The frames from `first` on. A format without framestamps and times yields -1 and NaN for them.
 
         Raises:
             DataError: the pixels are not the uint16 that a Frame holds.
@@ -168,10 +175,10 @@ class ScanReader(ABC):
         self.require_counts()
         keys, angles, exposures = self.image_key, self.angles, self.exposures
         triggers = count_in_blocks(keys)
-        for i, key in enumerate(keys):
+        for i in range(first, keys.size):
             yield Frame(
                 counts=self.read([i])[0],
-                kind=FrameKind(int(key)),
+                kind=FrameKind(int(keys[i])),
                 index=i,
                 trigger=int(triggers[i]),
                 framestamp=-1,

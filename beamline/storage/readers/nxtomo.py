@@ -5,7 +5,8 @@ What counts is the structure, an NXdetector with `data` [frame, row, col] and `i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -145,13 +146,21 @@ class NXtomoSource(ScanReader):
         hdf5.read_frames(self._places.data, indices, rows, out)
         return out
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames one after the other, with all that the file knows about each."""
+    @property
+    def plan(self) -> Mapping[str, Any]:
+        try:
+            plan = json.loads(hdf5.text(_value(self._file, "/entry/record/plan")) or "{}") if self._ours else {}
+        except ValueError:
+            return {}
+        return plan if isinstance(plan, dict) else {}
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """The frames from `first` on, with all that the file knows about each."""
         self.require_counts()
         time = self._seconds(self._places.entry, "frame_log/time")
         trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
         framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
-        for i in range(self.n):
+        for i in range(first, self.n):
             yield Frame(
                 counts=self.read([i])[0],
                 kind=FrameKind(int(self.image_key[i])),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -102,12 +102,16 @@ class Overlay(ScanReader):
             out[~front] = self._base.read(indices[~front] - n, rows)
         return out
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames one after the other; those of `base` keep what their file knows about them."""
+    @property
+    def plan(self) -> Mapping[str, Any]:
+        return self._base.plan
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """The frames from `first` on; those of `base` keep what their file knows about them."""
         if len(self._front) or self.dtype != np.uint16:
-            return super().frames()
+            return super().frames(first)
         angles = self.angles
-        return (replace(frame, angle=float(angles[frame.index])) for frame in self._base.frames())
+        return (replace(frame, angle=float(angles[frame.index])) for frame in self._base.frames(first))
 
     def refresh(self) -> int:
         n = len(self._front) + self._base.refresh()

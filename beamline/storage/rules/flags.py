@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from beamline.core.text import spans
-from beamline.storage.flag_legend import counted
+from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from drivers.frame import FrameKind
@@ -16,9 +16,13 @@ FEWEST_VIEWS = 10
 """Views without an alarm that a volume takes at least, where some have one: so few are a sketch of the sample."""
 
 
-def frames_flagged(source: ScanSource) -> Iterator[Finding]:
-    """Number of flagged frames by check and level, and the rows of those with an alarm."""
-    flags = source.flags
+def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iterator[Finding]:
+    """Number of flagged frames by check and level, and the rows of those with an alarm.
+
+    Args:
+        judged: flags that count in place of the file's.
+    """
+    flags = source.flags if judged is None else judged
     if flags is None or not flags.flagged.any():
         return
     rows = np.flatnonzero(flags.alarmed)

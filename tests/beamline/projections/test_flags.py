@@ -86,6 +86,15 @@ def test_too_few_good_views_are_refused_with_figures(tmp_path: Path, n: int) -> 
         prepared(path)
 
 
+def test_a_file_without_flags_is_judged_where_that_is_wanted(tmp_path: Path) -> None:
+    frames = frames_of(SCAN)
+    frames[9], frames[10] = (replace(frames[i], counts=frames[8].counts) for i in (9, 10))
+    path = write_flagged(tmp_path / "s.h5", frames, {})
+    assert prepared(path)[0].geometry.n_views == 30
+    found, told = prepared(path, replace(SELECTION, judge=True))
+    assert found.geometry.n_views == 28 and "2 have an alarm and are left out (stuck 2 alarm)" in told[0]
+
+
 def test_flags_of_darks_and_flats_leave_the_views_alone(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, {1: Level.WARN, 3: Level.WARN}))
     assert found.geometry.n_views == 30 and told == [] and found.view_weights is None

@@ -1,0 +1,115 @@
+"""`beamline monitor`: looks at the frames of a scan file with the checks that look at a running scan."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.json_output import StopOnSignal, json_events
+from beamline.cli.options import json_option, set_option
+from beamline.cli.scan_options import scan_options
+from beamline.cli.terminal import Terminal, counting
+from beamline.config.load import load
+from beamline.config.monitor import configured_checks
+from beamline.config.references import reference_limits
+from beamline.core.errors import AlarmError, ScanStopped
+from beamline.core.events import Event, fan_out
+from beamline.core.text import spans
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS
+from beamline.projections.replay import Kind, by_kind, counts_of, replay
+from beamline.storage.flag_legend import counted
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.rules.references import reference_groups
+from drivers.clock import SystemClock
+
+UNITS = {check.name: check.unit for check in CHECKS}
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--follow", is_flag=True, help="Follow a scan that is still running.")
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    help="Configuration whose sections `monitor` and `references` give the limits. Default: those of a new scan.",
+)
+@set_option
+@scan_options
+@json_option
+def monitor(
+    file: Path, follow: bool, config: Path | None, overrides: tuple[str, ...], as_json: bool, **said: Any
+) -> None:
+    """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.
+
+    Prints the flags by check and level: frames, worst score, limit, where in the frame, what to do. FILE is not
+    changed.
+
+    Exit code: 0 no alarm, 4 stopped, 7 alarms, or darks or flats with a fault.
+    """
+    if overrides and config is None:
+        raise click.UsageError("--set changes a value of the configuration: give --config too.")
+    clock = SystemClock()
+    with json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        checks, limits = CHECKS, None
+        if config is not None:
+            read = load(config, overrides)
+            checks, limits = configured_checks(read.monitor), reference_limits(read.references)
+        sink = fan_out(*(json_sinks or [terminal]))
+        progress = counting("monitor", sink, clock)
+        flags: list[Flag] = []
+        active: set[tuple[str, Level]] = set()
+        n = 0
+        with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
+            for judged in replay(source, checks, follow=clock if follow else None, should_stop=stopped):
+                n += 1
+                if not follow:
+                    progress(n, judged.n)
+                now = {(flag.check, flag.level) for flag in judged.flags}
+                for flag in judged.flags:
+                    flags.append(flag)
+                    if (flag.check, flag.level) not in active:
+                        sink(Event("flag", clock.now(), asdict(flag)))
+                active = now
+            references = []
+            if source.quantity == "counts":
+                references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
+        for fault in references:
+            sink(Event("warning", clock.now(), {"message": fault}))
+        kinds = by_kind(flags)
+        alarmed = {flag.view for flag in flags if flag.level is Level.ALARM}
+        done = {
+            "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "flags": counts_of(kinds),
+            "references": references, "kinds": [{**asdict(kind.worst), "rows": kind.rows} for kind in kinds],
+        }  # fmt: skip
+        for json_sink in json_sinks:
+            json_sink(Event("done", clock.now(), done))
+    if not as_json:
+        click.echo("\n".join([*table(kinds), *references, f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"]))
+    if stopped():
+        raise ScanStopped(f"{file}: stopped after {n} frames.")
+    if alarmed or references:
+        faults = f", and groups of references with a fault: {len(references)}" if references else ""
+        raise AlarmError(f"{file}: {len(alarmed)} of {n} frames have an alarm{faults}; stdout lists them.")
+
+
+def table(kinds: Iterable[Kind]) -> list[str]:
+    """The flags for people, three lines a check and level."""
+    lines = []
+    for kind in kinds:
+        worst = kind.worst
+        where = ""
+        if worst.region is not None:
+            top, bottom, left, right = worst.region
+            where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
+        lines += [
+            f"{kind.level:<6}{kind.check:<12}{len(kind.rows)} frames: {spans(kind.rows)}",
+            f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {UNITS[kind.check]}, in frame {worst.view}{where}",
+            f"{'':<18}{worst.advice}",
+        ]
+    return lines

@@ -1,0 +1,188 @@
+"""Replay: the monitor's checks over the frames of a file, of any format, finished or growing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.monitor.check import Check, Flag, Level, ScanContext
+from beamline.monitor.checks import CHECKS, bitmask
+from beamline.monitor.digest import digest
+from beamline.monitor.references import full_scale
+from beamline.monitor.watch import look, start
+from beamline.storage.flag_legend import FlagBit, FrameFlags
+from beamline.storage.readers.base import ScanSource
+from drivers.clock import Clock
+from drivers.frame import Frame, FrameKind
+
+PREVIEW_BIN = 4
+BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
+SAMPLES = 4  # frames of a kind that tell where the detector saturates
+PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
+POLL = 0.1  # s between looks at a growing file
+PATIENCE = 120.0  # s without a new frame, after which a growing file is given up
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What the checks said of a frame, and which frames there are so far.
+
+    Attributes:
+        row: of the frame, in the file.
+        kind: of the frame.
+        flags: what the checks found.
+        n: frames in the file so far.
+    """
+
+    row: int
+    kind: FrameKind
+    flags: tuple[Flag, ...]
+    n: int
+
+
+@dataclass(frozen=True)
+class Kind:
+    """All flags of a check at one level.
+
+    Attributes:
+        rows: of the frames, ascending.
+        worst: the flag with the largest score over its limit.
+    """
+
+    check: str
+    level: Level
+    rows: tuple[int, ...]
+    worst: Flag
+
+
+def replay(
+    source: ScanSource,
+    checks: Sequence[Check] = CHECKS,
+    *,
+    follow: Clock | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Iterator[Judged]:
+    """Look at every frame, in the order of the file.
+
+    Frames of line integrals are judged as the counts of a beam without noise; exposures that are not known count as
+    equal.
+
+    Args:
+        follow: the clock to wait by for further frames, until the file is finished; None: the frames that are there.
+        should_stop: asked before each frame.
+
+    Raises:
+        DataError: a followed file that is not finished and grows no more.
+    """
+    monitor, done, waited = start(context_of(source), checks), 0, 0.0
+    while True:
+        ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
+        n = source.refresh()
+        for frame in _frames(source, done):
+            if should_stop():
+                return
+            seen = digest(frame.counts, monitor.context.saturation, PREVIEW_BIN)
+            monitor, flags = look(monitor, frame, seen)
+            yield Judged(frame.index, frame.kind, flags, n)
+        if ended:
+            return
+        assert follow is not None
+        waited = 0.0 if n > done else waited + POLL
+        done = n
+        if waited > PATIENCE:
+            raise DataError(
+                f"{source.path} has not grown for {PATIENCE:.0f} s and is not finished: the scan died. Its {n} frames "
+                "were looked at."
+            )
+        follow.sleep(POLL)
+
+
+def judged_flags(source: ScanSource) -> FrameFlags:
+    """Flags as the monitor would have written them, of the frames that are there."""
+    bits = np.zeros(source.image_key.size, np.uint32)
+    for judged in replay(source):
+        bits[judged.row] = bitmask(judged.flags)
+    return FrameFlags(bits, tuple(FlagBit(check.name, check.bit) for check in CHECKS))
+
+
+def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
+    """Flags by check and level, the worst level first, then those of most frames."""
+    found: dict[tuple[str, Level], list[Flag]] = {}
+    for flag in flags:
+        found.setdefault((flag.check, flag.level), []).append(flag)
+    kinds = [
+        Kind(check, level, tuple(flag.view for flag in each), max(each, key=_excess))
+        for (check, level), each in found.items()
+    ]
+    levels = (Level.ALARM, Level.WARN, Level.INFO)
+    return tuple(sorted(kinds, key=lambda kind: (levels.index(kind.level), -len(kind.rows))))
+
+
+def counts_of(kinds: Iterable[Kind]) -> Mapping[str, Mapping[str, int]]:
+    """Number of frames by check, then by level."""
+    counts: dict[str, dict[str, int]] = {}
+    for kind in kinds:
+        counts.setdefault(kind.check, {})[str(kind.level)] = len(kind.rows)
+    return counts
+
+
+def context_of(source: ScanSource) -> ScanContext:
+    """What the checks must know of a file before its first frame.
+
+    The period is known of our own fly scans only.
+    """
+    rows, cols = source.shape
+    plan, period = source.plan, None
+    starts = frozenset({0})
+    if plan.get("mode") == "fly":
+        period = float(source.attributes.get("period_s", 0)) or None
+        angles = np.asarray(plan.get("angles_deg", ()), np.float64)
+        if angles.size > 2:
+            steps = np.diff(angles)
+            starts = frozenset([0, *(np.flatnonzero(steps * np.median(steps) < 0) + 1).tolist()])
+    context = ScanContext(_saturation(source), rows * cols, period, starts)
+    if source.quantity != "line_integrals":
+        return context
+    preview = digest(np.zeros(source.shape, np.uint16), preview_bin=PREVIEW_BIN).preview
+    return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0)
+
+
+def _saturation(source: ScanSource) -> float:
+    """The end of the pixels' type, or of fewer bits where pixels pile up there; inf where pixels are real numbers."""
+    if source.quantity == "line_integrals" or source.dtype.kind not in "ui":
+        return np.inf
+    for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
+        rows = np.flatnonzero(source.image_key == kind)
+        for row in rows[np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))] if rows.size else ():
+            image = source.read([int(row)])[0]
+            largest = float(image.max())
+            if largest == full_scale(largest) and (image == image.max()).mean() > PILED_UP:
+                return largest
+    return float(np.iinfo(source.dtype).max)
+
+
+def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
+    """Frames from `first` on; their exposure is 1 s where it is not known, so that those of views and flats agree."""
+    for frame in source.frames(first) if source.dtype == np.uint16 else _plain_frames(source, first):
+        yield frame if frame.exposure > 0 else replace(frame, exposure=1.0)
+
+
+def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:
+    """Frames of other types than a camera's: counts as they are, line integrals as counts of a beam."""
+    for row in range(first, source.image_key.size):
+        pixels: NDArray[np.uint16] = source.read([row])[0]
+        if source.quantity == "line_integrals":
+            with np.errstate(over="ignore"):
+                pixels = np.nan_to_num(BEAM * np.exp(-pixels.astype(np.float64)), posinf=65535).clip(0, 65535)
+            pixels = pixels.round().astype(np.uint16)
+        kind, angle = FrameKind(int(source.image_key[row])), float(source.angles[row])
+        yield Frame(pixels, kind, row, row, -1, angle, np.nan, float(source.exposures[row]))
+
+
+def _excess(flag: Flag) -> float:
+    score = abs(flag.score)
+    return score / abs(flag.limit) if flag.limit else score

@@ -1,0 +1,146 @@
+"""The monitor over a file says what it said while the scan ran, and judges files that no monitor has seen."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.digest import digest
+from beamline.projections import replay as module
+from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.clock import SystemClock
+from drivers.frame import Frame, FrameKind
+from tests.beamline.array_source import ArraySource
+from tests.beamline.fakes import FakeInstrument, Faults
+from tests.beamline.ran import Ran
+from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(8, 40))
+
+
+@pytest.mark.parametrize("passes", [1, 3])
+def test_a_file_gets_the_flags_that_the_scan_gave_it(tmp_path: Path, passes: int) -> None:
+    angles = f"scan.angles={{scheme: interlaced, views: 12, passes: {passes}, start_deg: 0, span_deg: 180}}"
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10}, lost={12})), angles, "scan.period_s=1.5")
+    path = ran.of("scan_done")[0].data["path"]
+    with open_scan(path) as source:
+        written = source.flags
+        assert written is not None and written.flagged.sum() >= 3  # two repeats, and the frame after the lost one
+        np.testing.assert_array_equal(judged_flags(source).bits, written.bits)
+        assert context_of(source).pass_starts == frozenset(range(0, 12, 12 // passes))
+        assert context_of(source).period == pytest.approx(1.5, rel=0.01)
+
+
+def test_a_foreign_file_is_judged(tmp_path: Path) -> None:
+    """Data Exchange without flags, exposures or times: a view without beam is found, and nothing else."""
+    counts = SCAN.counts()
+    rng = np.random.default_rng(3)
+    counts = rng.poisson(counts).astype(np.uint16)
+    counts[20] = rng.poisson(np.full(SCAN.shape, DARK))
+    path = write_exchange(tmp_path / "s.h5", SCAN, {"data": counts})
+    with open_scan(path) as source:
+        assert source.flags is None
+        found = judged_flags(source)
+    assert np.flatnonzero(found.alarmed).tolist() == [24]  # two darks and two flats come before the views
+
+
+def test_line_integrals_are_judged_as_counts_of_a_beam() -> None:
+    views = SCAN.line_integrals().astype(np.float32)
+    views[17] += 3.0
+    source = ArraySource(views, [0] * 30, SCAN.angles)
+    source.quantity = "line_integrals"
+    found = judged_flags(source)  # type: ignore[arg-type]
+    assert 17 in np.flatnonzero(found.alarmed)
+    assert 0 not in np.flatnonzero(found.flagged)
+
+
+@pytest.mark.parametrize(("level", "expected"), [(4095, 4095.0), (4000, 65535.0), (65535, 65535.0)])
+def test_the_end_of_the_range_is_where_pixels_pile_up(level: int, expected: float) -> None:
+    data = np.full((4, *SCAN.shape), level, np.uint16)
+    assert context_of(ArraySource(data, [1, 1, 0, 0], np.zeros(4))).saturation == expected  # type: ignore[arg-type]
+
+
+def _grow(path: Path, frames: list[Frame], close: bool) -> Iterator[int]:
+    """Write the frames one by one; yields before each, and once more at the end."""
+    writer = NXtomoWriter(path, ScanInfo("s"), SCAN.shape, clock=SystemClock())
+    for frame in frames:
+        yield frame.index
+        writer.append(frame, digest(frame.counts))
+    yield len(frames)
+    if close:
+        writer.close()
+
+
+class Waits:
+    """A clock whose every sleep lets the scan take a frame."""
+
+    def __init__(self, scan: Iterator[int]) -> None:
+        self.scan, self.n = scan, 0
+
+    def now(self) -> float:
+        return 0.0
+
+    def sleep(self, seconds: float) -> None:
+        self.n += 1
+        next(self.scan, None)
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_a_growing_file_is_followed_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, close: bool) -> None:
+    monkeypatch.setattr(module, "PATIENCE", 1.0)
+    frames = frames_of(SCAN)
+    frames[9] = replace(frames[9], counts=frames[8].counts)
+    scan = _grow(tmp_path / "s.h5", frames, close)
+    next(scan), next(scan)
+    clock = Waits(scan)
+    rows, flagged = [], []
+    with open_scan(tmp_path / "s.h5", follow=True) as source:
+        try:
+            for judged in replay(source, follow=clock):
+                rows.append(judged.row)
+                flagged += [judged.row] * any(flag.level is Level.ALARM for flag in judged.flags)
+        except DataError as error:
+            assert not close and "34 frames were looked at" in str(error)
+        else:
+            assert close
+    assert rows == list(range(34))
+    assert 9 in flagged
+    assert clock.n >= 32
+
+
+def test_flags_are_gathered_by_check_and_level() -> None:
+    def flag(check: str, level: Level, view: int, score: float) -> Flag:
+        return Flag(check, level, view, score, 0.5, "")
+
+    found = by_kind(
+        [flag("a", Level.WARN, i, i) for i in range(5)]
+        + [flag("b", Level.WARN, 7, -9.0)]
+        + [flag("a", Level.ALARM, 9, 4.0)]
+        + [flag("c", Level.INFO, 1, 4.0)]
+    )
+    assert [(kind.check, kind.level, kind.rows) for kind in found] == [
+        ("a", Level.ALARM, (9,)), ("a", Level.WARN, (0, 1, 2, 3, 4)), ("b", Level.WARN, (7,)), ("c", Level.INFO, (1,)),
+    ]  # fmt: skip
+    assert found[1].worst.view == 4
+    assert counts_of(found) == {"a": {"alarm": 1, "warn": 5}, "b": {"warn": 1}, "c": {"info": 1}}
+
+
+def test_stopping_ends_it_between_frames() -> None:
+    source = ArraySource(np.full((9, 4, 40), BEAM, np.uint16), [0] * 9, np.zeros(9))
+    stop = threading.Event()
+    seen = []
+    for judged in replay(source, should_stop=stop.is_set):  # type: ignore[arg-type]
+        seen.append(judged.row)
+        if judged.row == 3:
+            stop.set()
+    assert seen == [0, 1, 2, 3]
+    assert judged.kind == FrameKind.PROJECTION
