@@ -1,4 +1,4 @@
-"""Air beside the sample: the columns at the detector's edges that see only air, and each view's light there."""
+"""Air beside the sample: the columns at the detector's edges that see only air, and the light of each view by them."""
 
 from __future__ import annotations
 
@@ -58,10 +58,20 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
     return left, right
 
 
-def air_level(transmission: F32, left: int, right: int) -> F32:
-    """Median transmission of the air columns in each view, with equal weight for both sides."""
-    cols = transmission.shape[2]
-    sides = [side for side in (transmission[:, :, :left], transmission[:, :, cols - right :]) if side.shape[2]]
-    if not sides:
-        return np.ones(transmission.shape[0], np.float32)
-    return np.mean([np.median(side, axis=(1, 2)) for side in sides], axis=0).astype(np.float32)
+def air_light(transmission: F32, left: int, right: int) -> F32:
+    """Transmission of the air across each view [view, col]: 1 without air columns.
+
+    Medians of the two sides, and the line through them: a beam that moved or changed its shape since the flat tilts it.
+    """
+    views, _, cols = transmission.shape
+    sides = [(side, at) for side, at in (
+        (transmission[:, :, :left], (left - 1) / 2), (transmission[:, :, cols - right :], cols - (right + 1) / 2),
+    ) if side.shape[2]]  # fmt: skip
+    if not (sides and views):
+        return np.ones((views, cols), np.float32)
+    levels = [np.median(side, axis=(1, 2)).astype(np.float32) for side, _ in sides]
+    if len(sides) == 1:
+        return np.repeat(levels[0][:, None], cols, axis=1)
+    first, last = (at for _, at in sides)
+    along = np.clip((np.arange(cols) - first) / (last - first), 0, 1).astype(np.float32)
+    return levels[0][:, None] * (1 - along) + levels[1][:, None] * along

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.masks import Image, Mask, fill, plan_fill
-from recon.prep.air import air_columns, air_level, edge_profiles
+from recon.prep.air import air_columns, air_light, edge_profiles
 from recon.prep.defects import dead_pixels, zingers
 
 
@@ -37,7 +37,7 @@ class CorrectionSettings:
         zinger_threshold: robust standard deviations by which a pixel must be brighter than its neighbours, and than
             itself in the neighbouring views, to be replaced; inf replaces none.
         air: columns (left, right) that see no sample in any view and are scaled to a transmission of 1, or "auto" to
-            find them, or "none".
+            find them, or "none". Where both sides have some, the line through their levels is.
     """
 
     floor: float = 1e-4
@@ -63,7 +63,7 @@ class Projections:
         data: float32 [view, row, col], dimensionless, finite.
         view_ids: int64 [view].
         floored: fraction of the live pixels that were set to -log(floor).
-        air: float32 [view], transmission of the air columns, by which each view was divided; 1 without air columns.
+        air: float32 [view], transmission of the air, by which each view was divided, on average; 1 without air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
         replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
@@ -209,15 +209,16 @@ class Correction:
         if views is None:
             rows, cols = self._dark.shape
             views = Transmission(np.empty((0, rows, cols), np.float32), np.empty(0, np.int64), np.empty(0, np.int64))
-        air = air_level(views.data, *columns) if views.view_ids.size else np.empty(0, np.float32)
-        unlit = views.view_ids[~(air > settings.floor)]
+        light = air_light(views.data, *columns)
+        air = light.mean(axis=1)
+        unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
         if unlit.size:
             raise ValueError(
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )
         data, ids, repaired = views.data, views.view_ids, views.repaired
-        data /= air[:, None, None]
+        data /= light[:, None]
         if self._waiting is not None:
             first, first_air = self._waiting
             data = np.concatenate((first.data, data))

@@ -191,6 +191,16 @@ def test_air_takes_out_the_beam(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(one_side.air, beam, rtol=0.008)
 
 
+def test_a_beam_that_tilted_since_the_flat_is_taken_out(rng: np.random.Generator) -> None:
+    truth = sphere(views=40)
+    counts, references = beer_lambert(truth, rng, noise=0.003)
+    tilted = 0.7 * (1 + 0.04 * np.linspace(-1, 1, truth.shape[2]))
+    counts = references.dark + (counts - references.dark) * tilted
+    result = correct(counts, positions(counts), references)
+    np.testing.assert_allclose(result.air, 0.7, rtol=0.002)
+    assert np.abs(result.data - truth).mean(axis=(0, 1)).max() < 0.005
+
+
 @pytest.mark.parametrize("density", [0.025, 0.004])
 def test_a_sample_that_fills_the_view_has_no_air(rng: np.random.Generator, density: float) -> None:
     c = np.arange(100) - 50.0
