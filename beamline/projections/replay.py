@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.monitor.check import Check, Flag, Level, ScanContext
-from beamline.monitor.checks import CHECKS, bitmask
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.monitor.references import full_scale
 from beamline.monitor.watch import look, start
-from beamline.storage.flag_legend import FlagBit, FrameFlags
+from beamline.storage.flag_legend import FrameFlags, mark_of
 from beamline.storage.readers.base import ScanSource
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
@@ -103,10 +103,7 @@ def replay(
 
 def judged_flags(source: ScanSource) -> FrameFlags:
     """Flags as the monitor would have written them, of the frames that are there."""
-    bits = np.zeros(source.image_key.size, np.uint32)
-    for judged in replay(source):
-        bits[judged.row] = bitmask(judged.flags)
-    return FrameFlags(bits, tuple(FlagBit(check.name, check.bit) for check in CHECKS))
+    return FrameFlags.of_marks([mark_of(judged.flags) for judged in replay(source)])
 
 
 def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from queue import Full, Queue
@@ -17,7 +17,6 @@ from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import Emit
 from beamline.core.stop import StopRequest
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import Monitor, look
 from beamline.plan.plan import Timeline
@@ -38,7 +37,7 @@ class Writer(Protocol):
     def path(self) -> Path: ...
     @property
     def committed(self) -> int: ...
-    def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None: ...
+    def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None: ...
 
 
 class Recorder:
@@ -172,7 +171,7 @@ class Recorder:
     def _record(self, frame: Frame) -> None:
         found = digest(frame.counts, self._monitor.context.saturation, self._preview_bin)
         flags = self._look(frame, found)
-        self._writer.append(frame, found, bitmask(flags))
+        self._writer.append(frame, found, flags)
         self.references.add(frame, found)
         self.n_frames += 1
         self._report(flags)

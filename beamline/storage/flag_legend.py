@@ -5,19 +5,24 @@ Files without a legend hold the bits of the checks as they are numbered today, b
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Level
-from beamline.monitor.checks import ALARM_SHIFT, CHECKS
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.storage import hdf5
 
 FLAGS = "/entry/frame_log/flags"
+SCORES = "/entry/frame_log/flag_scores"
+REGIONS = "/entry/frame_log/flag_regions"
+VALID = "/entry/frame_log/frame_valid"
 LEGEND = "/entry/frame_log/flag_legend"
+NOWHERE = (-1, -1, -1, -1)  # the region of a flag that has none
 
 
 @dataclass(frozen=True)
@@ -26,10 +31,47 @@ class FlagBit:
 
     name: str
     bit: int
+    unit: str = ""
+    meaning: str = ""
 
     @property
     def alarm_bit(self) -> int:
         return self.bit + ALARM_SHIFT
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """What a row of a scan file says of the flags of its frame.
+
+    Attributes:
+        bits: as `beamline.monitor.checks.bitmask` makes them.
+        scores: float32 [check], in the order of the legend; NaN where the check did not flag the frame.
+        regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: none.
+    """
+
+    bits: int
+    scores: NDArray[np.float32]
+    regions: NDArray[np.int32]
+
+    @property
+    def valid(self) -> bool:
+        """No check raised an alarm."""
+        return self.bits >> ALARM_SHIFT == 0
+
+
+def mark_of(flags: Iterable[Flag]) -> Mark:
+    """The flags of a frame as a row of a file."""
+    flags = [flag for flag in flags if flag.level is not Level.INFO]
+    scores, regions = np.full(len(CHECKS), np.nan, np.float32), np.full((len(CHECKS), 4), -1, np.int32)
+    for flag in flags:
+        at = _PLACES[flag.check]
+        scores[at], regions[at] = flag.score, flag.region or NOWHERE
+    return Mark(bitmask(flags), scores, regions)
+
+
+_PLACES = {check.name: i for i, check in enumerate(CHECKS)}
+UNMARKED = mark_of(())
+"""Of a frame that no check flagged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +81,36 @@ class FrameFlags:
     Attributes:
         bits: [frame] as `beamline.monitor.checks.bitmask` makes them.
         legend: the checks behind the bits.
+        scores: [frame, check] as in `Mark`; None where the file holds none.
+        regions: [frame, check, 4], likewise.
     """
 
     bits: NDArray[np.integer]
     legend: tuple[FlagBit, ...]
+    scores: NDArray[np.float32] | None = None
+    regions: NDArray[np.int32] | None = None
+
+    @classmethod
+    def of_marks(cls, marks: Sequence[Mark]) -> FrameFlags:
+        """The flags of frames as today's checks found them."""
+        return cls(
+            np.array([mark.bits for mark in marks], np.uint32),
+            TODAY,
+            np.array([mark.scores for mark in marks], np.float32).reshape(-1, len(CHECKS)),
+            np.array([mark.regions for mark in marks], np.int32).reshape(-1, len(CHECKS), 4),
+        )
+
+    def mark(self, frame: int) -> Mark:
+        """The row of a frame as today's checks would write it; a check that is no more is left out."""
+        mark = Mark(0, UNMARKED.scores.copy(), UNMARKED.regions.copy())
+        bits, row = 0, int(self.bits[frame])
+        for i, entry in enumerate(self.legend):
+            if (at := _PLACES.get(entry.name)) is None or not row >> entry.bit & 1:
+                continue
+            bits |= 1 << TODAY[at].bit | (row >> entry.alarm_bit & 1) << TODAY[at].alarm_bit
+            if self.scores is not None and self.regions is not None:
+                mark.scores[at], mark.regions[at] = self.scores[frame, i], self.regions[frame, i]
+        return replace(mark, bits=bits)
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
@@ -57,11 +125,16 @@ class FrameFlags:
 
     def of(self, frames: NDArray[np.integer] | NDArray[np.bool_]) -> FrameFlags:
         """The flags of some of the frames."""
-        return FrameFlags(self.bits[frames], self.legend)
+        scores = None if self.scores is None else self.scores[frames]
+        regions = None if self.regions is None else self.regions[frames]
+        return FrameFlags(self.bits[frames], self.legend, scores, regions)
 
     def after(self, n: int) -> FrameFlags:
         """The flags with `n` frames that no check has seen put in front."""
-        return FrameFlags(np.concatenate([np.zeros(n, self.bits.dtype), self.bits]), self.legend)
+        bits = np.concatenate([np.zeros(n, self.bits.dtype), self.bits])
+        scores = None if self.scores is None else np.pad(self.scores, ((n, 0), (0, 0)), constant_values=np.nan)
+        regions = None if self.regions is None else np.pad(self.regions, ((n, 0), (0, 0), (0, 0)), constant_values=-1)
+        return FrameFlags(bits, self.legend, scores, regions)
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Frames by check and level, for the checks and levels that flagged any; a frame counts by its worst level."""
@@ -73,6 +146,10 @@ class FrameFlags:
             if any(by_level.values()):
                 found[entry.name] = {str(level): n for level, n in by_level.items() if n}
         return found
+
+
+TODAY = tuple(FlagBit(check.name, check.bit, check.unit, check.meaning) for check in CHECKS)
+"""The legend of a file that is written now."""
 
 
 def counted(counts: Mapping[str, Mapping[str, int]]) -> str:
@@ -92,20 +169,34 @@ def write_legend(file: h5py.File) -> None:
     group.create_dataset("alarm_bit", data=[check.bit + ALARM_SHIFT for check in CHECKS], dtype="<i4")
     group.create_dataset("unit", data=[check.unit for check in CHECKS], dtype=text)
     group.create_dataset("meaning", data=[check.meaning for check in CHECKS], dtype=text)
+    file[SCORES].attrs["description"] = "score of each check of flag_legend; NaN where it did not flag the frame"
+    file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
+    file[REGIONS].attrs["units"] = "pixel"
+    file[VALID].attrs["description"] = "0: a check raised an alarm; the frame's pixels are as the camera gave them"
     group["bit"].attrs["description"] = "set in flags where the check flagged the frame; alarm_bit: and as an alarm"
-    group["unit"].attrs["description"] = "of the check's score, which the events give"
+    group["unit"].attrs["description"] = "of the check's score"
 
 
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
     """The legend of a scan file; today's checks where an older file has none."""
-    names, bits = hdf5.dataset(file, f"{LEGEND}/name"), hdf5.dataset(file, f"{LEGEND}/bit")
-    if names is None or bits is None:
-        return tuple(FlagBit(check.name, check.bit) for check in CHECKS)
-    return tuple(FlagBit(hdf5.text(name), int(bit)) for name, bit in zip(names[()], bits[()], strict=True))
+    columns = [hdf5.dataset(file, f"{LEGEND}/{name}") for name in ("name", "bit", "unit", "meaning")]
+    if any(column is None for column in columns):
+        return TODAY
+    return tuple(
+        FlagBit(hdf5.text(name), int(bit), hdf5.text(unit), hdf5.text(meaning))
+        for name, bit, unit, meaning in zip(*(column[()] for column in columns if column is not None), strict=True)
+    )
 
 
 def read_flags(file: h5py.File, n: int) -> FrameFlags:
     """The flags of the first `n` frames of a scan file of ours, also of one that is being written."""
-    column = file[FLAGS]
+    legend, scores, regions = read_legend(file), None, None
+    if SCORES in file and REGIONS in file:
+        scores, regions = _read(file, SCORES, n), _read(file, REGIONS, n)
+    return FrameFlags(_read(file, FLAGS, n), legend, scores, regions)
+
+
+def _read(file: h5py.File, path: str, n: int) -> NDArray[Any]:
+    column = file[path]
     column.refresh()
-    return FrameFlags(column[:n], read_legend(file))
+    return np.asarray(column[:n])

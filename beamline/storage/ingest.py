@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, ScanStopped
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
+from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
@@ -141,13 +142,13 @@ def _copy(
 
 def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
     """Pixels and what is known of each frame; a scan of ours (also one whose writer died) keeps its log."""
-    flags = np.zeros(source.image_key.size, np.int64) if source.flags is None else source.flags.bits
+    flags = source.flags
     if source.dtype == np.uint16:
-        for frame, bits in zip(source.frames(), flags.tolist(), strict=True):
+        for i, frame in enumerate(source.frames()):
             known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
-            yield frame.counts, layout.Record(*known, bits)
+            yield frame.counts, layout.Record(*known, UNMARKED if flags is None else flags.mark(i))
         return
     keys, angles, exposures = source.image_key, source.angles, source.exposures
     for i in range(keys.size):
-        record = layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]), flags=int(flags[i]))
+        record = layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
         yield source.read([i])[0], record

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import CHECKS, bitmask
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
@@ -105,5 +105,5 @@ def write_flagged(path: Path, frames: list[Frame], levels: Mapping[int, Level], 
             said = (
                 [Flag(CHECKS[0].name, levels[frame.index], frame.index, 1.0, 0.0, "")] if frame.index in levels else []
             )
-            writer.append(frame, digest(frame.counts), bitmask(said))
+            writer.append(frame, digest(frame.counts), said)
     return path

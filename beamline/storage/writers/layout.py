@@ -6,7 +6,8 @@
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time, flags of each frame; flag_legend: bits of the flags
+      frame_log                 kind, trigger, framestamp, time of each frame; its flags, flag_scores, flag_regions and
+                                frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
@@ -31,8 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.version import version
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
-from beamline.storage.flag_legend import FLAGS, write_legend
+from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
 
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
@@ -56,6 +58,7 @@ SOURCE_DISTANCE = "/entry/record/source_distance"
 """Of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes for cones."""
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
+_MARKS_PER_CHUNK = 32  # frames, of scores and regions
 
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {  # path: (type, unit)
@@ -123,7 +126,7 @@ class Record:
     trigger: int = -1
     framestamp: int = -1
     time: float = np.nan
-    flags: int = 0
+    mark: Mark = UNMARKED
 
 
 def iso_time(seconds: float) -> str:
@@ -205,6 +208,9 @@ def create(
         _growing(file, path, (), np.dtype(kind))
         if unit:
             file[path].attrs["units"] = unit
+    _growing(file, VALID, (), np.dtype("<u1"))
+    _growing(file, SCORES, (len(CHECKS),), np.dtype("<f4"), _MARKS_PER_CHUNK)
+    _growing(file, REGIONS, (len(CHECKS), 4), np.dtype("<i4"), _MARKS_PER_CHUNK)
     write_legend(file)
     file["/entry/frame_log/time"].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
     if info.beam_unit is not None:
@@ -228,7 +234,8 @@ class Rows:
     def __init__(self, file: h5py.File) -> None:
         self._data: h5py.Dataset = file[DATA]
         self._preview: h5py.Dataset = file[PREVIEW]
-        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in COLUMNS}
+        paths = (*COLUMNS, VALID, SCORES, REGIONS)
+        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in paths}
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
         """Row `row`, which may exist or be the next: pixels first, then what is said about them."""
@@ -240,7 +247,10 @@ class Rows:
             "trigger": record.trigger,
             "framestamp": record.framestamp,
             "time": record.time,
-            "flags": record.flags,
+            "flags": record.mark.bits,
+            "frame_valid": record.mark.valid,
+            "flag_scores": record.mark.scores,
+            "flag_regions": record.mark.regions,
         }
         for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
@@ -271,8 +281,8 @@ def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None
     file.create_dataset(path, data=value.encode(), dtype=h5py.string_dtype("utf-8", width))
 
 
-def _growing(file: h5py.File, path: str, item: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    chunks = (1, *item) if item else (_SCALARS_PER_CHUNK,)
+def _growing(file: h5py.File, path: str, item: tuple[int, ...], dtype: np.dtype[Any], rows: int = 1) -> None:
+    chunks = (rows, *item) if item else (_SCALARS_PER_CHUNK,)
     file.create_dataset(path, (0, *item), dtype, maxshape=(None, *item), chunks=chunks)
 
 

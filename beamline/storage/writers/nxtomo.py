@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.text import size
+from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
+from beamline.storage.flag_legend import mark_of
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.layout import ScanInfo
@@ -101,15 +103,15 @@ class NXtomoWriter:
         self._table = layout.Rows(self._file)
         self._progress = self._file[layout.COMMITTED]
 
-    def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
-        """Write the next row; `frame.index` must be `rows`. `flags`: 32-bit mask of the monitor's checks.
+    def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
+        """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found.
 
         DataError for a wrong shape, type or index (nothing is written), or a disk that does not take it (the frames
         before stay readable; nothing more can be appended).
         """
-        self._check(frame, digest, flags)
+        self._check(frame, digest)
         record = layout.Record(
-            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time, flags
+            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time, mark_of(flags)
         )
         try:
             self._table.write(self._rows, frame.counts, digest, record)
@@ -199,7 +201,7 @@ class NXtomoWriter:
             dataset[()] = value
             dataset.flush()
 
-    def _check(self, frame: Frame, digest: FrameDigest, flags: int) -> None:
+    def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, wrong = frame.counts, ""
         if not self._open or self._broken:
             wrong = "the file is closed" if not self._open else "an earlier write failed"
@@ -209,8 +211,6 @@ class NXtomoWriter:
             wrong = f"its preview is {digest.preview.shape}, expected {self._preview_shape}"
         elif frame.index != self._rows:
             wrong = f"its index is {frame.index}, expected {self._rows}, the next row"
-        elif not 0 <= flags < 2**32:
-            wrong = f"its flags are {flags}, expected a 32-bit mask"
         if wrong:
             raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
 

@@ -15,7 +15,7 @@ import pytest
 from beamline.core.errors import BeamlineError, ConfigError, DataError
 from beamline.core.events import Event
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import CHECKS, bitmask
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
@@ -99,7 +99,7 @@ def _schedule(
         writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
 
     def append(frame: Frame) -> Callable[[], None]:
-        flags = bitmask([Flag(CHECKS[0].name, Level.ALARM, frame.index, 1.0, 0.0, "")] if frame.index in alarms else [])
+        flags = [Flag(CHECKS[0].name, Level.ALARM, frame.index, 1.0, 0.0, "")] if frame.index in alarms else []
         return lambda: writers[0].append(frame, digest(frame.counts), flags)
 
     start = clock.time + begin

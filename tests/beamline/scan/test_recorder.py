@@ -36,7 +36,7 @@ class Writer:
     def committed(self) -> int:
         return len(self.rows)
 
-    def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+    def append(self, frame: Frame, digest: FrameDigest, flags: object = ()) -> None:
         self._before(frame.index)
         assert digest.mean == frame.index
         self.rows.append(frame.index)

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from beamline.core.errors import ConfigError, DataError, InstrumentError, ScanSt
 from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import connect
+from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
@@ -141,7 +143,7 @@ def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None
 
 def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:
     class Full(NXtomoWriter):
-        def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+        def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
             if frame.index == at:
                 raise failure
             super().append(frame, digest, flags)
@@ -209,7 +211,7 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
     free = threading.Event()
 
     class Hanging(NXtomoWriter):
-        def append(self, frame: Frame, digest: FrameDigest, flags: int = 0) -> None:
+        def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
             if frame.index == 6:
                 free.wait(60)
             super().append(frame, digest, flags)

@@ -17,22 +17,25 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
-from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, read_legend
+from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, mark_of, read_legend
+from beamline.storage.ingest import ingest
+from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import StandingClock
 
 NAMES = [check.name for check in CHECKS]
+REGION = {"mass": (1, 3, 0, 6)}
 
 
 @pytest.fixture
 def path(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A scan of 4 views: beam flagged in views 1 and 2 (an alarm), mass in view 2."""
-    found = [[], [("beam", Level.WARN)], [("beam", Level.ALARM), ("mass", Level.WARN)], []]
+    found = [[], [("beam", Level.WARN)], [("beam", Level.ALARM), ("mass", Level.WARN)], [("dark", Level.INFO)]]
     with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
         frame = Frame(rng.integers(0, 99, (4, 6)).astype(np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
         for row, pairs in enumerate(found):
-            flags = bitmask(Flag(name, level, row, 1.0, 0.0, "") for name, level in pairs)
+            flags = [Flag(name, level, row, 1.5 * row, 0.0, "", REGION.get(name)) for name, level in pairs]
             writer.append(replace(frame, index=row), digest(frame.counts), flags)
     return writer.path
 
@@ -61,8 +64,38 @@ def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: 
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         names = file[f"{LEGEND}/name"]
         names[0] = "a check of a later version"
-        assert read_legend(file)[0] == FlagBit("a check of a later version", 0)
+        found = read_legend(file)[0]
+        assert (found.name, found.bit) == ("a check of a later version", 0)
     assert counted(describe(path)["flags"]) == "a check of a later version 1 warn 1 alarm, mass 1 warn"
+
+
+def test_scores_and_regions_stand_beside_the_bits(path: Path, tmp_path: Path) -> None:
+    with open_scan(path) as source, open_scan(ingest(path, tmp_path / "again.h5").path) as again:
+        for flags in (source.flags, again.flags):
+            assert flags is not None and flags.scores is not None and flags.regions is not None
+            beam, mass = NAMES.index("beam"), NAMES.index("mass")
+            np.testing.assert_array_equal(flags.scores[:, beam], [np.nan, 1.5, 3.0, np.nan])
+            np.testing.assert_array_equal(flags.scores[:, mass], [np.nan, np.nan, 3.0, np.nan])
+            assert np.isfinite(flags.scores).sum() == 3  # an INFO marks no frame
+            assert tuple(flags.regions[2, mass]) == REGION["mass"]
+            assert (np.delete(flags.regions.reshape(4, -1), 2, axis=0) == -1).all()
+            shifted = flags.after(2)
+            np.testing.assert_array_equal(shifted.scores[2:], flags.scores)  # type: ignore[index]
+            assert shifted.of(shifted.alarmed).regions.shape == (1, len(NAMES), 4)  # type: ignore[union-attr]
+    with h5py.File(path) as file:
+        assert file["entry/frame_log/frame_valid"][()].tolist() == [1, 1, 0, 1]
+        pixels = file["entry/instrument/detector/data"][()]
+    assert len(np.unique(pixels, axis=0)) == 1  # the raw frames are untouched
+
+
+def test_marks_become_flags_and_flags_marks() -> None:
+    found = [[Flag("mass", Level.ALARM, 0, 2.0, 1.0, "", (0, 1, 2, 3)), Flag("beam", Level.WARN, 0, 3.0, 1.0, "")], []]
+    flags = FrameFlags.of_marks([mark_of(each) for each in found])
+    assert [flags.mark(i).bits for i in range(2)] == [bitmask(each) for each in found]
+    later = FrameFlags(flags.bits, (FlagBit("of a later version", 0), *flags.legend[1:]), flags.scores, flags.regions)
+    assert later.mark(0).bits == bitmask(found[0][:1])
+    np.testing.assert_array_equal(later.mark(0).regions, mark_of(found[0][:1]).regions)
+    assert FrameFlags.of_marks([]).counts() == {}
 
 
 def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:

@@ -215,8 +215,6 @@ def test_wrong_frames_are_refused_and_nothing_is_written(
             writer.append(bad, digest(good.counts))
     with pytest.raises(DataError, match="preview"):
         writer.append(good, digest(good.counts, preview_bin=2))
-    with pytest.raises(DataError, match="32-bit"):
-        writer.append(good, digest(good.counts), flags=-1)
     with pytest.raises(ValueError, match="Status"):
         writer.close("splendid")
     assert (writer.rows, writer.committed) == (1, 1)
