@@ -44,6 +44,21 @@ class ScanAborted(ScanStopped):
     exit_code = INTERRUPTED
 
 
+class HoldRequest:
+    """A request to hold a scan before its next view, from another thread; it is granted once."""
+
+    def __init__(self) -> None:
+        self._reason: str | None = None
+
+    def hold(self, reason: str) -> None:
+        self._reason = reason
+
+    def take(self) -> str | None:
+        """Why the scan should be held; None where it should not. The request is then over."""
+        reason, self._reason = self._reason, None
+        return reason
+
+
 class StopRequest:
     """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once); it stays requested.
 

@@ -14,6 +14,7 @@ from beamline.core.text import spans
 from beamline.plan.plan import Block, Timeline
 from beamline.scan.exposures import Exposures, Taken
 from beamline.scan.ledger import LedgerError
+from beamline.scan.supervision import UNSUPERVISED, Supervision
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
@@ -38,8 +39,7 @@ class Acquisition:
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: takes (event, data) for block_started, block_done and warning.
-        refusal: asked once, before the first projection, when all frames before it were taken over: why no projection
-            should be taken; None: they may be.
+        supervision: what may hold the scan, or end it before its first projection.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class Acquisition:
         clock: Clock,
         stop: StopRequest,
         emit: Emit = lambda event, data: None,
-        refusal: Callable[[], str | None] = lambda: None,
+        supervision: Supervision = UNSUPERVISED,
     ) -> None:
         self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
-        self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit)
-        self._refusal, self._refused = refusal, ""
+        self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit, self._hold)
+        self._supervision, self._refused = supervision, ""
         self._done: list[TakenBlock] = []
         self.unsafe = False
         """A device failed while the instrument was made safe: stage, camera or shutter may be as during the scan."""
@@ -80,7 +80,7 @@ class Acquisition:
         Raises:
             LedgerError: frames are missing, or some have no trigger; all others were delivered with their angles.
             ScanStopped: a stop was requested, and the scan has ended in order.
-            ReferencesError: no projection was taken, by the `refusal`.
+            ReferencesError: no projection was taken, because supervision refused them.
             ScanAborted: an abort, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """
@@ -108,7 +108,7 @@ class Acquisition:
                 raise ScanAborted(f"Aborted: {self._stop.reason}.")
             if self._stop.stopping and not self._still_needed(block):
                 continue
-            if block.kind is FrameKind.PROJECTION and (refused := self._refusal()):
+            if block.kind is FrameKind.PROJECTION and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
             done = TakenBlock(block, Taken())
@@ -154,6 +154,21 @@ class Acquisition:
                 f"{shutter.name}: it is {found}, {NOUN[kind]}s need it {wanted}. Check its interlock. "
                 "What was taken before is in the file."
             )
+
+    def _hold(self) -> None:
+        """Wait with a closed shutter until the operator lets the scan go on, where supervision asks for that."""
+        reason, shutter = self._supervision.hold(), self._devices.shutter
+        if reason is None:
+            return
+        shutter.close()
+        self._emit("state", {"state": "held", "message": f"Held with a closed shutter: {reason}"})
+        try:
+            self._supervision.ask(f"The scan is held: {reason}. Let it go on?")
+        except DeviceError as error:
+            self._stop.stop(f"{reason}; the scan was held, and nobody let it go on ({error})")
+        if not self._stop.stopping:
+            shutter.open()
+            self._emit("state", {"state": "acquiring", "message": "The scan goes on"})
 
     def _make_safe(self, home: float | None) -> list[Exception]:
         """Stop the stage, disarm, close the shutter; all steps are tried. Returns the first error of each one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -90,6 +90,7 @@ class Exposures:
         camera_settings: roi, binning and readout for all blocks; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: where warnings go.
+        hold: called before each view of a step scan and each pass of a fly scan; may wait.
     """
 
     def __init__(
@@ -100,10 +101,11 @@ class Exposures:
         clock: Clock,
         stop: StopRequest,
         emit: Emit,
+        hold: Callable[[], None] = lambda: None,
     ) -> None:
         self._stage, self._camera = devices.stage, devices.camera
         self._settings, self._settle = camera_settings, settle
-        self._clock, self._stop, self._emit = clock, stop, emit
+        self._clock, self._stop, self._emit, self._hold = clock, stop, emit, hold
 
     def take(self, block: Block, first_row: int, taken: Taken) -> Iterator[Frame]:
         """The block's frames, numbered from `first_row`; `taken` records what is missing.
@@ -142,6 +144,7 @@ class Exposures:
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         first = 0
         for train, (start, end) in zip(block.trains, pass_ends(block), strict=True):
+            self._hold()
             if self._stop.stopping or not self.go(start):
                 return
             angles = block.angles[first : first + train.n]
@@ -219,6 +222,8 @@ class Exposures:
         triggered, silent = -math.inf, 0
         owed = self._stop.stopping
         for i, angle in enumerate(block.angles):
+            if math.isfinite(angle):
+                self._hold()
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from queue import Full, Queue
@@ -15,7 +15,6 @@ import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import Emit
-from beamline.core.stop import StopRequest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import Monitor, look
@@ -46,7 +45,7 @@ class Recorder:
     No frame is dropped: while the disk is behind, `put` waits.
 
     Args:
-        stop_on_alarm: an alarm asks for a stop.
+        react: told the flags of each frame.
 
     Attributes:
         n_frames: written so far.
@@ -62,11 +61,10 @@ class Recorder:
         *,
         preview_bin: int,
         emit: Emit,
-        stop: StopRequest,
-        stop_on_alarm: bool,
+        react: Callable[[tuple[Flag, ...]], None] = lambda flags: None,
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
-        self._emit, self._stop, self._stop_on_alarm = emit, stop, stop_on_alarm
+        self._emit, self._react = emit, react
         self._progress = _Progress(timeline)
         self._active: set[tuple[str, Level]] = set()
         self._monitor_off = False
@@ -199,9 +197,8 @@ class Recorder:
         for flag in flags:
             if (flag.check, flag.level) not in self._active:
                 self._emit("flag", asdict(flag))
-            if flag.level is Level.ALARM and self._stop_on_alarm and not self._stop.stopping:
-                self._stop.stop(f"the monitor's {flag.check} check raised an alarm: {flag.advice.rstrip('.')}")
         self._active = active
+        self._react(flags)
 
 
 class _Progress:

@@ -13,12 +13,14 @@ from typing import Any
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, resolved_yaml
+from beamline.config.monitor import policies
 from beamline.config.references import reference_limits
 from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.narration import UserLog
-from beamline.core.stop import ScanAborted, StopRequest
+from beamline.core.stop import HoldRequest, ScanAborted, StopRequest
 from beamline.instrument.connect import Instrument, connect
+from beamline.instrument.operator import ask_operator
 from beamline.plan.plan import Block
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
@@ -27,6 +29,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction
 from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
+from beamline.scan.supervision import AlarmPolicy, AlarmReaction, Supervision
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
@@ -131,7 +134,7 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
-            run = _Run(config, instrument, ready, folder, stop, emit, began)
+            run = _Run(config, instrument, ready, folder, stop, emit, began, ask or ask_operator)
             return run.go(live, release=connected.close)
 
 
@@ -150,6 +153,8 @@ class _Run:
     stop: StopRequest
     emit: Emit
     began: float
+    ask: Ask
+    hold: HoldRequest = field(default_factory=HoldRequest)
     told: set[str] = field(default_factory=set)
     """Groups of references whose faults were told."""
 
@@ -259,21 +264,22 @@ class _Run:
         )
 
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
+        monitor = self.config.monitor
+        policy = AlarmPolicy(monitor.on_alarm == "stop", monitor.act_after, policies(monitor))
         return Recorder(
             writer,
             self.ready.monitor,
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             emit=self.emit,
-            stop=self.stop,
-            stop_on_alarm=self.config.monitor.on_alarm == "stop",
+            react=AlarmReaction(policy, self.stop, self.hold, self.emit),
         )
 
     def _acquisition(self, recorder: Recorder) -> Acquisition:
         ready, instrument = self.ready, self.instrument
         return Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
-            self.emit, lambda: self._refusal(recorder),
+            self.emit, Supervision(lambda: self._refusal(recorder), self.hold.take, self.ask),
         )  # fmt: skip
 
     def _refusal(self, recorder: Recorder) -> str | None:

@@ -14,6 +14,7 @@ from beamline.core.stop import StopRequest
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
+from drivers.manual import Ask
 from tests.beamline.fakes import COUNT, FakeInstrument, decode
 
 SMALL = (
@@ -41,14 +42,16 @@ class Ran:
         *overrides: str,
         stop: StopRequest | None = None,
         live: Callable[[Path, Path], Sequence[str]] | None = None,
+        ask: Ask | None = None,
     ) -> None:
         self.events: list[Event] = []
         self.result: RunResult | None = None
         self.error: BaseException | None = None
         self.instrument = instrument
         try:
+            devices = instrument.connected()
             self.result = run_scan(
-                small(*overrides), runs, [self.events.append], stop, live=live, instrument=instrument.connected()
+                small(*overrides), runs, [self.events.append], stop, live=live, instrument=devices, ask=ask
             )
         except BaseException as error:
             self.error = error

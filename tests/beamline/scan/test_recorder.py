@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.core.stop import StopRequest
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start
@@ -43,15 +42,12 @@ class Writer:
 
 
 def record(writer: Writer) -> Recorder:
-    stop = StopRequest()
     return Recorder(
         writer,
         start(ScanContext(65535, 4)),
         TIMELINE,
         preview_bin=2,
         emit=lambda event, data: None,
-        stop=stop,
-        stop_on_alarm=False,
     )
 
 
