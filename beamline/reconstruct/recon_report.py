@@ -27,6 +27,7 @@ from recon.base.volume import Volume
 from recon.methods import BASELINE, by_name
 from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import Filter
+from recon.voxels.unexplained import LIMIT, Unexplained
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,17 @@ class ReportContext:
     scan_flags: Sequence[str] = field(default_factory=tuple)
 
 
+def hiding_text(made: ReconOutcome, left: Unexplained) -> str:
+    """The warning that a volume leaves structure in the views; empty where it does not, or is no fit to the views."""
+    if left.share <= LIMIT or by_name(made.method).traits.direct:
+        return ""
+    return (
+        f"{left.share:.1%} of the matter leaves structure in the residual of the views (at most {LIMIT:.1%} is usual): "
+        f"the {label_of(made.method)} volume may hide cracks, pores or edges. Look at 'What the volume leaves in the "
+        "views' in the report, and compare with --method fbp and fista-tv."
+    )
+
+
 def label_of(method: str) -> str:
     """A method's name for people."""
     return by_name(method).label
@@ -157,8 +169,9 @@ def compose(
     metrics: Mapping[str, Mapping[str, float]],
     parameters: Mapping[str, Value],
     context: ReportContext,
+    left: Unexplained | None = None,
 ) -> Report:
-    """The report on a reconstruction."""
+    """The report on a reconstruction; `left` is the structure in its residual, where it is known."""
     name, geometry = label_of(made.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]
@@ -184,6 +197,11 @@ def compose(
         )
     if "resumed_from" in made.settings:
         footnotes.append(f"Time of {name}: since the fit was resumed, without the time before.")
+    if left is not None:
+        footnotes.append(
+            f"Matter that leaves structure: voxels at which the back-projected residual of {len(left.significance)} "
+            f"slices exceeds four standard deviations of its noise; above {LIMIT:g} a fit hides something."
+        )
     if truth is not None:
         footnotes.append(
             "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
@@ -196,14 +214,18 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
-        pictures=_pictures(made, prepared, truth, volumes),
+        pictures=_pictures(made, prepared, truth, volumes, left),
         command=context.command,
         footnotes=footnotes,
     )
 
 
 def _pictures(
-    made: ReconOutcome, prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]
+    made: ReconOutcome,
+    prepared: PreparedProjections,
+    truth: Volume | None,
+    volumes: Mapping[str, Volume],
+    left: Unexplained | None,
 ) -> list[Picture]:
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
     row = geometry.detector_shape[0] // 2
@@ -217,6 +239,17 @@ def _pictures(
             figures.orthogonal_slices(shown, unit),
         )
     ]
+    if left is not None:
+        at = len(left.significance) // 2
+        pictures.append(
+            Picture(
+                "What the volume leaves in the views",
+                "Filtered back-projection of the residual over its noise. Noise alone is even and seldom beyond 4; an "
+                "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
+                "much, red: too little.",
+                figures.significance(left.significance[at], made.volume.grid, left.first + at, unit),
+            )
+        )
     if made.history:
         pictures.append(
             Picture(

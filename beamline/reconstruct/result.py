@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, hiding_text, label_of
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
@@ -22,6 +22,7 @@ from recon.base.volume import Volume
 from recon.methods import BASELINE, by_name
 from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
+from recon.voxels.unexplained import unexplained
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,17 @@ def write_result(
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
         return {**measure(volume, prepared, truth, mask), "seconds": seconds}
 
+    left = unexplained(
+        made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed)
+    )  # fmt: skip
     metrics = {made.method: judged(made.volume, made.seconds)}
+    hiding = ""
+    if left is not None:
+        metrics[made.method]["unexplained"] = left.share
+        hiding = hiding_text(made, left)
+        if hiding:
+            sink(Event("warning", clock.now(), {"message": hiding}))
+            context = replace(context, warnings=[*context.warnings, hiding])
     volumes = {made.method: made.volume}
     if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
         before = clock.now()
@@ -81,7 +92,7 @@ def write_result(
     )
     write_reconstruction(target.output, record, replace=target.replace)
     if target.report is not None:
-        page = compose(made, prepared, truth, volumes, metrics, parameters, context)
+        page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
         try:
             write_report(target.report, page, replace=target.replace)
         except BaseException:
@@ -99,6 +110,8 @@ def write_result(
         **own,
     }
     summary |= {name: made.settings[name] for name in ("ended_early", "resumed_from") if name in made.settings}
+    if hiding:
+        summary["hiding"] = hiding
     if made.chosen:
         summary["chosen"] = made.chosen
     if (further := made.next_decibel) is not None:

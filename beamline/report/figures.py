@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from beamline.report.record import residual_curve
 from recon.assess.time_model import NextDecibel, parts_of, record
 from recon.base.geometry import Geometry
-from recon.base.volume import Volume
+from recon.base.volume import Grid, Volume
 
 Window = tuple[float, float]
 _DPI = 110
@@ -128,6 +128,19 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
                 axes.set_title(name, fontsize=11)
     bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
     bar.set_label(f"attenuation (1/{unit})")
+    return png(figure)
+
+
+def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> bytes:
+    """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
+    figure, axes = _figure((6.4, 5.4))
+    (y, x), (_, cy, cx) = image.shape, grid.centre
+    extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size))
+    shown = axes.imshow(
+        image, cmap="RdBu_r", origin="lower", extent=extent, norm=Normalize(-8, 8), interpolation="nearest"
+    )
+    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})", title=f"Slice {at}")
+    figure.colorbar(shown, ax=axes, label="standard deviations of the noise", pad=0.02)
     return png(figure)
 
 

@@ -24,6 +24,7 @@ METRICS = {
     "cnr": Metric("CNR", "dB", 2, "smoother has more"),
     "residual": Metric("Data residual, views used", "", 4, "lower is better"),
     "residual_held_out": Metric("Data residual, views held out", "", 4, "lower is better"),
+    "unexplained": Metric("Matter that leaves structure", "", 4, "lower is better"),
     "seconds": Metric("Time", "s", 1, "lower is better"),
 }
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from recon.base.masks import masked
 from recon.base.method import ReconProblem
-from recon.base.noise import median_deviation, noise_level
+from recon.base.noise import noise_level, ring_offsets
 from recon.base.volume import Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field
@@ -36,7 +35,6 @@ SWEEPS = 8
 
 SUBSETS, TV_STEPS = 9, 3
 
-_RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
 _DIFFERENT = 0.6  # of the noise
 # Times the noise. After the sweeps 0.7 to 1.0 on six scans that voxels explain, crops that fill their box among them,
 # 1.9 to 5.6 on three coarse cones, 3 to 7 on three regions of interest.
@@ -127,28 +125,6 @@ def finish(
 def _deviation(left: F32, weights: F32 | None) -> float:
     """Root mean square of a residual, rays weighed."""
     return math.sqrt(float(np.nanmean(np.square(whitened(left, weights)), dtype=np.float64)))
-
-
-def ring_offsets(residual: F32) -> F32:
-    """Offsets of single pixels [row, col] that stay in all views: what becomes rings in a volume.
-
-    The median over the views of what a model leaves of them, less its own neighbourhood along the row, and along the
-    column: the wall of a can around the axis stays in all views, too, but in all rows alike (-1.1 dB on a battery). 0
-    where it does not stand out of its scatter by three standard errors. Of few views it cannot be told from the sample:
-    then it is 0.
-
-    Args:
-        residual: views less a model's views, [view, row, col].
-    """
-    n = len(residual)
-    if n < _RING_VIEWS or residual.shape[2] < _NEIGHBOURS:
-        return np.zeros(residual.shape[1:], np.float32)
-    steady = np.median(residual, axis=0)
-    steady -= median_filter(steady, (1, _NEIGHBOURS), mode="nearest")
-    if len(steady) >= _NEIGHBOURS:
-        steady -= median_filter(steady, (_NEIGHBOURS, 1), mode="nearest")
-    error = 1.25 * median_deviation(residual - np.median(residual)) / np.sqrt(n)
-    return np.where(np.abs(steady) > 3 * error, steady, 0).astype(np.float32)
 
 
 def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, F32 | None]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from recon.base.geometry import Geometry
-from recon.base.noise import median_deviation, noise_level
+from recon.base.noise import median_deviation, noise_level, ring_offsets
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 
@@ -79,3 +79,26 @@ def test_pixels_that_do_not_count_are_nan(rng: np.random.Generator) -> None:
     assert noise_level(views) == pytest.approx(0.3, rel=0.1)
     assert median_deviation(views) == pytest.approx(0.3, rel=0.05)
     assert median_deviation(np.full((1, 1, 3), np.nan, np.float32)) == 0.0
+
+
+def test_what_stays_in_a_pixel_over_all_views_is_a_ring_and_what_moves_is_not(rng: np.random.Generator) -> None:
+    rings = np.zeros((6, 50), np.float32)
+    rings[:, 12], rings[2, 30] = 0.5, -0.4
+    noise = rng.normal(0, 0.2, (60, 6, 50)).astype(np.float32)
+    crack = np.zeros((60, 6, 50), np.float32)
+    crack[np.arange(60), :, (25 + 20 * np.cos(np.arange(60) / 10)).astype(int)] = 1.5
+    found = ring_offsets(noise + rings + crack)
+    np.testing.assert_allclose(found[rings != 0], rings[rings != 0], atol=0.12)
+    assert np.count_nonzero(found[rings == 0]) < 0.02 * rings.size
+    assert not ring_offsets((noise + rings)[:10]).any()  # too few views to tell
+
+
+def test_a_wall_around_the_axis_is_no_ring(rng: np.random.Generator) -> None:
+    # What the fit leaves of a can's wall stays in all views, too, but in all rows alike.
+    wall = np.zeros((12, 50), np.float32)
+    wall[:, 12:14], wall[:, 37:39] = 0.5, -0.4
+    ring = np.zeros_like(wall)
+    ring[5, 12] = 0.5
+    found = ring_offsets(rng.normal(0, 0.2, (60, 12, 50)).astype(np.float32) + wall + ring)
+    np.testing.assert_allclose(found[5, 12], 0.5, atol=0.15)
+    assert np.abs(found[ring == 0]).max() < 0.2 and np.count_nonzero(found[ring == 0]) < 0.02 * ring.size

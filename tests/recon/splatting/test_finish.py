@@ -16,7 +16,7 @@ from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import finish, ring_offsets
+from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
@@ -117,29 +117,6 @@ def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
     filled, opened = (depth(reconstruct(data, views, replace(fit, finish=n)).volume.data) for n in (0, None))
     direct = depth(reconstruct(data, views, Fbp()).volume.data)
     assert filled < direct < 0.6 < 0.8 < opened
-
-
-def test_what_stays_in_a_pixel_over_all_views_is_a_ring_and_what_moves_is_not(rng: np.random.Generator) -> None:
-    rings = np.zeros((6, 50), np.float32)
-    rings[:, 12], rings[2, 30] = 0.5, -0.4
-    noise = rng.normal(0, 0.2, (60, 6, 50)).astype(np.float32)
-    crack = np.zeros((60, 6, 50), np.float32)
-    crack[np.arange(60), :, (25 + 20 * np.cos(np.arange(60) / 10)).astype(int)] = 1.5
-    found = ring_offsets(noise + rings + crack)
-    np.testing.assert_allclose(found[rings != 0], rings[rings != 0], atol=0.12)
-    assert np.count_nonzero(found[rings == 0]) < 0.02 * rings.size
-    assert not ring_offsets((noise + rings)[:10]).any()  # too few views to tell
-
-
-def test_a_wall_around_the_axis_is_no_ring(rng: np.random.Generator) -> None:
-    # What the fit leaves of a can's wall stays in all views, too, but in all rows alike.
-    wall = np.zeros((12, 50), np.float32)
-    wall[:, 12:14], wall[:, 37:39] = 0.5, -0.4
-    ring = np.zeros_like(wall)
-    ring[5, 12] = 0.5
-    found = ring_offsets(rng.normal(0, 0.2, (60, 12, 50)).astype(np.float32) + wall + ring)
-    np.testing.assert_allclose(found[5, 12], 0.5, atol=0.15)
-    assert np.abs(found[ring == 0]).max() < 0.2 and np.count_nonzero(found[ring == 0]) < 0.02 * ring.size
 
 
 def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generator) -> None:

@@ -1,0 +1,88 @@
+"""unexplained: structure that a volume leaves in the views, such as a crack that it fills, told from their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, gaussian_filter
+
+from recon.base.geometry import Geometry
+from recon.base.noise import ring_offsets
+from recon.base.volume import Grid, Volume
+from recon.voxels.fbp import fbp
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+
+LIMIT = 0.007
+"""Share of the matter above which a volume hides structure: 0.01 to 0.05 of seven fits that fill cracks and round
+edges, up to 0.004 of sixteen finished ones, up to 0.005 of the true volumes on voxels (docs/exploration.md)."""
+
+_SIGMAS = 4.0  # of the noise: its own share is below 1e-3
+_FLIPS = 6
+_SMOOTH, _AROUND = 1.0, 4.0  # pixels: detail that is looked for, and of the map of the noise
+_ROWS, _COLS = 8, 256  # rows looked at, of so many columns; fewer of wider detectors
+_LEAST_VIEWS = 16
+_MATTER, _CLOSED = 0.2, 2  # of the 99th percentile; voxels: cracks belong to the matter
+
+
+@dataclass(frozen=True, eq=False)
+class Unexplained:
+    """What the residual of the views would add to some slices of a volume.
+
+    Attributes:
+        share: of the voxels of matter, those at which the residual has more than four standard deviations of its noise.
+        first: slice of the volume, the first looked at.
+        significance: float32 [z, y, x], filtered back-projection of the residual over its noise; positive where the
+            volume has too little.
+    """
+
+    share: float
+    first: int
+    significance: F32
+
+
+def unexplained(volume: Volume, projections: F32, geometry: Geometry, rng: np.random.Generator) -> Unexplained | None:
+    """Filtered back-projection of the residual p - A x, over the noise that the same views have with random signs.
+
+    Random signs of the views cancel structure, which all of them have in common, and keep noise [our own; after the
+    odd-even differences of half-sets]. Pixels that make rings are taken out first. Up to eight rows around the middle
+    of the matter are looked at, one of a detector of 700 columns or more.
+
+    Args:
+        volume: on the slices of the detector rows, 1/mm.
+        projections: [view, row, col].
+
+    Returns:
+        None for cones, rolled or tilted views, fewer than 16 views, other slices, and where there is no matter.
+    """
+    rows, cols = geometry.detector_shape
+    same = volume.grid == Grid.matching(geometry)
+    if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
+        return None
+    n = min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
+    mass = np.maximum(volume.data, 0).sum(axis=(1, 2), dtype=np.float64)
+    middle = round(float(mass @ np.arange(rows) / mass.sum())) if mass.any() else 0
+    first = min(max(middle - n // 2, 0), rows - n)
+    views = geometry.rows(first, first + n)
+    part = Volume(np.ascontiguousarray(volume.data[first : first + n]), Grid.matching(views))
+    level = _MATTER * float(np.percentile(part.data, 99))
+    matter = np.stack([binary_closing(image > level, iterations=_CLOSED) for image in part.data])
+    if level <= 0 or not matter.any():
+        return None
+    left = projections[:, first : first + n] - Projector(views, part.grid).forward(part.data)
+    left -= ring_offsets(left)
+
+    def seen(residual: F32) -> F32:
+        images = fbp(np.ascontiguousarray(residual, np.float32), views, part.grid, filter="hann")
+        return gaussian_filter(images, (0, _SMOOTH, _SMOOTH))
+
+    found, variance = seen(left), np.zeros(part.grid.shape, np.float32)
+    signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
+    for _ in range(_FLIPS):
+        variance += seen(left * rng.permutation(signs)[:, None, None]) ** 2 / _FLIPS
+    noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
+    significance = np.divide(found, noise, out=np.zeros_like(found), where=noise > 0)
+    return Unexplained(float(np.mean(np.abs(significance[matter]) > _SIGMAS)), first, significance)

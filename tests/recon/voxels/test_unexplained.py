@@ -1,0 +1,56 @@
+"""Structure left in the residual: none in noise, rings or a true volume; a filled crack is seen, and where it is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.voxels.projector import Projector
+from recon.voxels.unexplained import LIMIT, unexplained
+
+F32 = NDArray[np.float32]
+VIEWS = Geometry.parallel(np.linspace(0, math.pi, 60, endpoint=False), (8, 64))
+GRID = Grid.matching(VIEWS)
+_, Y, X = np.meshgrid(*GRID.coordinates(), indexing="ij")
+TOOTH = np.where(np.hypot(X, Y) < 26, np.float32(0.04), np.float32(0))
+CRACK = (abs(X - 6.5) < 1) & (abs(Y) < 12)
+TRUTH = np.where(CRACK, np.float32(0), TOOTH)
+
+
+def _views(rng: np.random.Generator, sigma: float = 0.03) -> F32:
+    return Projector(VIEWS, GRID).forward(TRUTH) + rng.normal(0, sigma, (60, 8, 64)).astype(np.float32)
+
+
+def test_a_filled_crack_is_seen_where_it_is(rng: np.random.Generator) -> None:
+    found = unexplained(Volume(TOOTH, GRID), _views(rng), VIEWS, rng)
+    assert found is not None and found.share > 2 * LIMIT
+    strong = found.significance < -4  # the volume has too much there
+    assert strong[CRACK].mean() > 0.5 and strong[np.hypot(X - 6.5, np.maximum(abs(Y) - 12, 0)) > 6].mean() < LIMIT
+
+
+@pytest.mark.parametrize("rings", [0.0, 0.1])
+def test_the_truth_leaves_noise_and_rings(rng: np.random.Generator, rings: float) -> None:
+    offsets = np.where(rng.random((8, 64)) < 0.05, rings, 0).astype(np.float32)
+    found = unexplained(Volume(TRUTH, GRID), _views(rng) + offsets, VIEWS, rng)
+    assert found is not None and found.share < LIMIT / 3
+
+
+def test_it_is_in_units_of_the_noise(rng: np.random.Generator) -> None:
+    found = unexplained(Volume(TRUTH, GRID), _views(rng), VIEWS, rng)
+    assert found is not None
+    inside = np.broadcast_to(np.hypot(X, Y) < 26, TRUTH.shape)
+    assert found.significance[inside].std() == pytest.approx(1, abs=0.15)
+
+
+def test_what_it_is_not_made_for(rng: np.random.Generator) -> None:
+    volume, few = Volume(TRUTH, GRID), VIEWS.select(np.arange(10))
+    data = _views(rng)
+    assert unexplained(volume, data[:10], few, rng) is None
+    assert unexplained(Volume(np.zeros_like(TRUTH), GRID), data, VIEWS, rng) is None
+    cone = Geometry.cone(VIEWS.angles, (8, 64), 1.0, 500.0, 700.0)
+    assert unexplained(volume, data, cone, rng) is None
