@@ -90,8 +90,8 @@ def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
     assert f"Warning: The fit started from {start} Gaussians, not from 99999999" in result.stderr
     result = beamline("recon", "scan.h5", "--steps", "2", "--gaussians", "50", "--no-report", "-o", "few.h5")
     assert result.exit_code == 0 and "The fit started" not in result.stderr
-        # Two steps of fifty Gaussians do not explain the views, and that is said.
-        assert "leaves structure in the residual of the views" in result.stderr
+    # Two steps of fifty Gaussians do not explain the views, and that is said.
+    assert "leaves structure in the residual of the views" in result.stderr
 
 
 def test_the_default_of_steps_is_told_as_it_is() -> None:
