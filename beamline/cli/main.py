@@ -31,6 +31,7 @@ _COMMANDS = {
     "check": _Entry("check", "Validate a configuration. Nothing moves."),
     "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves."),
     "home": _Entry("home", "Search the stage's reference position. The stage turns."),
+    "tune": _Entry("tune", "Take a few frames and say which exposure to take."),
     "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
     "simulate": _Entry("simulate", "Simulate a scan of a scene, with labels and truth."),
     "xafs": _Entry("xafs", "Find a material's absorption edge and the energy of its highest contrast."),

@@ -152,7 +152,7 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fa
         return None
     said = (
         f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
-        "Shorten the exposure or add a filter: `beamline tune` says how far."
+        "Shorten the exposure or add a filter."
     )
     return Fault("saturated", score, limits.saturated, said)
 

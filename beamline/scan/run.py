@@ -291,8 +291,8 @@ class _Run:
             return None
         return (
             f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
-            f"The shutter is closed; the {recorder.n_frames} darks and flats are in the file. references.on_fault: "
-            "log takes the scan all the same."
+            f"The shutter is closed; the {recorder.n_frames} darks and flats are in the file. `beamline tune` looks "
+            "for an exposure; references.on_fault: log takes the scan all the same."
         )
 
     def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:

@@ -1,0 +1,55 @@
+"""`beamline tune`: takes a few frames and says which exposure to take."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from beamline.cli.json_output import json_events
+from beamline.cli.options import config_argument, json_option, set_option
+from beamline.cli.scan import stop_signals
+from beamline.cli.terminal import Terminal
+from beamline.config.load import load
+from beamline.core.errors import QualityError
+from beamline.core.events import Announcer, Event, Sink
+from beamline.core.stop import StopRequest
+from beamline.instrument.connect import connect
+from beamline.instrument.operator import ask_operator
+from beamline.scan.tune import tune as tune_exposure
+
+
+@click.command()
+@config_argument
+@click.option("--angle", type=float, help="Angle of the view, degrees. Default: the first one of the scan.")
+@set_option
+@json_option
+def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Take darks, flats and a view, and say counts, saturation, transmission, noise and the exposure to take.
+
+    The shutter opens, the sample goes out and back, the stage turns to the view's angle and back. Two darks and two
+    flats tell noise from structure; flats and view are also taken at an eighth and a 64th of the exposure, in case
+    they saturate. Nothing is written.
+
+    Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the darks or flats would stop a scan.
+    """
+    with json_events(as_json) as json_sinks:
+        config = load(file, overrides)
+        stop = StopRequest()
+        with stop_signals(stop), Terminal(sys.stderr) as terminal:
+            sinks: list[Sink] = [terminal, *json_sinks]
+            with (
+                connect(config, ask=lambda request: terminal.ask(request, ask_operator)) as instrument,
+                Announcer(sinks, instrument.clock) as emit,
+            ):
+                found = tune_exposure(config, instrument, stop, emit, None if angle is None else math.radians(angle))
+                now = instrument.clock.now()
+        for sink in json_sinks:
+            sink(Event("done", now, asdict(found)))
+    if not as_json:
+        click.echo("\n".join(found.lines()))
+    if found.faults:
+        raise QualityError(f"These references would stop a scan; {found.advised:.4g} s is the exposure to take.")

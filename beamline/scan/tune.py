@@ -1,0 +1,278 @@
+"""Tune: a few darks, flats and views at some exposures, and what they say about counts, noise and the exposure to take.
+
+Noise is told from structure by pairs of frames; the gain by photon transfer (Janesick 2007, Photon Transfer, ch. 5):
+variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
+sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.config.load import Config, plan_of
+from beamline.config.references import reference_limits
+from beamline.core.errors import InstrumentError
+from beamline.core.events import Emit
+from beamline.core.stop import StopRequest
+from beamline.instrument.connect import Instrument, camera_settings
+from beamline.monitor.digest import digest
+from beamline.monitor.references import Reference, ReferenceLimits, judge
+from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
+from beamline.scan.acquisition import Acquisition
+from beamline.scan.ledger import LedgerError
+from drivers.errors import DeviceRefused
+from drivers.frame import Frame, FrameKind
+from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
+
+F64 = NDArray[np.float64]
+
+SHORTER = (1.0, 1 / 8, 1 / 64)  # of the configured exposure: one of them does not saturate, unless it is off by 60
+TARGET = 0.8  # of the range for the brightest pixels: room for top-up and drift; more light would gain 1/10 of noise
+BRIGHTEST = 99.9  # percentile of the flat that must not saturate
+DARKEST = 1.0  # percentile of the transmission that is the darkest part
+UNLIT = 0.05  # of the brightest light: pixels with less are beside the beam
+BLOCK = 4  # pixels a side, whose mean has little noise
+ZINGER = 12.0  # times the median change of a pixel from frame to frame, 8 standard deviations: no noise
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What the frames say; counts per pixel and frame, exposures in s.
+
+    Attributes:
+        configured: exposure of the configuration.
+        exposure: of the flats that were used: the longest that does not saturate.
+        saturation: the largest count.
+        dark, dark_noise: median of the darks, standard deviation of a pixel.
+        flat, brightest: median of the flat where there is beam, and 99.9th percentile of its means of 4 x 4 pixels.
+        saturated: fraction of its pixels that are saturated at the configured exposure.
+        gain: counts of a photon; NaN where the frames have no noise.
+        transmission: of the view, at its darkest hundredth and in the median.
+        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow.
+        noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median.
+        longest: exposure that the period and the camera allow.
+        angle: of the view, rad.
+        faults: what is wrong with darks and flats at the configured exposure.
+    """
+
+    configured: float
+    exposure: float
+    saturation: float
+    dark: float
+    dark_noise: float
+    flat: float
+    brightest: float
+    saturated: float
+    gain: float
+    transmission: tuple[float, float]
+    advised: float
+    noise: tuple[float, float]
+    longest: float
+    angle: float
+    faults: tuple[str, ...]
+
+    @property
+    def photons(self) -> float:
+        """In a pixel of the flat, at its exposure."""
+        return (self.flat - self.dark) / self.gain
+
+    def lines(self) -> list[str]:
+        """For a human; the exposure to take comes last."""
+        low, middle = self.transmission
+        at_low, at_middle = self.noise
+        words = [
+            ("dark", f"{self.dark:.5g} counts, a pixel's noise {self.dark_noise:.3g}"),
+            (
+                "flat",
+                f"{self.flat:.5g} counts, the brightest thousandth {self.brightest:.5g} of {self.saturation:.5g}, at "
+                f"{self.exposure:.4g} s",
+            ),
+            ("saturated", f"{self.saturated:.2%} of the flat's pixels at the configured {self.configured:.4g} s"),
+            ("photons", f"{self.photons:.4g} in a pixel of that flat, {self.gain:.3g} counts each"),
+            ("view", f"lets {middle:.3g} of the light through, its darkest hundredth {low:.3g}, at {_deg(self.angle)}"),
+            (
+                "noise",
+                f"{at_middle:.3g} of a line integral in one view at the exposure advised, {at_low:.3g} in its darkest "
+                "hundredth",
+            ),
+            (
+                "exposure",
+                f"{self.advised:.4g} s: scan.exposure_s={self.advised:.4g} (configured {self.configured:.4g}; period "
+                f"and camera allow up to {self.longest:.4g})",
+            ),
+        ]
+        return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]
+
+
+def tune(config: Config, instrument: Instrument, stop: StopRequest, emit: Emit, angle: float | None = None) -> Tuning:
+    """Take darks, flats and views at a few exposures and evaluate them. Nothing is written.
+
+    At the end the shutter is closed and stage and sample are where they were, as after a scan.
+
+    Args:
+        angle: rad, of the views; None: the first of the plan.
+
+    Raises:
+        ScanStopped: it was requested. InstrumentError, DeviceError: a device failed.
+    """
+    plan, camera = plan_of(config), instrument.devices.camera
+    angle = float(plan.angles[0]) if angle is None else angle
+    exposures = _accepted(instrument, config, plan.exposure)
+    settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
+    timing = camera.timing
+    blocks = _blocks(exposures, angle)
+    acquisition = Acquisition(
+        instrument.devices, _timeline(blocks, timing), settings, plan.settle, instrument.clock, stop, emit
+    )
+    try:
+        frames = list(acquisition.frames())
+    except LedgerError as error:
+        raise InstrumentError(f"{camera.name}: frames are missing. {error}") from error
+    longest = _longest(plan, settings, timing)
+    return evaluate(frames, plan, 2.0**timing.bits - 1, longest, reference_limits(config.references))
+
+
+def evaluate(
+    frames: Sequence[Frame], plan: ScanPlan, saturation: float, longest: float, limits: ReferenceLimits
+) -> Tuning:
+    """What the frames say: two darks, and two flats and a view at each exposure.
+
+    Args:
+        longest: exposure in s that may be advised.
+    """
+    darks = [frame for frame in frames if frame.kind is FrameKind.DARK]
+    flats = [frame for frame in frames if frame.kind is FrameKind.FLAT]
+    first = max(frame.exposure for frame in flats)
+    dark = _mean(darks)
+    used = _unsaturated(flats, saturation, limits)
+    pair = [frame for frame in flats if frame.exposure == used]
+    (view,) = [frame for frame in frames if frame.kind is FrameKind.PROJECTION and frame.exposure == used]
+    flat = _mean(pair)
+    light = flat - dark
+    lit = light > UNLIT * np.percentile(light, BRIGHTEST)
+    of_darks, of_flats = _variance(darks, np.ones(lit.shape, bool)), _variance(pair, lit)
+    typical = float(np.median(light[lit]))
+    gain = (of_flats - of_darks) / float(light[lit].mean()) if of_flats > of_darks and typical > 0 else math.nan
+    through = (view.counts - dark)[lit] / light[lit]
+    transmission = float(np.percentile(through, DARKEST)), float(np.median(through))
+    brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
+    room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
+    advised = _rounded(min(used * room, longest))
+    n = max(plan.flats.count, 1)
+    longer = typical * advised / used
+    noise = tuple(_noise(share, longer, gain, of_darks, n) for share in transmission)
+    references = [
+        Reference.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
+        for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
+    ]
+    judged = judge([references[: len(darks)], references[len(darks) :]], limits)
+    return Tuning(
+        configured=plan.exposure,
+        exposure=used,
+        saturation=saturation,
+        dark=float(np.median(dark)),
+        dark_noise=math.sqrt(of_darks),
+        flat=float(np.median(flat[lit])),
+        brightest=brightest,
+        saturated=float(np.mean([frame.counts >= saturation for frame in flats if frame.exposure == first])),
+        gain=gain,
+        transmission=transmission,
+        advised=advised,
+        noise=(noise[0], noise[1]),
+        longest=longest,
+        angle=view.angle,
+        faults=tuple(fault.message for group in judged for fault in group.faults),
+    )
+
+
+def _mean(frames: Sequence[Frame]) -> F64:
+    return np.asarray(np.mean([frame.counts for frame in frames], axis=0, dtype=np.float64))
+
+
+def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: int) -> float:
+    """Standard deviation of a line integral where a share of the light comes through; see the module."""
+    through = share * light
+    if not through > 0:
+        return math.inf
+    return math.sqrt(
+        (gain * through + of_darks) / through**2 + (gain * light + of_darks) / (n_flats * light**2)
+    )  # fmt: skip
+
+
+def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:
+    """The longest exposure of the flats of which few pixels are saturated; the shortest where there is none."""
+    exposures = sorted({frame.exposure for frame in flats}, reverse=True)
+    for exposure in exposures:
+        each = [(frame.counts >= saturation).mean() for frame in flats if frame.exposure == exposure]
+        if np.mean(each) <= limits.saturated:
+            return exposure
+    return exposures[-1]
+
+
+def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
+    """Mean over pixels, from the difference of two frames; a change of the light as a whole is none, nor a zinger."""
+    one, other = (frame.counts[where].astype(np.float64) for frame in pair[:2])
+    change = one - other
+    change -= np.median(change)
+    squares = change**2
+    return float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 2
+
+
+def _accepted(instrument: Instrument, config: Config, exposure: float) -> list[float]:
+    """The exposures that the camera takes, the longest first.
+
+    Raises:
+        DeviceRefused: it takes none.
+    """
+    camera = instrument.devices.camera
+    taken: list[float] = []
+    for share in SHORTER:
+        try:
+            accepted = camera.configure(camera_settings(config, exposure * share, TriggerSource.SOFTWARE))
+        except DeviceRefused:
+            if not taken:
+                raise
+            break
+        taken.append(accepted.exposure)
+    return taken
+
+
+def _blocks(exposures: Sequence[float], angle: float) -> list[Block]:
+    def static(kind: FrameKind, n: int, exposure: float) -> Block:
+        return Block(kind, Mode.STATIC, 0, np.full(n, np.nan), exposure, exposure)
+
+    views = [Block(FrameKind.PROJECTION, Mode.STEP, 0, np.array([angle]), t, t) for t in exposures]
+    return [
+        static(FrameKind.DARK, 2, exposures[0]),
+        *(static(FrameKind.FLAT, 2, exposure) for exposure in exposures),
+        *views,
+    ]
+
+
+def _timeline(blocks: Sequence[Block], timing: CameraTiming) -> Timeline:
+    frame_bytes = 2 * math.prod(timing.shape)
+    return Timeline(tuple(blocks), 0.0, frame_bytes, 0, 0, 0.0, 0.0, 0.0, (), ())
+
+
+def _longest(plan: ScanPlan, settings: CameraSettings, timing: CameraTiming) -> float:
+    """Exposure that leaves the camera its overhead within the period of a fly scan; a step scan may wait."""
+    if plan.mode is not Mode.FLY:
+        return math.inf
+    return plan.period - max(timing.min_period - settings.exposure, timing.readout)
+
+
+def _rounded(seconds: float) -> float:
+    """Down to three digits."""
+    if not 0 < seconds < math.inf:
+        return seconds
+    unit = 10.0 ** (math.floor(math.log10(seconds)) - 2)
+    return math.floor(seconds / unit + 1e-9) * unit
+
+
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.4g}°"
