@@ -12,6 +12,7 @@ from recon.kernels.cpu.activation import F32
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.view_weights import covers_the_circle
 
@@ -64,6 +65,10 @@ def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
     width = 2 * views.sample_pitch
     blob = Gaussians.from_physical(
-        np.zeros((1, 3)), np.array([width]), np.array([0.2 / width]), density_unit=0.2 / width
+        np.zeros((1, 3)),
+        np.array([width]),
+        np.array([0.2 / width]),
+        density_unit=0.2 / width,
+        kernel=FitSettings().kernel,
     )
     return project(blob, views).numpy(), views

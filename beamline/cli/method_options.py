@@ -12,15 +12,18 @@ from click.core import ParameterSource
 from beamline.cli.options import POSITIVE
 from recon.assess.time_model import PRESETS, parse_budget
 from recon.auto import Auto
+from recon.base.kernel import Kernel
 from recon.base.method import Method
 from recon.methods import build, by_name, has_setting, taking, with_trait
 from recon.splatting.initialise import Start
 from recon.splatting.problem import Loss
 from recon.splatting.r2 import DEFAULT_STEPS
+from recon.splatting.settings import FitSettings
 
 SETTINGS = {
     "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
-    "early_stop": "early_stop", "finish": "finish", "iterations": "iterations", "tv_weight": "tv_weight",
+    "kernel": "fit.kernel", "early_stop": "early_stop", "finish": "finish", "iterations": "iterations",
+    "tv_weight": "tv_weight",
 }  # fmt: skip
 """Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
@@ -31,7 +34,7 @@ _TRAITS = {
 
 _PLANS = ("budget", "quality")
 _TIMED = ("steps", "seconds", "gaussians")
-_OF_A_FIT = (*_TIMED, "start", "loss", "device", "early_stop", "finish", "checkpoint", "resume")
+_OF_A_FIT = (*_TIMED, "start", "loss", "kernel", "device", "early_stop", "finish", "checkpoint", "resume")
 # The options that exclude each of those that choose a plan.
 _CHOSEN = {"budget": ("quality", *_OF_A_FIT), "quality": ("budget", *_TIMED, "finish")}
 _FINISHED = tuple(name for name in _OF_A_FIT if name not in _TIMED)  # of scans that are finished only
@@ -158,6 +161,13 @@ _OPTIONS = (
         default="l1",
         show_default=True,
         help=f"Loss of the fit ({_of('loss')}), beside SSIM: absolute, squared, or squares weighted by photon noise.",
+    ),
+    click.option(
+        "--kernel",
+        type=click.Choice([kernel.value for kernel in Kernel]),
+        default=FitSettings().kernel.value,
+        show_default=True,
+        help=f"Shape of the Gaussians ({_of('kernel')}): true ones, or with an end of their own, (1 - r²/8)^1.5.",
     ),
     click.option(
         "--device", default="cpu", show_default=True, metavar="cpu|cuda", help=f"Device of the fit ({_of('device')})."

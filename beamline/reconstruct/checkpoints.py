@@ -18,11 +18,13 @@ from beamline.projections.prepare import PreparedProjections
 from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.writers.recon_file import Value
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 from recon.splatting.settings import FitSettings
 
 _SHOWN = 40  # characters of a value that is told
+_BEFORE_KERNELS = {"setting kernel": Kernel.GAUSSIAN.value}  # of checkpoints that do not say
 
 
 def fit_origin(prepared: PreparedProjections, settings: FitSettings, others: Mapping[str, Value]) -> dict[str, Value]:
@@ -109,7 +111,8 @@ class CheckpointOptions:
         if self.resume is None:
             return None
         kept, reached = _whole(self.resume)
-        others = differences(origin, kept.made_from)
+        older = {name: value for name, value in _BEFORE_KERNELS.items() if name in origin}
+        others = differences(origin, {**older, **kept.made_from})
         if others:
             raise DataError(
                 f"{self.resume} is of another fit: {_listed(others)}. Give the options that it was made with, or start "
@@ -146,8 +149,8 @@ def _whole(path: Path) -> tuple[Checkpoint, FitState]:
     try:
         reached = state_from(kept.state)
         for name, values in kept.state.items():
-            # The last loss may be none yet, and so may the best of views held out.
-            if name not in ("scalars", "watch") and not np.isfinite(values).all():
+            # The last loss may be none yet, and so may the best of views held out; a Gaussian's exponent is infinite.
+            if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
                 raise ValueError(f"{name} of the checkpoint holds values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):
             raise ValueError(f"the density unit of the checkpoint is {reached.unit}")

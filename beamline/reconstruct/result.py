@@ -164,7 +164,7 @@ def _flat(prefix: str, values: Mapping[str, Any]) -> dict[str, Value]:
         if isinstance(value, Mapping):
             out |= _flat(name, value)
         else:
-            out[name] = value if isinstance(value, str | int | float | np.ndarray) else str(value)
+            out[name] = value if isinstance(value, int | float | np.ndarray) else str(value)
     return out
 
 

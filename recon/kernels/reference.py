@@ -13,18 +13,35 @@ source to the centre and D along the ray of a pixel,
 
     ∫ σ dt = Σ_i ρ_i sqrt(2π) |D| / |H D| exp(-1/2 |Hδ x HD|² / |HD|²)
 
+Another `Kernel` replaces exp(-q/2) of the squared distance q in standard deviations, in an image by its line integral,
+and sqrt(2π) by its own length.
 Losses follow below. Everything is plain torch, so autograd gives the gradients to compare with.
 """
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.kernels.cpu.losses import ABSOLUTE, L1, L2, DataTerm, gaussian_window
+
+
+def density_profile(q: Tensor, kernel: Kernel) -> Tensor:
+    """f of a kernel at squared distances q, in standard deviations."""
+    return _profile(q, kernel, kernel.exponent)
+
+
+def shadow_profile(q: Tensor, kernel: Kernel) -> Tensor:
+    """Line integral of a kernel over that through its centre, at squared distances q of the line."""
+    return _profile(q, kernel, kernel.exponent + 0.5)
+
+
+def _profile(q: Tensor, kernel: Kernel, exponent: float) -> Tensor:
+    if kernel.is_compact:
+        return (1 - q / kernel.radius**2).clamp(min=0) ** exponent
+    return torch.exp(-0.5 * q)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
@@ -54,14 +71,15 @@ def project_view(
     *,
     exact: Tensor | None = None,  # bool [n]: Gaussians integrated along the true rays of a cone; None: none
     length: float = 0.0,  # mm, replaces μ if not 0: the uncorrected factor
+    kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Tensor:
     """Line integrals [row, col] of one view: every Gaussian on every pixel, not truncated."""
     in_view = means @ means.new_tensor(geometry.axes(view)).T  # along columns, rows and beam
     seen = in_front(means, geometry, view)
     rays = torch.zeros_like(seen) if exact is None or not geometry.is_cone else exact & seen
     flat = seen & ~rays
-    image = _affine(in_view[flat], scales[flat], quaternions[flat], densities[flat], geometry, view, length)
-    return image + _along_rays(means[rays], scales[rays], quaternions[rays], densities[rays], geometry, view)
+    image = _affine(in_view[flat], scales[flat], quaternions[flat], densities[flat], geometry, view, length, kernel)
+    return image + _along_rays(means[rays], scales[rays], quaternions[rays], densities[rays], geometry, view, kernel)
 
 
 def in_front(means: Tensor, geometry: Geometry, view: int) -> Tensor:
@@ -71,7 +89,14 @@ def in_front(means: Tensor, geometry: Geometry, view: int) -> Tensor:
     return geometry.sod + means.detach() @ means.new_tensor(geometry.axes(view)[2]) > 0.01 * geometry.sod
 
 
-def affine_error(means: Tensor, scales: Tensor, quaternions: Tensor, geometry: Geometry, view: int) -> Tensor:
+def affine_error(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    geometry: Geometry,
+    view: int,
+    kernel: Kernel = Kernel.GAUSSIAN,
+) -> Tensor:
     """ε [n], the estimate of `cpu.footprints` for the relative L2 error of a cone's affine footprints; no gradient."""
     means, scales, quaternions = means.detach(), scales.detach(), quaternions.detach()
     axes = means.new_tensor(geometry.axes(view))
@@ -89,8 +114,9 @@ def affine_error(means: Tensor, scales: Tensor, quaternions: Tensor, geometry: G
     def between(x: Tensor, y: Tensor) -> Tensor:
         return torch.einsum("nu,nuv,nv->n", x, flat, y)
 
-    first = 0.5 * between(beta, beta) + between(alpha, beta) + 1.5 * between(alpha, alpha)
-    return torch.sqrt(first + 6 * eta**2)
+    bb, ab, aa, ee = kernel.affine_terms
+    first = bb * between(beta, beta) + ab * between(alpha, beta) + aa * between(alpha, alpha)
+    return torch.sqrt(first + ee * eta**2)
 
 
 def pixels(geometry: Geometry, view: int, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,22 +152,23 @@ def _affine(
     geometry: Geometry,
     view: int,
     length: float,
+    kernel: Kernel,
 ) -> Tensor:
     centre, jacobian = to_detector(in_view, geometry)
     turn = jacobian @ in_view.new_tensor(geometry.axes(view))
     shaped = turn @ rotation_matrices(quaternions) * scales[:, None, :]
     lower = torch.linalg.qr(shaped.transpose(1, 2)).R.transpose(1, 2)  # L, up to signs of its columns
-    factor = torch.full_like(densities, length) if length > 0 else math.sqrt(2 * math.pi) * lower[:, 2, 2].abs()
+    factor = torch.full_like(densities, length) if length > 0 else kernel.length * lower[:, 2, 2].abs()
     u, v = pixels(geometry, view, in_view)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
     offset = grid[None] - centre[:, None, None, :]
     first = offset[..., 0] / lower[:, 0, 0, None, None]
     second = (offset[..., 1] - lower[:, 1, 0, None, None] * first) / lower[:, 1, 1, None, None]
-    return torch.einsum("n,nrc->rc", densities * factor, torch.exp(-0.5 * (first * first + second * second)))
+    return torch.einsum("n,nrc->rc", densities * factor, shadow_profile(first * first + second * second, kernel))
 
 
 def _along_rays(
-    means: Tensor, scales: Tensor, quaternions: Tensor, densities: Tensor, geometry: Geometry, view: int
+    means: Tensor, scales: Tensor, quaternions: Tensor, densities: Tensor, geometry: Geometry, view: int, kernel: Kernel
 ) -> Tensor:
     u, v = pixels(geometry, view, means)
     if means.shape[0] == 0:
@@ -154,9 +181,8 @@ def _along_rays(
     white = torch.einsum("nij,rcj->nrci", whiten, ray)
     power = (white * white).sum(-1)
     miss = torch.linalg.cross(centre.expand_as(white), white)
-    exponent = (miss * miss).sum(-1) / power
-    factor = math.sqrt(2 * math.pi) * torch.linalg.norm(ray, dim=-1) / torch.sqrt(power)
-    return torch.einsum("n,nrc->rc", densities, factor * torch.exp(-0.5 * exponent))
+    factor = kernel.length * torch.linalg.norm(ray, dim=-1) / torch.sqrt(power)
+    return torch.einsum("n,nrc->rc", densities, factor * shadow_profile((miss * miss).sum(-1) / power, kernel))
 
 
 def voxelize(
@@ -165,6 +191,7 @@ def voxelize(
     quaternions: Tensor,
     densities: Tensor,
     axes: tuple[Tensor, Tensor, Tensor],  # z [nz], y [ny], x [nx] in mm
+    kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Tensor:
     """Density [z, y, x] at voxel centres: every Gaussian in every voxel, not truncated."""
     z, y, x = axes
@@ -172,7 +199,7 @@ def voxelize(
     offset = grid[None] - means[:, None, None, None, :]
     whiten = rotation_matrices(quaternions).transpose(1, 2) / scales[:, :, None]  # S⁻¹Rᵀ
     white = torch.einsum("nij,nzyxj->nzyxi", whiten, offset)
-    return torch.einsum("n,nzyx->zyx", densities, torch.exp(-0.5 * (white * white).sum(-1)))
+    return torch.einsum("n,nzyx->zyx", densities, density_profile((white * white).sum(-1), kernel))
 
 
 def ssim(image: Tensor, target: Tensor, c1: float = 0.01**2, c2: float = 0.03**2) -> Tensor:

@@ -13,6 +13,7 @@ from typing import Any, Protocol, SupportsFloat, TypeVar
 import numpy as np
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu import losses as losses_cpu
@@ -79,7 +80,10 @@ class Backend(Protocol[Array]):
     def numpy(self, array: Array) -> F32:
         """A copy as a numpy array."""
 
-    def begin(self, means: Array, log_scales: Array, quaternions: Array, raw: Array, unit: float) -> Pass[Array]:
+    def begin(
+        self, means: Array, log_scales: Array, quaternions: Array, raw: Array, unit: float,
+        kernel: Kernel = Kernel.GAUSSIAN,
+    ) -> Pass[Array]:  # fmt: skip
         """A pass over raw parameters; densities are unit * softplus(raw)."""
 
     def projection_loss(
@@ -141,8 +145,10 @@ class Cpu:
     def numpy(self, array: F32) -> F32:
         return array.copy()
 
-    def begin(self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> CpuPass:
-        return CpuPass(self, means, log_scales, quaternions, raw, unit)
+    def begin(
+        self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float, kernel: Kernel = Kernel.GAUSSIAN
+    ) -> CpuPass:
+        return CpuPass(self, Active.of(means, log_scales, quaternions, raw, unit, kernel), quaternions, raw, unit)
 
     def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:
         """Scratch buffers for a view of n Gaussians; the last ones are reused if they fit."""
@@ -182,11 +188,8 @@ class Cpu:
 class CpuPass:
     """A pass with the numba kernels."""
 
-    def __init__(
-        self, backend: Cpu, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float
-    ) -> None:  # fmt: skip
-        self._backend, self._raw, self._unit = backend, (quaternions, raw), unit
-        self.active = Active.of(means, log_scales, quaternions, raw, unit)
+    def __init__(self, backend: Cpu, active: Active, quaternions: F32, raw: F32, unit: float) -> None:
+        self._backend, self.active, self._raw, self._unit = backend, active, (quaternions, raw), unit
         self.into = Gradients.zeros(raw.shape[0])
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> CpuView:

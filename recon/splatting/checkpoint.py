@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.kernel import Kernel
 from recon.splatting.backend import Backend, Cpu
 from recon.splatting.optimise import FitState
 from recon.splatting.settings import NAMES
@@ -30,6 +32,7 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
             arrays[f"{group}.{name}"] = device.numpy(getattr(state, group)[name])
     arrays["counts"] = np.array([getattr(state, name) for name in _COUNTS], np.int64)
     arrays["scalars"] = np.array([float(getattr(state, name)) for name in _SCALARS], np.float64)
+    arrays["kernel_exponent"] = np.array(state.kernel.exponent)
     arrays["drawn"] = np.array(state.drawn, np.int64)
     generator = state.rng.bit_generator.state
     if generator["bit_generator"] != "PCG64":
@@ -43,10 +46,12 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
 def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None = None) -> FitState:
     """The inverse of `arrays_of`: the fit continues as if it had not been interrupted.
 
+    Without `kernel_exponent`, as checkpoints were before there was another kernel, it is one of Gaussians.
+
     Raises:
         ValueError: where arrays are missing, disagree in length, or hold values that are not finite.
     """
-    device = backend or Cpu()
+    device, arrays = backend or Cpu(), {"kernel_exponent": np.array(math.inf), **arrays}
     groups = ("parameters", "first", "second")
     wanted = [f"{group}.{name}" for group in groups for name in NAMES]
     missing = [k for k in (*wanted, "statistic", "counts", "scalars", "drawn", "generator") if k not in arrays]
@@ -56,6 +61,7 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     widths = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw": (n,)}
     shapes: dict[str, tuple[int, ...]] = {key: widths[key.split(".")[1]] for key in wanted}
     shapes |= {"statistic": (n,), "counts": (len(_COUNTS),), "scalars": (len(_SCALARS),), "generator": (_WORDS + 2,)}
+    shapes["kernel_exponent"] = ()
     for key, shape in shapes.items():
         if np.shape(arrays[key]) != shape:
             raise ValueError(f"{key} of the checkpoint has shape {np.shape(arrays[key])}, expected {shape}")
@@ -73,7 +79,8 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     parts = {group: {name: device.array(arrays[f"{group}.{name}"]) for name in NAMES} for group in groups}
     limit, step, seen = (int(v) for v in arrays["counts"])
     unit, loss, residual = (float(v) for v in arrays["scalars"])
+    kernel = Kernel.of_exponent(float(arrays["kernel_exponent"]))
     return FitState(
         parts["parameters"], parts["first"], parts["second"], device.array(arrays["statistic"]), unit, rng, limit,
-        step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
+        kernel=kernel, step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
     )  # fmt: skip

@@ -1,7 +1,8 @@
-"""Gaussians: a density field as a sum of anisotropic Gaussians, with unconstrained raw parameters."""
+"""Gaussians: a density field as a sum of anisotropic kernels, with unconstrained raw parameters."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,10 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.base.kernel import Kernel
+
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ   (Zha et al. 2024).
+    """σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ,  f(q) = exp(-q/2)   (Zha et al. 2024).
+
+    With another kernel f they keep their name, and S its meaning of standard deviations.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).
@@ -22,6 +27,7 @@ class Gaussians:
         raw_densities: [n]; ρ = density_unit * softplus(raw), so a density is never negative.
         density_unit: a typical density, 1/mm; it makes raw values and their learning rates independent of the units of
             the data.
+        kernel: their radial profile.
     """
 
     means: Tensor
@@ -29,6 +35,7 @@ class Gaussians:
     quaternions: Tensor
     raw_densities: Tensor
     density_unit: float = 1.0
+    kernel: Kernel = Kernel.GAUSSIAN
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -52,6 +59,7 @@ class Gaussians:
         densities: NDArray[np.floating],
         quaternions: NDArray[np.floating] | None = None,
         density_unit: float | None = None,
+        kernel: Kernel = Kernel.GAUSSIAN,
     ) -> Gaussians:
         """From positions [n, 3] mm, standard deviations [n, 3] or [n] mm and densities [n] 1/mm, all positive.
 
@@ -77,6 +85,7 @@ class Gaussians:
             _tensor(quaternions),
             _tensor(inverse_softplus(densities / unit)),
             unit,
+            kernel,
         )
 
     @property
@@ -101,6 +110,7 @@ class Gaussians:
             self.quaternions[index],
             self.raw_densities[index],
             self.density_unit,
+            self.kernel,
         )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
@@ -111,17 +121,19 @@ class Gaussians:
             "quaternions": self.quaternions.detach().cpu().numpy(),
             "raw_densities": self.raw_densities.detach().cpu().numpy(),
             "density_unit": np.asarray(self.density_unit),
+            "kernel_exponent": np.asarray(self.kernel.exponent),
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.floating]]) -> Gaussians:
-        """The inverse of `arrays`."""
+        """The inverse of `arrays`; without `kernel_exponent`, as in older files, they are true Gaussians."""
         names = ("means", "log_scales", "quaternions", "raw_densities")
         missing = [name for name in (*names, "density_unit") if name not in arrays]
         if missing:
             raise ValueError(f"a checkpoint of Gaussians needs {names} and density_unit; {missing} are missing")
         means, log_scales, quaternions, raw = (_tensor(np.asarray(arrays[name])) for name in names)
-        return cls(means, log_scales, quaternions, raw, float(arrays["density_unit"]))
+        kernel = Kernel.of_exponent(float(arrays.get("kernel_exponent", math.inf)))
+        return cls(means, log_scales, quaternions, raw, float(arrays["density_unit"]), kernel)
 
 
 def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.masks import masked
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid, Volume
@@ -66,6 +67,7 @@ def place(
     *,
     start: Start = "fbp",
     rays: RayModel | None = None,
+    kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
     """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
 
@@ -75,6 +77,7 @@ def place(
         count: number of Gaussians; None: `default_count` of the field.
         start: kind of first volume, see `first_volume`.
         rays: ray model of the fit.
+        kernel: of the Gaussians.
 
     Raises:
         ValueError: for a count below 1, and for data without matter or that are not line integrals.
@@ -84,7 +87,7 @@ def place(
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
     volume = first_volume(projections, geometry, grid, start)
     radius = math.inf if leaves_the_field(projections, geometry) else geometry.reach
-    placed = sample_gaussians(volume, wanted, rng, field_radius=radius)
+    placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
     return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
 
 
@@ -139,7 +142,13 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
 
 
 def sample_gaussians(
-    volume: Volume, n: int, rng: np.random.Generator, *, field_radius: float, smooth: float = 1.0
+    volume: Volume,
+    n: int,
+    rng: np.random.Generator,
+    *,
+    field_radius: float,
+    smooth: float = 1.0,
+    kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
     """At most n isotropic Gaussians drawn from a volume.
 
@@ -153,6 +162,7 @@ def sample_gaussians(
         n: number of Gaussians; fewer if fewer voxels hold matter.
         field_radius: mm around the rotation axis; no Gaussian is placed outside.
         smooth: standard deviation of the smoothing, in voxels.
+        kernel: of the Gaussians.
 
     Raises:
         ValueError: where the volume holds no matter inside the field.
@@ -180,7 +190,8 @@ def sample_gaussians(
     means = np.stack((x[i], y[j], z[k]), 1) + jitter
     scales = _SPREAD * neighbour_distance(means)
     scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))
-    return Gaussians.from_physical(means, scales, data.ravel()[chosen].astype(np.float64) * unit, density_unit=unit)
+    densities = data.ravel()[chosen].astype(np.float64) * unit
+    return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)
 
 
 def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -216,7 +227,7 @@ def scale_to_data(
     densities = gaussians.densities.double().numpy() * factor
     return Gaussians.from_physical(
         gaussians.means.numpy(), gaussians.scales.numpy(), densities,
-        gaussians.quaternions.numpy(), gaussians.density_unit,
+        gaussians.quaternions.numpy(), gaussians.density_unit, gaussians.kernel,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.engine import Active
@@ -40,6 +41,7 @@ class FitState:
     unit: float
     rng: np.random.Generator
     limit: int
+    kernel: Kernel = Kernel.GAUSSIAN
     step: int = 0
     drawn: list[int] = field(default_factory=list)
     seen: int = 0
@@ -96,6 +98,7 @@ def init(
         gaussians.density_unit,
         np.random.default_rng(seed),
         limit=max(gaussians.n, round(gaussians.n * growth)),
+        kernel=gaussians.kernel,
     )
 
 
@@ -109,7 +112,7 @@ def step(
         view: the first view to take; None draws it, as the others, without replacement.
     """
     p, geometry, backend, cut = state.parameters, problem.geometry, problem.backend, settings.truncation
-    run = backend.begin(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field)
+    run = backend.begin(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel)
     loss: Any = 0.0
     share = settings.views_per_step
     for k in range(share):
@@ -157,7 +160,9 @@ def run_steps(
 def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> float:
     """||rendered - measured|| / ||measured|| over all views of a problem, root mean square of the views' own."""
     p, cut = state.parameters, settings.truncation
-    run = problem.backend.begin(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field)
+    run = problem.backend.begin(
+        p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel
+    )
     squares = [
         float(
             problem.backend.misfit(
@@ -178,7 +183,7 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
     means, log_scales, quaternions, raw = (
         torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES
     )  # fmt: skip
-    return Gaussians(means, log_scales, quaternions, raw, state.unit)
+    return Gaussians(means, log_scales, quaternions, raw, state.unit, state.kernel)
 
 
 def volume_of(state: FitState, grid: Grid, settings: FitSettings, backend: Backend[Any] | None = None) -> Volume:

@@ -15,6 +15,7 @@ from recon.base.volume import Grid
 from recon.kernels.reference import projection_loss
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 
 _VIEWS, _ROWS, _COLS, _GAUSSIANS = 12, 8, 32, 150  # few, since the reference evaluates every Gaussian at every pixel
@@ -51,7 +52,7 @@ def compare(
     """
     data, views = small_crop(projections, geometry)
     grid = Grid.matching(views)
-    start = place(data, views, grid, _GAUSSIANS, np.random.default_rng(seed))
+    start = place(data, views, grid, _GAUSSIANS, np.random.default_rng(seed), kernel=FitSettings().kernel)
     out: dict[str, float] = {}
     volumes = []
     for name, dtype in (("float32", torch.float32), ("float64", torch.float64)):
@@ -62,8 +63,8 @@ def compare(
         out[f"seconds_{name}"] = now() - begin
         exact = _as(fitted, torch.float64)
         with torch.no_grad():
-            rendered = project(exact, views, kernel="reference").numpy()
-            volumes.append(voxelize(exact, grid, kernel="reference").numpy())
+            rendered = project(exact, views, implementation="reference").numpy()
+            volumes.append(voxelize(exact, grid, implementation="reference").numpy())
         out[f"residual_{name}"] = float(np.linalg.norm(rendered - data) / np.linalg.norm(data))
     single, double = volumes
     out["difference"] = float(np.linalg.norm(single - double) / np.linalg.norm(double))
@@ -76,7 +77,7 @@ def _as(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
     means, log_scales, quaternions, raw = (
         p.detach().to(dtype, copy=True) for p in (g.means, g.log_scales, g.quaternions, g.raw_densities)
     )
-    return Gaussians(means, log_scales, quaternions, raw, g.density_unit)
+    return Gaussians(means, log_scales, quaternions, raw, g.density_unit, g.kernel)
 
 
 def _fit(start: Gaussians, data: NDArray[np.float32], geometry: Geometry, dtype: torch.dtype, steps: int) -> Gaussians:

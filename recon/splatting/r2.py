@@ -128,5 +128,5 @@ class R2:
 
     def work(self, n_views: int, binning: int) -> float:
         count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or 0
-        spread = self.fit.truncation.sigmas / FitSettings().truncation.sigmas
+        spread = self.fit.kernel.reach(self.fit.truncation.sigmas) / FitSettings().truncation.sigmas
         return (self.planned_steps or 0) * (1 + count / 2e4 * spread**2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
@@ -41,11 +42,12 @@ class FitSettings:
             scans, see docs/exploration.md).
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
-        truncation: where Gaussians end.
+        truncation: where Gaussians end; a compact kernel ends by itself.
         smallest: standard deviation, in pixels, below which none shrinks: point sampling sees nothing thinner.
         views_per_step: gradients of so many views are averaged.
         coarse, coarse_until: the fit begins on pixels joined by this factor, until this fraction of its steps.
         rays: the integral of a Gaussian along a ray; matters for cones.
+        kernel: radial profile of the Gaussians, also by its name; a fit that starts from a model keeps the model's.
     """
 
     loss: Loss = "l1"
@@ -63,8 +65,10 @@ class FitSettings:
     coarse: int = 1
     coarse_until: float = 0.2
     rays: RayModel = field(default_factory=RayModel)
+    kernel: Kernel = Kernel.GAUSSIAN
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "kernel", Kernel(self.kernel))
         for name in ("views_per_step", "coarse", "tv_size"):
             value = getattr(self, name)
             if value is None and name == "tv_size":

@@ -1,7 +1,7 @@
 """project and voxelize: Gaussians to line integrals and to voxels, differentiable.
 
-The kernel follows from the tensors: float32 on the CPU uses the threaded CPU kernels, float32 on a CUDA device the GPU
-kernels, and float64 (or `kernel="reference"`) the reference implementation, which runs on the CPU.
+The implementation follows from the tensors: float32 on the CPU uses the threaded CPU kernels, float32 on a CUDA device
+the GPU kernels, and float64 (or `implementation="reference"`) the reference implementation, which runs on the CPU.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.kernels import reference
@@ -24,16 +25,16 @@ from recon.kernels.cpu.engine import Active, Gradients, Scratch, grid_layout, re
 from recon.kernels.cpu.footprints import footprint_table
 from recon.splatting.gaussians import Gaussians
 
-Kernel = Literal["auto", "cpu", "gpu", "reference"]
+Implementation = Literal["auto", "cpu", "gpu", "reference"]
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel,
+        unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel, kernel: Kernel,
     ) -> Tensor:  # fmt: skip
-        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
+        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit, kernel)
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         shared, views = Scratch.of(len(active.densities), geometry.detector_shape), []
         for view, image in enumerate(images):  # each needs its own table until its backward pass
@@ -49,16 +50,16 @@ class _Project(torch.autograd.Function):
         centres = np.empty((len(raw), 2), np.float32)
         for view, image in zip(views, gradient.contiguous().numpy(), strict=True):
             view.backward(image, into, centres)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None, None)
 
 
 class _Voxelize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, grid: Grid, faint: float, cut: float,
+        unit: float, grid: Grid, faint: float, cut: float, kernel: Kernel,
     ) -> Tensor:  # fmt: skip
-        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit)
+        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit, kernel)
         layout = grid_layout(active, grid, faint, cut)
         ctx.state = (_array(quaternions), _array(raw), layout, unit)
         return torch.from_numpy(np.ascontiguousarray(layout.fill()))
@@ -68,7 +69,7 @@ class _Voxelize(torch.autograd.Function):
         quaternions, raw, layout, unit = ctx.state
         into = Gradients.zeros(len(raw))
         layout.backward(gradient.contiguous().numpy(), into.means, into.log_scales, into.rotations, into.densities)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None)
+        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None)
 
 
 def _array(tensor: Tensor) -> F32:
@@ -82,7 +83,7 @@ def project(
     *,
     truncation: Truncation | None = None,
     model: RayModel | None = None,
-    kernel: Kernel = "auto",
+    implementation: Implementation = "auto",
 ) -> Tensor:
     """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
 
@@ -90,12 +91,12 @@ def project(
     four parameter tensors. The reference implementation does not truncate.
 
     Raises:
-        ValueError: the kernel does not support tensors of this type or on this device.
+        ValueError: the implementation does not support tensors of this type or on this device.
         ImportError: the tensors are on a CUDA device and triton is not installed.
     """
     rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
-    g, which = gaussians, _kernel(gaussians, kernel)
+    g, which = gaussians, _chosen(gaussians, implementation)
     if which == "reference":
         parameters = (g.means, g.scales, g.quaternions, g.densities)
         length = rays.length(chosen)
@@ -103,32 +104,34 @@ def project(
         for view in range(chosen.n_views):
             exact = None
             if chosen.is_cone and rays.exact_above < math.inf:
-                exact = reference.affine_error(*parameters[:3], chosen, view) > rays.exact_above
-            images.append(reference.project_view(*parameters, chosen, view, exact=exact, length=length))
+                exact = reference.affine_error(*parameters[:3], chosen, view, g.kernel) > rays.exact_above
+            images.append(
+                reference.project_view(*parameters, chosen, view, exact=exact, length=length, kernel=g.kernel)
+            )
         return torch.stack(images)
     cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
     if which == "gpu":
         from recon.kernels.gpu import autograd  # loads triton, so only if a GPU is used
 
-        return autograd.project(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
-    return _Project.apply(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+        return autograd.project(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays, g.kernel)
+    return _Project.apply(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays, g.kernel)
 
 
 def voxelize(
-    gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, kernel: Kernel = "auto"
+    gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, implementation: Implementation = "auto"
 ) -> Tensor:
     """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
-    g, which = gaussians, _kernel(gaussians, kernel)
+    g, which = gaussians, _chosen(gaussians, implementation)
     if which == "reference":
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
-        return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x))
+        return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x), g.kernel)
     cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
     faint = cut.faint * g.density_unit
     if which == "gpu":
         from recon.kernels.gpu import autograd
 
-        return autograd.voxelize(*raw, g.density_unit, grid, faint, cut.sigmas)
-    return _Voxelize.apply(*raw, g.density_unit, grid, faint, cut.sigmas)
+        return autograd.voxelize(*raw, g.density_unit, grid, faint, cut.sigmas, g.kernel)
+    return _Voxelize.apply(*raw, g.density_unit, grid, faint, cut.sigmas, g.kernel)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
@@ -136,12 +139,14 @@ def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> 
     return truncation.faint * gaussians.density_unit * geometry.sample_pitch * geometry.detector_shape[1]
 
 
-def _kernel(gaussians: Gaussians, kernel: Kernel) -> Kernel:
+def _chosen(gaussians: Gaussians, implementation: Implementation) -> Implementation:
     dtype, device = gaussians.means.dtype, gaussians.means.device.type
-    suited: Kernel = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
-    chosen = suited if kernel == "auto" else kernel
+    suited: Implementation = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
+    chosen = suited if implementation == "auto" else implementation
     if chosen != "reference" and dtype != torch.float32:
-        raise ValueError(f"the {chosen} kernel works in float32, the Gaussians are {dtype}")
+        raise ValueError(f"the {chosen} implementation works in float32, the Gaussians are {dtype}")
     if chosen != "gpu" and device != "cpu":
-        raise ValueError(f"the {chosen} kernel runs on the cpu, the Gaussians are {dtype} on {device}: move them")
+        raise ValueError(
+            f"the {chosen} implementation runs on the cpu, the Gaussians are {dtype} on {device}: move them"
+        )
     return chosen

@@ -268,7 +268,7 @@ class StreamingFit:
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
         field = Grid.for_fit(self._template, self._grid, wider=leaves_the_field(data, geometry))
-        placed = place(data, geometry, field, self._count, self._rng)
+        placed = place(data, geometry, field, self._count, self._rng, kernel=self._settings.kernel)
         self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
         self._state = fit.init(placed, self._rng)
         self._placed = placed.n

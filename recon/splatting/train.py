@@ -166,7 +166,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         else:
             volume = finished
     record = {
-        **asdict(settings), "steps": state.step, "seed": problem.seed, "start": method.start,
+        **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,
         "finish": sweeps, "tv_weight": tv_weight(settings, fine, state.limit),
         "tv_size": tv_size(settings, field_grid),
@@ -214,7 +214,9 @@ def _first_state(
     start = method.gaussians
     if not isinstance(start, Gaussians):
         rng = np.random.default_rng(seed)
-        start = place(data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays)
+        start = place(
+            data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays, kernel=method.fit.kernel
+        )
     return fit.init(start, seed, growth(method.fit), backend), start.n, start.density_unit
 
 

@@ -14,6 +14,7 @@ import recon
 import recon.splatting.initialise
 from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.methods import build, by_name, names
 from recon.splatting.settings import FitSettings
@@ -63,11 +64,13 @@ def test_the_same_seed_gives_the_same_volume(noisy: np.ndarray) -> None:
     assert not np.array_equal(first, other)
 
 
-def test_a_model_can_be_continued(noisy: np.ndarray) -> None:
-    first = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=1500))
+def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> None:
+    other = next(kernel for kernel in Kernel if kernel is not FitSettings().kernel)
+    first = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=1500, fit=FitSettings(kernel=other)))
     second = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=first.gaussians, fit=FitSettings(policy=None)))
     assert second.history[-1].residual < first.history[-1].residual
     assert second.history[-1].n_gaussians == first.history[-1].n_gaussians
+    assert second.settings["kernel"] is other and second.gaussians is not None and second.gaussians.kernel is other
 
 
 def test_a_small_box_holds_what_the_whole_volume_holds_there(noisy: np.ndarray) -> None:

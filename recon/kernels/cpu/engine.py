@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, activate, activation_backward
@@ -23,20 +24,23 @@ from recon.kernels.cpu.voxelize import Layout
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """Physical parameters of Gaussians as float32 arrays, row-major rotations [n, 9]."""
+    """Physical parameters of Gaussians as float32 arrays, row-major rotations [n, 9], and their kernel."""
 
     means: F32
     scales: F32
     rotations: F32
     densities: F32
+    kernel: Kernel = Kernel.GAUSSIAN
 
     @classmethod
-    def of(cls, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float) -> Active:
+    def of(
+        cls, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float, kernel: Kernel = Kernel.GAUSSIAN
+    ) -> Active:
         n = raw.shape[0]
         scales, rotations = np.empty((n, 3), np.float32), np.empty((n, 9), np.float32)
         densities = np.empty(n, np.float32)
         activate(log_scales, quaternions, raw, unit, scales, rotations, densities)
-        return cls(means, scales, rotations, densities)
+        return cls(means, scales, rotations, densities, kernel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +78,7 @@ def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigm
     """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
     table = footprint_table(active.densities.shape[0])
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    footprints(*parameters, camera(geometry, view), faint, sigmas, table)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table, kernel=active.kernel)
     return table
 
 
@@ -125,8 +129,9 @@ class RenderedView:
         """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
         a, table = self.active, self.scratch.table
         footprints_backward(
-            table, moments(table, gradient, self.scratch.moments), a.means, a.scales, a.rotations, a.densities,
-            self.camera, into.means, into.log_scales, into.rotations, into.densities, centres, length=self.length,
+            table, moments(table, gradient, self.scratch.moments, a.kernel), a.means, a.scales, a.rotations,
+            a.densities, self.camera, into.means, into.log_scales, into.rotations, into.densities, centres,
+            length=self.length, kernel=a.kernel,
         )  # fmt: skip
         if self.rays is None:
             return
@@ -161,15 +166,15 @@ def render_view(
     projection, length = camera(geometry, view), chosen.length(geometry)
     footprints(
         a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, buffers.table,
-        length=length, exact_above=chosen.exact_above,
+        length=length, exact_above=chosen.exact_above, kernel=a.kernel,
     )  # fmt: skip
-    render(buffers.table, picture, buffers.layers)
+    render(buffers.table, picture, buffers.layers, a.kernel)
     exact, rays = np.empty(0, np.intp), None
     if geometry.is_cone and chosen.exact_above < math.inf:
         exact = np.flatnonzero(buffers.table[:, HU] == INEXACT)
     if exact.size:
         some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
-        rays = Rays(*some, projection, shape, faint, sigmas)
+        rays = Rays(*some, projection, shape, faint, sigmas, a.kernel)
         rays.add_to(picture)
     return RenderedView(picture, active, projection, length, buffers, exact, rays)
 
@@ -178,4 +183,4 @@ def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layo
     """Layout of Gaussians on a grid, for filling it and its backward pass; `faint` is a density."""
     z, y, x = (float(axis[0]) for axis in grid.coordinates())
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas)
+    return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas, active.kernel)

@@ -14,7 +14,7 @@ and a parallel beam is the same with ax = ay = 0, g = 1 / pitch. With a = S Rᵀ
 a subtraction (3DGS's projection, Zwicker et al. 2001, with the factor of Zha et al. 2024). Backward, with the
 moments M of the image gradient under a footprint, in its own directions τ and v (see `cpu.project`):
 
-    ∂W = M₀,   ∂m = W (k M_τ, l M_v - k r M_τ),   ∂T = W (Σ g G yyᵀ + M₀ hhᵀ / h·h)      W = ρμ
+    ∂W = M₀,   ∂m = W (k M_τ, l M_v - k r M_τ),   ∂T = W (Σ g D yyᵀ + M₀ hhᵀ / h·h)      W = ρμ
     y = τ A + δv B,   A = (b x h) / (g s₁ s₂ s₃ h·h),   B = l b
 
 y is the offset in the Gaussian's own axes, in standard deviations: y·y = δᵀKδ, A·A = k, B·B = l, A·B = 0. T's diagonal
@@ -35,6 +35,9 @@ exp((β - α)·δ + δᵀKδ α·δ), with α, β as in `cpu.rays`; over the foo
     ε² = 1/2 βᵀΣ₂β + αᵀΣ₂β + 3/2 αᵀΣ₂α + 6 η²
 
 where η = 1 / |S⁻¹Rᵀt|² gives the leading term of second order, the only one on the optical axis.
+
+A compact kernel (`recon.base.kernel`) has a factor other than sqrt(2π), moments of its own (`cpu.project`), its own end
+in place of a truncation, and other numbers in ε: (β·δ G + (N D - G) α·δ)² in the mean over G², and (η N² D / 2)².
 """
 
 from __future__ import annotations
@@ -46,10 +49,10 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from recon.base.kernel import Kernel
 from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f, _d = np.float32, np.float64
-_ROOT_TWO_PI = np.float32(math.sqrt(2 * math.pi))
 # Columns of the footprint table.
 U, V, K, SHEAR, KV, W, HU, HV = range(8)
 HIDDEN, INEXACT = -1.0, -2.0  # in HU and HV: not visible; to be integrated ray by ray
@@ -115,10 +118,14 @@ def _forward(straight: bool) -> Any:
         cut: float,
         length: float,
         exact_above: float,
+        unit: float,
+        ends: bool,
+        terms: tuple[float, float, float, float],
         table: F32,
     ) -> None:
         f, source, nearest = _f(focal), _f(sod), _f(NEAREST * sod)
-        plain, judged = length > 0, exact_above < _NEVER
+        plain, judged, central = length > 0, exact_above < _NEVER, _f(unit)
+        e0, e1, e2, e3 = _f(terms[0]), _f(terms[1]), _f(terms[2]), _f(terms[3])
         for i in prange(densities.shape[0]):
             u0, u1, u2 = axes[0, 0], axes[0, 1], axes[0, 2]
             v0, v1, v2 = axes[1, 0], axes[1, 1], axes[1, 2]
@@ -155,19 +162,20 @@ def _forward(straight: bool) -> Any:
             wide, high = np.sqrt(uu), np.sqrt(vv)
             steep, level = high * scale, _f(1) / (high * g)
             table[i, K], table[i, SHEAR], table[i, KV] = steep * steep, uv / vv, level * level
-            weight = densities[i] * (_f(length) if plain else _ROOT_TWO_PI * ray * within)
+            weight = densities[i] * (_f(length) if plain else central * ray * within)
             table[i, W] = weight
             reach = _f(HIDDEN)
             if weight > _f(faint):
-                reach = min(_f(cut), np.sqrt(_f(2) * np.log(weight / _f(faint)))) * g
+                reach = _f(cut) if ends else min(_f(cut), np.sqrt(_f(2) * np.log(weight / _f(faint))))
+                reach *= g
                 if not straight and sod > 0 and judged:
                     # α and β in px of the rotation axis' scale: f α, f β and Σ₂ / f².
                     au, av, bu, bv = hu / hh, hv / hh, ax / (ray * ray), ay / (ray * ray)
                     eta = _f(1) / (depth * depth * hh)
-                    first = uu * (_f(0.5) * bu * bu + au * bu + _f(1.5) * au * au)
-                    first += uv * (bu * bv + au * bv + av * bu + _f(3) * au * av)
-                    first += vv * (_f(0.5) * bv * bv + av * bv + _f(1.5) * av * av)
-                    if first / (depth * depth) + _f(6) * eta * eta > _f(exact_above * exact_above):
+                    first = uu * (e0 * bu * bu + e1 * au * bu + e2 * au * au)
+                    first += uv * (_f(2) * (e0 * bu * bv + e2 * au * av) + e1 * (au * bv + av * bu))
+                    first += vv * (e0 * bv * bv + e1 * av * bv + e2 * av * av)
+                    if first / (depth * depth) + e3 * eta * eta > _f(exact_above * exact_above):
                         table[i, HU] = table[i, HV] = _f(INEXACT)
                         continue
             table[i, HU], table[i, HV] = reach * wide, reach * high
@@ -188,6 +196,7 @@ def _backward(straight: bool) -> Any:
         focal: float,
         sod: float,
         length: float,
+        unit: float,
         d_means: F32,
         d_log_scales: F32,
         d_rotations: F32,
@@ -233,7 +242,7 @@ def _backward(straight: bool) -> Any:
             size, level = _f(_d(turned) / (_d(g) * (_d(s0) * _d(s1) * _d(s2)) * _d(hh))), kv * g
             a0, a1, a2 = size * (b1 * h2 - b2 * h1), size * (b2 * h0 - b0 * h2), size * (b0 * h1 - b1 * h0)
             b0, b1, b2 = level * b0, level * b1, level * b2
-            d_densities[i] += m0 * (_f(length) if plain else _ROOT_TWO_PI * np.sqrt(rr / hh))
+            d_densities[i] += m0 * (_f(length) if plain else _f(unit) * np.sqrt(rr / hh))
             pull = _f(0) if plain else m0 / hh
             # T / W = (τ A + δv B)(τ A + δv B)ᵀ + M₀ hhᵀ / h·h, as A cᵀ + B eᵀ + ...
             c0, c1, c2 = mtt * a0 + mtv * b0, mtt * a1 + mtv * b1, mtt * a2 + mtv * b2
@@ -281,17 +290,19 @@ def footprints(
     *,
     length: float = 0.0,
     exact_above: float = math.inf,
+    kernel: Kernel = Kernel.GAUSSIAN,
 ) -> None:
     """Fill table [n, 8]: centre (col, row), k (1/px²), r, 1 / Σvv (1/px²), weight W = ρμ, half widths in px (two).
 
-    Footprints are cut off where they fall below `faint` (in units of the image), and at `cut` standard deviations. Half
-    widths are HIDDEN for a footprint nowhere above `faint`, and INEXACT where a cone's ε is above `exact_above`. A
-    `length` (mm) other than 0 replaces μ: the uncorrected factor.
+    Footprints are cut off where they fall below `faint` (in units of the image), and at `cut` standard deviations,
+    those of a compact kernel at its end. Half widths are HIDDEN for a footprint nowhere above `faint`, and INEXACT
+    where a cone's ε is above `exact_above`. A `length` (mm) other than 0 replaces μ: the uncorrected factor.
     """
-    kernel = _straight_footprints if camera.straight else _footprints
-    kernel(
-        means, scales, rotations, densities, camera.axes, camera.focal, camera.sod, camera.col, camera.row,
-        faint, cut, length, min(exact_above, _NEVER), table,
+    fill = _straight_footprints if camera.straight else _footprints
+    fill(
+        means, scales, rotations, densities, camera.axes, camera.focal, camera.sod, camera.col, camera.row, faint,
+        kernel.reach(cut), length, min(exact_above, _NEVER), kernel.length, kernel.is_compact, kernel.affine_terms,
+        table,
     )  # fmt: skip
 
 
@@ -310,12 +321,13 @@ def footprints_backward(
     d_centres: F32,
     *,
     length: float = 0.0,
+    kernel: Kernel = Kernel.GAUSSIAN,
 ) -> None:
     """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
-    kernel = _straight_footprints_backward if camera.straight else _footprints_backward
-    kernel(
+    add = _straight_footprints_backward if camera.straight else _footprints_backward
+    add(
         table, moments, means, scales, rotations, densities, camera.axes, camera.focal, camera.sod, length,
-        d_means, d_log_scales, d_rotations, d_densities, d_centres,
+        kernel.length, d_means, d_log_scales, d_rotations, d_densities, d_centres,
     )  # fmt: skip
 
 

@@ -174,6 +174,16 @@ def root(typing_context, lanes):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def positive(typing_context, lanes):  # type: ignore[no-untyped-def]
+    """max(x, 0) a lane."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.call(_vector_function(builder, "maxnum", 2), [args[0], _constant(0.0)], fastmath=_FAST)
+
+    return LANES(LANES), code
+
+
+@intrinsic
 def clamp(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
     """min(max(x, low), high) a lane, with float32 bounds."""
 

@@ -15,17 +15,21 @@ squares, which are accurate also for thin Gaussians. Rays with N / Q <= c² pass
 an ellipse, which limits the columns of each row. Where the Gaussian reaches the plane of the source, whole rows are
 computed.
 
+A compact kernel has (1 - N / (R² Q))₊² in place of the exponential and ends at c² = R².
+
 The integral is over the whole line, also behind the source: a Gaussian must not reach the source.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from recon.base.kernel import Kernel
 from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.kernels.cpu.footprints import (
     HU,
@@ -46,7 +50,8 @@ _f = np.float32
 _BAND = 8  # rows a task: no two tasks write to one pixel
 # Columns of the terms: α, η, W |f / D₀|, the truncation c² and the box that it fills.
 AU, AV, ETA, WEIGHT, CUT, ROW0, ROW1, COL0, COL1 = range(9)
-# Columns of the sums, with a = g V, b = ∂ ln V / ∂N, q = ∂ ln V / ∂Q, l = 1 + α·δ; b goes with τ = δu - r δv and δv.
+_PER = np.float32(1 / Kernel.COMPACT.radius**2)
+# Columns of the sums, with a = g V, b = g ∂V / ∂N, q = g ∂V / ∂Q, l = 1 + α·δ; b goes with τ = δu - r δv and δv.
 A, BT, BV, BTT, BTV, BVV, L, LU, LV, N = range(10)
 
 
@@ -63,6 +68,16 @@ def _decay(x):  # type: ignore[no-untyped-def]
     return p * p
 
 
+@njit(inline="always", fastmath=True)
+def _profile(x, compact):  # type: ignore[no-untyped-def]
+    """G and D of `cpu.project` where N / Q = x."""
+    if compact:
+        t = max(_f(1) - x * _PER, _f(0))
+        return t * t, t * (_f(4) * _PER)
+    value = _decay(_f(-0.5) * x)
+    return value, value
+
+
 @njit(**OPTIONS)
 def _terms(
     means: F32,
@@ -74,6 +89,8 @@ def _terms(
     sod: float,
     faint: float,
     cut: float,
+    unit: float,
+    ends: bool,
     rows: int,
     cols: int,
     table: F32,
@@ -83,7 +100,7 @@ def _terms(
         for k in range(9):
             terms[i, k] = 0.0
         broadest = max(scales[i, 0], max(scales[i, 1], scales[i, 2]))
-        most = densities[i] * math.sqrt(2 * math.pi) * broadest  # of any ray
+        most = densities[i] * unit * broadest  # of any ray
         if table[i, HU] < 0.0 or most <= faint:
             continue
         tx = ty = 0.0
@@ -101,7 +118,7 @@ def _terms(
             h = (ax * pu + ay * pv + pd) * sharp
             hh, hu, hv = hh + h * h, hu + h * pu * sharp, hv + h * pv * sharp
         au, av, eta = hu / (hh * focal), hv / (hh * focal), 1.0 / (hh * tz * tz)
-        c2 = min(cut * cut, 2.0 * math.log(most / faint))
+        c2 = cut * cut if ends else min(cut * cut, 2.0 * math.log(most / faint))
         terms[i, AU], terms[i, AV], terms[i, ETA], terms[i, CUT] = au, av, eta, c2
         terms[i, WEIGHT] = table[i, W] / math.sqrt(1.0 + ax * ax + ay * ay)
         # The conic N (1 - c²η) = c² (1 + α·δ)²: an ellipse unless the Gaussian reaches the source's plane.
@@ -144,74 +161,88 @@ def _span(table, terms, i, row):  # type: ignore[no-untyped-def]
     return int(first), int(last)
 
 
-@njit(**OPTIONS)
-def _render(table: F32, terms: F64, focal: float, col: float, row: float, image: F32) -> None:
-    rows = image.shape[0]
-    for band in prange((rows + _BAND - 1) // _BAND):
-        per = _f(1 / focal)
-        for i in range(table.shape[0]):
+# `compact` is a constant of the compiled kernels, as the profile in `cpu.project`.
+def _renderer(compact: bool) -> Any:
+    @njit(**OPTIONS)
+    def kernel(table: F32, terms: F64, focal: float, col: float, row: float, image: F32) -> None:
+        rows = image.shape[0]
+        for band in prange((rows + _BAND - 1) // _BAND):
+            per = _f(1 / focal)
+            for i in range(table.shape[0]):
+                au, av, eta, weight = _f(terms[i, AU]), _f(terms[i, AV]), _f(terms[i, ETA]), _f(terms[i, WEIGHT])
+                k, shear, kv, u = table[i, K], table[i, SHEAR], table[i, KV], table[i, U]
+                for r in range(max(band * _BAND, int(terms[i, ROW0])), min((band + 1) * _BAND, int(terms[i, ROW1]))):
+                    first, last = _span(table, terms, i, r)
+                    if first >= last:
+                        continue
+                    line = image[r, first:last]
+                    dv, du0 = _f(r) - table[i, V], _f(first) - u
+                    up, over0 = _f(r - row) * per, _f(first - col) * per
+                    tall, up2, along = kv * dv * dv, _f(1) + up * up, _f(1) + av * dv
+                    for j in range(line.shape[0]):
+                        du, over = du0 + _f(j), over0 + _f(j) * per
+                        across = du - shear * dv
+                        n = k * across * across + tall
+                        lift = along + au * du
+                        inverse = _f(1) / (lift * lift + eta * n)
+                        value, _ = _profile(n * inverse, compact)
+                        line[j] += weight * np.sqrt((up2 + over * over) * inverse) * value
+
+    return kernel
+
+
+def _summer(compact: bool) -> Any:
+    @njit(**OPTIONS)
+    def kernel(table: F32, terms: F64, focal: float, col: float, row: float, gradient: F32, sums: F32) -> None:
+        for i in prange(table.shape[0]):
+            per = _f(1 / focal)
             au, av, eta, weight = _f(terms[i, AU]), _f(terms[i, AV]), _f(terms[i, ETA]), _f(terms[i, WEIGHT])
             k, shear, kv, u = table[i, K], table[i, SHEAR], table[i, KV], table[i, U]
-            for r in range(max(band * _BAND, int(terms[i, ROW0])), min((band + 1) * _BAND, int(terms[i, ROW1]))):
+            for m in range(10):
+                sums[i, m] = _f(0)
+            for r in range(int(terms[i, ROW0]), int(terms[i, ROW1])):
                 first, last = _span(table, terms, i, r)
                 if first >= last:
                     continue
-                line = image[r, first:last]
+                line = gradient[r, first:last]
                 dv, du0 = _f(r) - table[i, V], _f(first) - u
                 up, over0 = _f(r - row) * per, _f(first - col) * per
                 tall, up2, along = kv * dv * dv, _f(1) + up * up, _f(1) + av * dv
+                s = sb = sbt = sbtt = sl = slu = sn = _f(0)
                 for j in range(line.shape[0]):
                     du, over = du0 + _f(j), over0 + _f(j) * per
                     across = du - shear * dv
                     n = k * across * across + tall
                     lift = along + au * du
                     inverse = _f(1) / (lift * lift + eta * n)
-                    line[j] += weight * np.sqrt((up2 + over * over) * inverse) * _decay(_f(-0.5) * n * inverse)
+                    value, slope = _profile(n * inverse, compact)
+                    under = line[j] * weight * np.sqrt((up2 + over * over) * inverse)
+                    a, steep = under * value, under * slope
+                    aq = _f(0.5) * inverse * (n * inverse * steep - a)
+                    ab, al = eta * aq - _f(0.5) * inverse * steep, lift * aq
+                    s += a
+                    sb += ab
+                    sbt += ab * across
+                    sbtt += ab * across * across
+                    sl += al
+                    slu += al * du
+                    sn += aq * n
+                sums[i, A] += s
+                sums[i, BT] += sbt
+                sums[i, BV] += sb * dv
+                sums[i, BTT] += sbtt
+                sums[i, BTV] += sbt * dv
+                sums[i, BVV] += sb * dv * dv
+                sums[i, L] += sl
+                sums[i, LU] += slu
+                sums[i, LV] += sl * dv
+                sums[i, N] += sn
+
+    return kernel
 
 
-@njit(**OPTIONS)
-def _sums(table: F32, terms: F64, focal: float, col: float, row: float, gradient: F32, sums: F32) -> None:
-    for i in prange(table.shape[0]):
-        per = _f(1 / focal)
-        au, av, eta, weight = _f(terms[i, AU]), _f(terms[i, AV]), _f(terms[i, ETA]), _f(terms[i, WEIGHT])
-        k, shear, kv, u = table[i, K], table[i, SHEAR], table[i, KV], table[i, U]
-        for m in range(10):
-            sums[i, m] = _f(0)
-        for r in range(int(terms[i, ROW0]), int(terms[i, ROW1])):
-            first, last = _span(table, terms, i, r)
-            if first >= last:
-                continue
-            line = gradient[r, first:last]
-            dv, du0 = _f(r) - table[i, V], _f(first) - u
-            up, over0 = _f(r - row) * per, _f(first - col) * per
-            tall, up2, along = kv * dv * dv, _f(1) + up * up, _f(1) + av * dv
-            s = sb = sbt = sbtt = sl = slu = sn = _f(0)
-            for j in range(line.shape[0]):
-                du, over = du0 + _f(j), over0 + _f(j) * per
-                across = du - shear * dv
-                n = k * across * across + tall
-                lift = along + au * du
-                inverse = _f(1) / (lift * lift + eta * n)
-                a = line[j] * weight * np.sqrt((up2 + over * over) * inverse) * _decay(_f(-0.5) * n * inverse)
-                aq = a * _f(0.5) * inverse * (n * inverse - _f(1))
-                ab, al = eta * aq - _f(0.5) * inverse * a, lift * aq
-                s += a
-                sb += ab
-                sbt += ab * across
-                sbtt += ab * across * across
-                sl += al
-                slu += al * du
-                sn += aq * n
-            sums[i, A] += s
-            sums[i, BT] += sbt
-            sums[i, BV] += sb * dv
-            sums[i, BTT] += sbtt
-            sums[i, BTV] += sbt * dv
-            sums[i, BVV] += sb * dv * dv
-            sums[i, L] += sl
-            sums[i, LU] += slu
-            sums[i, LV] += sl * dv
-            sums[i, N] += sn
+_RENDER = {kernel: _renderer(kernel.is_compact) for kernel in Kernel}
+_SUMS = {kernel: _summer(kernel.is_compact) for kernel in Kernel}
 
 
 @njit(**OPTIONS)
@@ -294,21 +325,23 @@ class Rays:
         shape: tuple[int, int],
         faint: float,
         cut: float,
+        kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:
         """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them."""
-        self.parameters, self.camera = (means, scales, rotations, densities), camera
+        self.parameters, self.camera, self._kernel = (means, scales, rotations, densities), camera, kernel
         self.table = footprint_table(densities.shape[0])
-        footprints(*self.parameters, camera, faint, cut, self.table)
+        footprints(*self.parameters, camera, faint, cut, self.table, kernel=kernel)
         self.terms = np.empty((densities.shape[0], 9))
         rows, cols = shape
         _terms(
-            *self.parameters, camera.axes, camera.focal, camera.sod, faint, cut, rows, cols, self.table, self.terms
+            *self.parameters, camera.axes, camera.focal, camera.sod, faint, kernel.reach(cut), kernel.length,
+            kernel.is_compact, rows, cols, self.table, self.terms,
         )  # fmt: skip
 
     def add_to(self, image: F32) -> None:
         """Add the Gaussians to image [row, col]."""
         c = self.camera
-        _render(self.table, self.terms, c.focal, c.col, c.row, image)
+        _RENDER[self._kernel](self.table, self.terms, c.focal, c.col, c.row, image)
 
     def backward(
         self, gradient: F32, d_means: F32, d_log_scales: F32, d_rotations: F32, d_densities: F32, d_centres: F32
@@ -317,11 +350,12 @@ class Rays:
         means, scales, rotations, _ = self.parameters
         c = self.camera
         sums = np.empty((means.shape[0], 10), np.float32)
-        _sums(self.table, self.terms, c.focal, c.col, c.row, gradient, sums)
+        _SUMS[self._kernel](self.table, self.terms, c.focal, c.col, c.row, gradient, sums)
         moments = np.empty((means.shape[0], 6), np.float32)
         _as_moments(self.table, self.terms, sums, moments)
         footprints_backward(
-            self.table, moments, *self.parameters, c, d_means, d_log_scales, d_rotations, d_densities, d_centres
+            self.table, moments, *self.parameters, c, d_means, d_log_scales, d_rotations, d_densities, d_centres,
+            kernel=self._kernel,
         )  # fmt: skip
         _bend(
             self.terms, sums, means, scales, rotations, c.axes, c.focal, c.sod, d_means, d_log_scales, d_rotations

@@ -7,29 +7,35 @@ With the rows a, b, c (x, y, z) of R S in voxels, the exponent is a sum of squar
 
 At one δz this is a footprint in (x, y) whose centre has moved by δz (a·c, b·c) / Σzz, as in `cpu.project`.
 
-The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g G ε and N₂ = Σ g G εεᵀ with ε = (τ, δy', δz): δz is
-measured from the Gaussian's centre, τ and δy' from the centre of its footprint in the slice. In the Gaussian's axes and
-standard deviations
+A compact kernel is t^(3/2), t = 1 + 2 E / R²: with t_z that of δz alone, the slice at δz is the footprint of k / t_z
+and l / t_z with weight t_z^(3/2).
+
+The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g D ε and N₂ = Σ g D εεᵀ with D as in `cpu.project` and
+ε = (τ, δy', δz): δz is measured from the Gaussian's centre, τ and δy' from the centre of its footprint in the slice. In
+the Gaussian's axes and standard deviations
 
     y = τ A + δy' B + δz C,   A = H e_x,   B = (c x A) sqrt(l) / |c x A|,   C = c / Σzz,   H = S⁻¹ Rᵀ per voxel
 
-and with T = ρ Σ g G yyᵀ (see `cpu.footprints`)
+and with T = ρ Σ g D yyᵀ (see `cpu.footprints`)
 
-    ∂ρ = N₀,   ∂p = ρ R S⁻¹ Σ g G y,   ∂ log scales and ∂R from T
+    ∂ρ = N₀,   ∂p = ρ R S⁻¹ Σ g D y,   ∂ log scales and ∂R from T
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from recon.base.kernel import Kernel
 from recon.kernels.cpu import lanes
 from recon.kernels.cpu.activation import F32, OPTIONS
+from recon.kernels.cpu.boxes import padded, padded_shape
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W, add_shape
-from recon.kernels.cpu.project import add_footprint, gather_footprint, padded, padded_shape
+from recon.kernels.cpu.project import COMPACT, GAUSSIAN, add_footprint, gather_footprint
 
 _f = np.float32
 _SLAB = 4  # slices a task: few enough to give all threads work on a 32-voxel cube, enough to keep rows in the cache
@@ -39,6 +45,8 @@ _SHARE = 16  # Gaussians a task of the backward pass
 # widths of the middle slice over the reach, reach in standard deviations.
 _X, _Y, _Z, _DRIFT_X, _DRIFT_Y, _KZ, _WIDE_X, _WIDE_Y, _REACH = 0, 1, 5, 6, 7, 8, 9, 10, 11
 _FARTHEST = 1e30  # keeps float32 from infinity
+_PER = np.float32(1 / Kernel.COMPACT.radius**2)
+_SLOPE = 8  # in a piece: the weight of D in a slice of a compact kernel
 
 
 @njit(**OPTIONS)
@@ -74,10 +82,14 @@ def _place(
     shape: tuple[int, int, int],
     faint: float,
     cut: float,
+    ends: bool,
     table: F32,
     slices: NDArray[np.int32],
 ) -> None:
-    """Fill table [k, 12] and slices [k, 2] (first, last + 1; 0, 0 outside the grid) of the Gaussians `near`."""
+    """Fill table [k, 12] and slices [k, 2] (first, last + 1; 0, 0 outside the grid) of the Gaussians `near`.
+
+    With `ends` a kernel ends at `cut` by itself, however dense it is.
+    """
     nz, ny, nx = shape
     for j in prange(near.shape[0]):
         i = near[j]
@@ -85,7 +97,9 @@ def _place(
         density = densities[i]
         if not density > _f(faint):
             continue
-        reach = min(cut, math.sqrt(2 * math.log(density / faint))) if faint > 0 else cut
+        reach = cut
+        if faint > 0 and not ends:
+            reach = min(cut, math.sqrt(2 * math.log(density / faint)))
         r, sc = rotations[i], scales[i]
         s0, s1, s2 = np.float64(sc[0]), np.float64(sc[1]), np.float64(sc[2])
         px, py, pz = 1 / spacing[2], 1 / spacing[1], 1 / spacing[0]
@@ -120,94 +134,118 @@ def _place(
 
 
 @njit(inline="always", fastmath=True)
-def _cut(table, j, z, weight, piece):  # type: ignore[no-untyped-def]
-    """Slice z of Gaussian j as a footprint, piece [1, 8]; returns δz."""
+def _cut(table, j, z, weight, piece, profile):  # type: ignore[no-untyped-def]
+    """Slice z of Gaussian j as a footprint, piece [1, 9 or more]; returns δz."""
     dz = _f(z) - table[j, _Z]
     down = table[j, _KZ] * dz * dz
     reach = np.sqrt(max(table[j, _REACH] * table[j, _REACH] - down, _f(0)))
     piece[0, U] = table[j, _X] + table[j, _DRIFT_X] * dz
     piece[0, V] = table[j, _Y] + table[j, _DRIFT_Y] * dz
-    piece[0, K], piece[0, SHEAR], piece[0, KV] = table[j, K], table[j, SHEAR], table[j, KV]
     piece[0, HU], piece[0, HV] = reach * table[j, _WIDE_X], reach * table[j, _WIDE_Y]
-    # numba's own exp is a call that clears the vector registers.
-    piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * down))
+    piece[0, SHEAR] = table[j, SHEAR]
+    if profile == GAUSSIAN:
+        piece[0, K], piece[0, KV] = table[j, K], table[j, KV]
+        # numba's own exp is a call that clears the vector registers.
+        piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * down))
+    else:
+        left = max(_f(1) - _PER * down, _f(1e-7))
+        piece[0, K], piece[0, KV] = table[j, K] / left, table[j, KV] / left
+        piece[0, _SLOPE] = weight * np.sqrt(left)
+        piece[0, W] = left * piece[0, _SLOPE]
     return dz
 
 
-@njit(**OPTIONS)
-def _fill(table: F32, slices: NDArray[np.int32], hits: NDArray[np.int64], densities: F32, volume: F32,
-          ny: int, nx: int, pieces: F32) -> None:  # fmt: skip
-    """volume [z, y, x] of padded slices: each task fills `_SLAB` of them, so no two write to one voxel."""
-    for task in prange(pieces.shape[0]):
-        low, high = task * _SLAB, min(volume.shape[0], (task + 1) * _SLAB)
-        piece = pieces[task]
-        volume[low:high] = _f(0)
-        for j in range(hits.shape[0]):
-            for z in range(max(low, slices[j, 0]), min(high, slices[j, 1])):
-                _cut(table, j, z, densities[hits[j]], piece)
-                add_footprint(piece, 0, ny, nx, volume[z])
+# The profile is a constant of the compiled kernels, as in `cpu.project`.
+def _filler(profile: int) -> Any:
+    @njit(**OPTIONS)
+    def kernel(table: F32, slices: NDArray[np.int32], hits: NDArray[np.int64], densities: F32, volume: F32,
+               ny: int, nx: int, pieces: F32) -> None:  # fmt: skip
+        """volume [z, y, x] of padded slices: each task fills `_SLAB` of them, so no two write to one voxel."""
+        for task in prange(pieces.shape[0]):
+            low, high = task * _SLAB, min(volume.shape[0], (task + 1) * _SLAB)
+            piece = pieces[task]
+            volume[low:high] = _f(0)
+            for j in range(hits.shape[0]):
+                for z in range(max(low, slices[j, 0]), min(high, slices[j, 1])):
+                    _cut(table, j, z, densities[hits[j]], piece, profile)
+                    add_footprint(piece, 0, ny, nx, volume[z], profile)
+
+    return kernel
 
 
-@njit(**OPTIONS)
-def _gather(
-    table: F32,
-    slices: NDArray[np.int32],
-    hits: NDArray[np.int64],
-    gradient: F32,
-    ny: int,
-    nx: int,
-    scales: F32,
-    rotations: F32,
-    densities: F32,
-    spacing: NDArray[np.float64],
-    means_too: bool,
-    pieces: F32,
-    d_means: F32,
-    d_log_scales: F32,
-    d_rotations: F32,
-    d_densities: F32,
-) -> None:
-    ex, ez = _f(spacing[2]), _f(spacing[0])
-    for task in prange(pieces.shape[0]):
-        piece, found = pieces[task, :1], pieces[task, 1:]
-        for j in range(task * _SHARE, min(hits.shape[0], (task + 1) * _SHARE)):
-            i = hits[j]
-            n0 = nt = nv = nz = tt = tv = vv = tz = vz = zz = _f(0)
-            for z in range(slices[j, 0], slices[j, 1]):
-                dz = _cut(table, j, z, _f(1), piece)
-                gather_footprint(piece, 0, ny, nx, gradient[z], found)
-                weight = piece[0, W]
-                m0, mt, mv = weight * found[0, 0], weight * found[0, 1], weight * found[0, 2]
-                n0, nt, nv, nz = n0 + m0, nt + mt, nv + mv, nz + dz * m0
-                tt, tv, vv = tt + weight * found[0, 3], tv + weight * found[0, 4], vv + weight * found[0, 5]
-                tz, vz, zz = tz + dz * mt, vz + dz * mv, zz + dz * dz * m0
-            density, r, s0, s1, s2 = densities[i], rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
-            d_densities[i] += n0
-            a0, a1, a2 = ex * r[0] / s0, ex * r[1] / s1, ex * r[2] / s2
-            c0, c1, c2 = r[6] * s0 / ez, r[7] * s1 / ez, r[8] * s2 / ez
-            # Scale B to its length sqrt(l), which removes the rounding errors of its factors.
-            b0, b1, b2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
-            size = np.sqrt(table[j, KV] / max(b0 * b0 + b1 * b1 + b2 * b2, _f(1 / _FARTHEST)))
-            b0, b1, b2 = size * b0, size * b1, size * b2
-            c0, c1, c2 = table[j, _KZ] * c0, table[j, _KZ] * c1, table[j, _KZ] * c2
-            if means_too:
-                y0 = density * (nt * a0 + nv * b0 + nz * c0) / s0
-                y1 = density * (nt * a1 + nv * b1 + nz * c1) / s1
-                y2 = density * (nt * a2 + nv * b2 + nz * c2) / s2
-                d_means[i, 0] += r[0] * y0 + r[1] * y1 + r[2] * y2
-                d_means[i, 1] += r[3] * y0 + r[4] * y1 + r[5] * y2
-                d_means[i, 2] += r[6] * y0 + r[7] * y1 + r[8] * y2
-            # T / ρ = (τ A + δv B + δz C)(...)ᵀ, as A fᵀ + B gᵀ + C hᵀ.
-            f0, f1, f2 = tt * a0 + tv * b0 + tz * c0, tt * a1 + tv * b1 + tz * c1, tt * a2 + tv * b2 + tz * c2
-            g0, g1, g2 = tv * a0 + vv * b0 + vz * c0, tv * a1 + vv * b1 + vz * c1, tv * a2 + vv * b2 + vz * c2
-            h0, h1, h2 = tz * a0 + vz * b0 + zz * c0, tz * a1 + vz * b1 + zz * c1, tz * a2 + vz * b2 + zz * c2
-            add_shape(
-                i, scales, rotations,
-                density * (a0 * f0 + b0 * g0 + c0 * h0), density * (a0 * f1 + b0 * g1 + c0 * h1),
-                density * (a0 * f2 + b0 * g2 + c0 * h2), density * (a1 * f1 + b1 * g1 + c1 * h1),
-                density * (a1 * f2 + b1 * g2 + c1 * h2), density * (a2 * f2 + b2 * g2 + c2 * h2),
-                d_log_scales, d_rotations,
-            )  # fmt: skip
+def _gatherer(profile: int) -> Any:
+    @njit(**OPTIONS)
+    def kernel(
+        table: F32,
+        slices: NDArray[np.int32],
+        hits: NDArray[np.int64],
+        gradient: F32,
+        ny: int,
+        nx: int,
+        scales: F32,
+        rotations: F32,
+        densities: F32,
+        spacing: NDArray[np.float64],
+        means_too: bool,
+        pieces: F32,
+        d_means: F32,
+        d_log_scales: F32,
+        d_rotations: F32,
+        d_densities: F32,
+    ) -> None:
+        ex, ez = _f(spacing[2]), _f(spacing[0])
+        for task in prange(pieces.shape[0]):
+            piece, found = pieces[task, :1], pieces[task, 1:]
+            for j in range(task * _SHARE, min(hits.shape[0], (task + 1) * _SHARE)):
+                i = hits[j]
+                n0 = nt = nv = nz = tt = tv = vv = tz = vz = zz = _f(0)
+                for z in range(slices[j, 0], slices[j, 1]):
+                    dz = _cut(table, j, z, _f(1), piece, profile)
+                    gather_footprint(piece, 0, ny, nx, gradient[z], found, profile)
+                    weight = piece[0, W]
+                    m0 = weight * found[0, 0]
+                    n0 += m0
+                    if profile != GAUSSIAN:
+                        weight = piece[0, _SLOPE]
+                        m0 = weight * found[0, 6]
+                    mt, mv = weight * found[0, 1], weight * found[0, 2]
+                    nt, nv, nz = nt + mt, nv + mv, nz + dz * m0
+                    tt, tv, vv = tt + weight * found[0, 3], tv + weight * found[0, 4], vv + weight * found[0, 5]
+                    tz, vz, zz = tz + dz * mt, vz + dz * mv, zz + dz * dz * m0
+                density, r, s0, s1, s2 = densities[i], rotations[i], scales[i, 0], scales[i, 1], scales[i, 2]
+                d_densities[i] += n0
+                a0, a1, a2 = ex * r[0] / s0, ex * r[1] / s1, ex * r[2] / s2
+                c0, c1, c2 = r[6] * s0 / ez, r[7] * s1 / ez, r[8] * s2 / ez
+                # Scale B to its length sqrt(l), which removes the rounding errors of its factors.
+                b0, b1, b2 = c1 * a2 - c2 * a1, c2 * a0 - c0 * a2, c0 * a1 - c1 * a0
+                size = np.sqrt(table[j, KV] / max(b0 * b0 + b1 * b1 + b2 * b2, _f(1 / _FARTHEST)))
+                b0, b1, b2 = size * b0, size * b1, size * b2
+                c0, c1, c2 = table[j, _KZ] * c0, table[j, _KZ] * c1, table[j, _KZ] * c2
+                if means_too:
+                    y0 = density * (nt * a0 + nv * b0 + nz * c0) / s0
+                    y1 = density * (nt * a1 + nv * b1 + nz * c1) / s1
+                    y2 = density * (nt * a2 + nv * b2 + nz * c2) / s2
+                    d_means[i, 0] += r[0] * y0 + r[1] * y1 + r[2] * y2
+                    d_means[i, 1] += r[3] * y0 + r[4] * y1 + r[5] * y2
+                    d_means[i, 2] += r[6] * y0 + r[7] * y1 + r[8] * y2
+                # T / ρ = (τ A + δv B + δz C)(...)ᵀ, as A fᵀ + B gᵀ + C hᵀ.
+                f0, f1, f2 = tt * a0 + tv * b0 + tz * c0, tt * a1 + tv * b1 + tz * c1, tt * a2 + tv * b2 + tz * c2
+                g0, g1, g2 = tv * a0 + vv * b0 + vz * c0, tv * a1 + vv * b1 + vz * c1, tv * a2 + vv * b2 + vz * c2
+                h0, h1, h2 = tz * a0 + vz * b0 + zz * c0, tz * a1 + vz * b1 + zz * c1, tz * a2 + vz * b2 + zz * c2
+                add_shape(
+                    i, scales, rotations,
+                    density * (a0 * f0 + b0 * g0 + c0 * h0), density * (a0 * f1 + b0 * g1 + c0 * h1),
+                    density * (a0 * f2 + b0 * g2 + c0 * h2), density * (a1 * f1 + b1 * g1 + c1 * h1),
+                    density * (a1 * f2 + b1 * g2 + c1 * h2), density * (a2 * f2 + b2 * g2 + c2 * h2),
+                    d_log_scales, d_rotations,
+                )  # fmt: skip
+
+    return kernel
+
+
+_PROFILES = {Kernel.GAUSSIAN: GAUSSIAN, Kernel.COMPACT: COMPACT}
+_FILL = {kernel: _filler(profile) for kernel, profile in _PROFILES.items()}
+_GATHER = {kernel: _gatherer(profile) for kernel, profile in _PROFILES.items()}
 
 
 class Layout:
@@ -224,13 +262,15 @@ class Layout:
         shape: tuple[int, int, int],
         faint: float,
         cut: float,
+        kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:
         """`origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm, `spacing` the voxels' edge or edges (z, y, x).
 
-        Gaussians are cut off where they fall below `faint` (a density), and at `cut` standard deviations.
+        Gaussians are cut off where they fall below `faint` (a density), and at `cut` standard deviations; compact
+        kernels at their own end, if they are above `faint` anywhere.
         """
-        n = densities.shape[0]
-        self.parameters, self.shape = (means, scales, rotations, densities), shape
+        n, cut = densities.shape[0], kernel.reach(cut)
+        self.parameters, self.shape, self._kernel = (means, scales, rotations, densities), shape, kernel
         self._spacing = np.broadcast_to(np.asarray(spacing, np.float64), 3).copy()
         corner = np.asarray(origin, np.float64)
         edge = self._spacing[::-1]
@@ -240,7 +280,7 @@ class Layout:
         pieces = [found[k * _TASK : k * _TASK + count] for k, count in enumerate(counts)]
         near = np.concatenate(pieces) if pieces else found
         table, slices = np.empty((near.size, 12), np.float32), np.empty((near.size, 2), np.int32)
-        _place(near, *self.parameters, corner, self._spacing, shape, faint, cut, table, slices)
+        _place(near, *self.parameters, corner, self._spacing, shape, faint, cut, kernel.is_compact, table, slices)
         hit = slices[:, 1] > slices[:, 0]
         self.hits, self._table, self._slices = near[hit], table[hit], slices[hit]
 
@@ -249,7 +289,7 @@ class Layout:
         nz, ny, nx = self.shape
         volume = np.empty((nz, *padded_shape(ny, nx)), np.float32)
         pieces = np.empty((-(-nz // _SLAB), 1, 16), np.float32)
-        _fill(self._table, self._slices, self.hits, self.parameters[3], volume, ny, nx, pieces)
+        _FILL[self._kernel](self._table, self._slices, self.hits, self.parameters[3], volume, ny, nx, pieces)
         return volume[:, :ny, :nx]
 
     def backward(
@@ -266,7 +306,7 @@ class Layout:
         _, ny, nx = self.shape
         _, scales, rotations, densities = self.parameters
         pieces = np.empty((-(-self.hits.size // _SHARE), 2, 16), np.float32)
-        _gather(
+        _GATHER[self._kernel](
             self._table, self._slices, self.hits, padded(gradient), ny, nx, scales, rotations, densities,
             self._spacing, means_too, pieces, d_means, d_log_scales, d_rotations, d_densities,
         )  # fmt: skip

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
@@ -33,8 +34,11 @@ def _zeros(like: Parameters) -> Parameters:
 class GpuPass:
     """One pass over a model: physical parameters, and the gradients added by its views and boxes of voxels."""
 
-    def __init__(self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> None:
-        self._raw, self._unit = (quaternions, raw), unit
+    def __init__(
+        self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float,
+        kernel: Kernel = Kernel.GAUSSIAN,
+    ) -> None:  # fmt: skip
+        self._raw, self._unit, self.kernel = (quaternions, raw), unit, kernel
         scales, rotations, densities = activate(log_scales, quaternions, raw, unit)
         self.active = (means, scales, rotations, densities)
         self.into = _zeros(self.active)
@@ -63,14 +67,16 @@ class GpuView:
 
     def __init__(self, run: GpuPass, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> None:
         self._run, self._geometry, self._view, self._length = run, geometry, view, model.length(geometry)
-        self.footprints = footprints(*run.active, geometry, view, faint, cut, self._length, model.exact_above)
-        self.image = render(self.footprints, geometry.detector_shape)
+        self.footprints = footprints(
+            *run.active, geometry, view, faint, cut, self._length, model.exact_above, run.kernel
+        )  # fmt: skip
+        self.image = render(self.footprints, geometry.detector_shape, run.kernel)
         self._rays: tuple[Tensor, Rays] | None = None
         if geometry.is_cone and model.exact_above < math.inf:  # their number is only known after waiting for the device
             exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
             if exact.numel() > 0:
                 means, scales, rotations, densities = (array[exact] for array in run.active)
-                rays = Rays(means, scales, rotations, densities, geometry, view, faint, cut)
+                rays = Rays(means, scales, rotations, densities, geometry, view, faint, cut, run.kernel)
                 rays.add_to(self.image)
                 self._rays = (exact, rays)
 
@@ -79,8 +85,9 @@ class GpuView:
         run, found = self._run, self.footprints
         centres = found.table.new_empty((found.table.shape[0], 2))
         footprints_backward(
-            found, moments(found, gradient), *run.active, self._geometry, self._view, *run.into, centres, self._length
-        )
+            found, moments(found, gradient, run.kernel), *run.active, self._geometry, self._view, *run.into, centres,
+            self._length, run.kernel,
+        )  # fmt: skip
         if self._rays is not None:
             exact, rays = self._rays
             some, moved = _zeros(rays.parameters), centres.new_empty((exact.numel(), 2))
@@ -95,7 +102,7 @@ class GpuBox:
     """One box of voxels: its density [z, y, x] and its backward pass."""
 
     def __init__(self, run: GpuPass, grid: Grid, faint: float, cut: float) -> None:
-        self._run, self.placed = run, place(*run.active, grid, faint, cut)
+        self._run, self.placed = run, place(*run.active, grid, faint, cut, run.kernel)
         self.density = fill(self.placed)
 
     def backward(self, gradient: Tensor, *, means_too: bool = True) -> None:
@@ -118,9 +125,12 @@ class Gpu:
         """A copy as a numpy array."""
         return array.detach().cpu().numpy().copy()
 
-    def begin(self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) -> GpuPass:
+    def begin(
+        self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float,
+        kernel: Kernel = Kernel.GAUSSIAN,
+    ) -> GpuPass:  # fmt: skip
         """A pass over raw parameters; densities are unit * softplus(raw)."""
-        return GpuPass(means, log_scales, quaternions, raw, unit)
+        return GpuPass(means, log_scales, quaternions, raw, unit, kernel)
 
     def projection_loss(
         self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE

@@ -16,10 +16,15 @@ import triton.language as tl
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.kernels.cpu.footprints import HIDDEN, INEXACT, NEAREST
 
 _BLOCK = 128
-_ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
+# A squared distance in standard deviations is taken times this: exp(-q / 2) = 2^x, and t = 1 + x of a compact kernel.
+_HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))
+_PER = tl.constexpr(-1 / Kernel.COMPACT.radius**2)
+_SHADOW_SLOPE = tl.constexpr(2 * (Kernel.COMPACT.exponent + 0.5) / Kernel.COMPACT.radius**2)
+_BODY_SLOPE = tl.constexpr(2 * Kernel.COMPACT.exponent / Kernel.COMPACT.radius**2)
 _HUGE = tl.constexpr(3.0e38)
 _HIDDEN, _INEXACT = tl.constexpr(HIDDEN), tl.constexpr(INEXACT)
 # Columns of the footprint table, as in `cpu.footprints`.
@@ -37,6 +42,37 @@ class Footprints:
 
     table: Tensor
     boxes: Tensor
+
+
+@triton.jit
+def scaled(k, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
+    """A factor of the quadratic form, as `shadow` and `body` take it."""
+    return k * _PER if COMPACT else k * _HALF_LOG2_E
+
+
+@triton.jit
+def shadow(x, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
+    """G and D of `cpu.project` in an image, x the scaled quadratic form."""
+    if COMPACT:
+        t = tl.maximum(1.0 + x, 0.0)
+        value, slope = t * t, t * _SHADOW_SLOPE
+    else:
+        value = tl.exp2(x)
+        slope = value
+    return value, slope
+
+
+@triton.jit
+def body(x, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
+    """G and D in a volume, x the scaled quadratic form."""
+    if COMPACT:
+        t = tl.maximum(1.0 + x, 0.0)
+        root = tl.sqrt(t)
+        value, slope = t * root, root * _BODY_SLOPE
+    else:
+        value = tl.exp2(x)
+        slope = value
+    return value, slope
 
 
 @triton.jit
@@ -124,7 +160,8 @@ def add_shape(  # type: ignore[no-untyped-def]
 @triton.jit(do_not_specialize=["n"])
 def _footprints(  # type: ignore[no-untyped-def]
     means, scales, rotations, densities, table, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz, col0, row0,
-    focal, sod, near, faint, cut, fixed, worst, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    focal, sod, near, faint, cut, fixed, worst, unit, e0, e1, e2, e3, CONE: tl.constexpr, COMPACT: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -150,21 +187,24 @@ def _footprints(  # type: ignore[no-untyped-def]
     wide, high = tl.sqrt(uu), tl.sqrt(vv)
     steep, level = high * scale, 1.0 / (high * per)
     ka, kv = steep * steep, level * level
-    weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI * norm * within)
+    weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, unit * norm * within)
     u, v = col0 + per * across, row0 + per * up
     # Comparisons with NaN are false, so Gaussians that are not finite are hidden.
     seen = live & (weight > faint) & (weight < _HUGE) & (ka < _HUGE) & (kv < _HUGE) & (depth > near)
-    reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, weight, 1.0) / faint), 0.0))) * per
+    if COMPACT:
+        reach = cut * per
+    else:
+        reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, weight, 1.0) / faint), 0.0))) * per
     hu, hv = reach * wide, reach * high
     hit = seen & (u + hu >= 0.0) & (u - hu <= cols - 1.0) & (v + hv >= 0.0) & (v - hv <= rows - 1.0)
     if CONE:
         # ε² of `cpu.footprints`: with α and β in px of the rotation axis' scale, Σ₂ / f² and η.
         au, av, bu, bv = along_u / hh, along_v / hh, a / (norm * norm), b / (norm * norm)
         eta = 1.0 / (depth * depth * hh)
-        error = uu * (0.5 * bu * bu + au * bu + 1.5 * au * au)
-        error += uv * (bu * bv + au * bv + av * bu + 3.0 * au * av)
-        error += vv * (0.5 * bv * bv + av * bv + 1.5 * av * av)
-        inexact = seen & (error / (depth * depth) + 6.0 * eta * eta > worst)
+        error = uu * (e0 * bu * bu + e1 * au * bu + e2 * au * au)
+        error += uv * (2.0 * (e0 * bu * bv + e2 * au * av) + e1 * (au * bv + av * bu))
+        error += vv * (e0 * bv * bv + e1 * av * bv + e2 * av * av)
+        inexact = seen & (error / (depth * depth) + e3 * eta * eta > worst)
         hu, hv = tl.where(inexact, _INEXACT, hu), tl.where(inexact, _INEXACT, hv)
         hit = hit & (hu >= 0.0)
     f = table + 8 * i
@@ -182,7 +222,7 @@ def _footprints(  # type: ignore[no-untyped-def]
 @triton.jit(do_not_specialize=["n"])
 def _footprints_backward(  # type: ignore[no-untyped-def]
     means, scales, rotations, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n,
-    ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, fixed, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, fixed, unit, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -212,7 +252,7 @@ def _footprints_backward(  # type: ignore[no-untyped-def]
     size, level = 1.0 / (g * s0 * s1) / (s2 * hh), kv * g
     a0, a1, a2 = size * (b2 * h1 - b1 * h2), size * (b0 * h2 - b2 * h0), size * (b1 * h0 - b0 * h1)
     b0, b1, b2 = level * b0, level * b1, level * b2
-    add_to(d_densities + i, m0 * tl.where(fixed > 0.0, fixed, _ROOT_TWO_PI * norm / tl.sqrt(hh)), seen)
+    add_to(d_densities + i, m0 * tl.where(fixed > 0.0, fixed, unit * norm / tl.sqrt(hh)), seen)
     pull = tl.where(fixed > 0.0, 0.0, m0 / hh)
     # T / W = (τ A + δv B)(τ A + δv B)ᵀ + M₀ hhᵀ / h·h, as A cᵀ + B eᵀ + ...
     c0, c1, c2 = mtt * a0 + mtv * b0, mtt * a1 + mtv * b1, mtt * a2 + mtv * b2
@@ -251,9 +291,9 @@ def beam_of(geometry: Geometry, view: int) -> tuple[list[float], float, float]:
 
 def footprints(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, geometry: Geometry, view: int,
-    faint: float, cut: float, length: float = 0.0, exact_above: float = math.inf,
+    faint: float, cut: float, length: float = 0.0, exact_above: float = math.inf, kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Footprints:  # fmt: skip
-    """Footprints of Gaussians, cut off below `faint` (units of the image) and at `cut` σ.
+    """Footprints of Gaussians, cut off below `faint` (units of the image) and at `cut` σ, compact ones at their end.
 
     A `length` (mm) other than 0 replaces μ: the uncorrected factor. Half widths are INEXACT, and boxes empty,
     where a cone's ε is above `exact_above` (see `cpu.footprints`).
@@ -265,8 +305,8 @@ def footprints(
     if n > 0:
         _footprints[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, densities, found.table, found.boxes, n, rows, cols, *axes, *geometry.origin(view),
-            focal, sod, NEAREST * sod, faint, cut, length, min(exact_above * exact_above, _HUGE.value),
-            CONE=geometry.is_cone, BLOCK=_BLOCK,
+            focal, sod, NEAREST * sod, faint, kernel.reach(cut), length, min(exact_above * exact_above, _HUGE.value),
+            kernel.length, *kernel.affine_terms, CONE=geometry.is_cone, COMPACT=kernel.is_compact, BLOCK=_BLOCK,
         )  # fmt: skip
     return found
 
@@ -275,7 +315,7 @@ def footprints_backward(
     found: Footprints, moments: Tensor, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
     geometry: Geometry, view: int,
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, d_centres: Tensor,
-    length: float = 0.0,
+    length: float = 0.0, kernel: Kernel = Kernel.GAUSSIAN,
 ) -> None:  # fmt: skip
     """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
     n = densities.shape[0]
@@ -283,5 +323,5 @@ def footprints_backward(
     if n > 0:
         _footprints_backward[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, found.table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres,
-            n, *axes, focal, sod, length, CONE=geometry.is_cone, BLOCK=_BLOCK,
+            n, *axes, focal, sod, length, kernel.length, CONE=geometry.is_cone, BLOCK=_BLOCK,
         )  # fmt: skip

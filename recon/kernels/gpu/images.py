@@ -1,7 +1,7 @@
 """render and moments: footprints to an image, and an image gradient to six moments a footprint (Triton).
 
     pixel = Σ_i W_i G_i,   G = exp(-1/2 (k τ² + δv² / Σvv)),   τ = δu - r δv
-    moments of the gradient g:  Σ g G (1, τ, δv, τ², τ δv, δv²)
+    moments of the gradient g:  Σ g G  and  Σ g D (τ, δv, τ², τ δv, δv²),   D = G, for a compact kernel as `cpu.project`
 
 The moments use the sheared offset τ, in which the quadratic form is diagonal: they are accurate for long thin
 footprints. A footprint is cut off at its box, independent of tiles.
@@ -9,26 +9,24 @@ footprints. A footprint is cut off at its box, independent of tiles.
 
 from __future__ import annotations
 
-import math
-
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.kernels.gpu.footprints import HU, HV, KV, SHEAR, Footprints, K, U, V, W
+from recon.base.kernel import Kernel
+from recon.kernels.gpu.footprints import HU, HV, KV, SHEAR, Footprints, K, U, V, W, scaled, shadow
 from recon.kernels.gpu.tiles import tile_lists
 
 _EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, and larger tiles would evaluate more pixels outside them
 _GROUP = 8  # Gaussians that a tile processes at once
 _MANY = 64  # footprints in one partial sum: adding many small numbers one by one to a large sum loses accuracy
 _BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
-_HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))  # exp(-q / 2) = 2^(q * this)
 
 
 @triton.jit
 def _render(  # type: ignore[no-untyped-def]
     table, owners, starts, layers, rows, cols, tile_cols, shares,
-    EDGE: tl.constexpr, GROUP: tl.constexpr, MANY: tl.constexpr,
+    EDGE: tl.constexpr, GROUP: tl.constexpr, MANY: tl.constexpr, COMPACT: tl.constexpr,
 ):  # fmt: skip
     tile, share = tl.program_id(0), tl.program_id(1)
     lane = tl.arange(0, EDGE * EDGE)
@@ -43,36 +41,38 @@ def _render(  # type: ignore[no-untyped-def]
             held = start + member < last
             f = table + 8 * tl.load(owners + start + member, held, 0)
             u, v = tl.load(f + U, held, 0.0), tl.load(f + V, held, 0.0)
-            k, kv = tl.load(f + K, held, 0.0) * _HALF_LOG2_E, tl.load(f + KV, held, 0.0) * _HALF_LOG2_E
+            k, kv = scaled(tl.load(f + K, held, 0.0), COMPACT), scaled(tl.load(f + KV, held, 0.0), COMPACT)
             shear, w = tl.load(f + SHEAR, held, 0.0), tl.load(f + W, held, 0.0)
             hu, hv = tl.load(f + HU, held, -1.0), tl.load(f + HV, held, -1.0)
             du, dv = col[None, :] - u[:, None], row[None, :] - v[:, None]
             inside = (tl.abs(du) <= hu[:, None]) & (tl.abs(dv) <= hv[:, None])
             t = du - shear[:, None] * dv
-            value = w[:, None] * tl.exp2(k[:, None] * t * t + kv[:, None] * dv * dv)
-            part += tl.where(inside, value, 0.0)
+            value, _ = shadow(k[:, None] * t * t + kv[:, None] * dv * dv, COMPACT)
+            part += tl.where(inside, w[:, None] * value, 0.0)
         sums += tl.sum(part, axis=0)
     pixel = (share.to(tl.int64) * rows + row) * cols + col
     tl.store(layers + pixel, sums, (row < rows) & (col < cols))
 
 
-def render(found: Footprints, shape: tuple[int, int]) -> Tensor:
+def render(found: Footprints, shape: tuple[int, int], kernel: Kernel = Kernel.GAUSSIAN) -> Tensor:
     """Image [row, col]: the sum of the footprints."""
     lists = tile_lists(found.boxes, shape, _EDGE)
     layers = found.table.new_empty((lists.shares, *shape))
     _render[(lists.n_tiles, lists.shares)](
         found.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.shares,
-        EDGE=_EDGE, GROUP=_GROUP, MANY=_MANY, num_warps=2,
+        EDGE=_EDGE, GROUP=_GROUP, MANY=_MANY, COMPACT=kernel.is_compact, num_warps=2,
     )  # fmt: skip
     return layers.sum(0)
 
 
 @triton.jit
-def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl.constexpr):  # type: ignore[no-untyped-def]
+def _moments(  # type: ignore[no-untyped-def]
+    table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl.constexpr, COMPACT: tl.constexpr
+):
     i = tl.program_id(0)
     f, box = table + 8 * i, boxes + 4 * i
     u, v, shear = tl.load(f + U), tl.load(f + V), tl.load(f + SHEAR)
-    k, kv = tl.load(f + K) * _HALF_LOG2_E, tl.load(f + KV) * _HALF_LOG2_E
+    k, kv = scaled(tl.load(f + K), COMPACT), scaled(tl.load(f + KV), COMPACT)
     hu, hv = tl.load(f + HU), tl.load(f + HV)
     row_low, row_high, col_low, col_high = tl.load(box), tl.load(box + 1), tl.load(box + 2), tl.load(box + 3)
     lane = tl.arange(0, HIGH * WIDE)
@@ -87,9 +87,10 @@ def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl
             du = col - u
             inside = (row < row_high) & (col < col_high) & (tl.abs(du) <= hu) & (tl.abs(dv) <= hv)
             t = du - shear * dv
-            g = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * tl.exp2(k * t * t + kv * dv * dv)
-            gt, gv = g * t, g * dv
-            m0, mt, mv = m0 + g, mt + gt, mv + gv
+            value, slope = shadow(k * t * t + kv * dv * dv, COMPACT)
+            g = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0)
+            gt, gv = g * slope * t, g * slope * dv
+            m0, mt, mv = m0 + g * value, mt + gt, mv + gv
             mtt, mtv, mvv = mtt + gt * t, mtv + gt * dv, mvv + gv * dv
     m = moments + 6 * i
     tl.store(m, tl.sum(m0))
@@ -100,13 +101,14 @@ def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl
     tl.store(m + 5, tl.sum(mvv))
 
 
-def moments(found: Footprints, gradient: Tensor) -> Tensor:
+def moments(found: Footprints, gradient: Tensor, kernel: Kernel = Kernel.GAUSSIAN) -> Tensor:
     """Moments [n, 6] (1, τ, v, ττ, τv, vv) of an image gradient [row, col] under each footprint."""
     n = found.table.shape[0]
     result = found.table.new_empty((n, 6))
     if n > 0:
         high, wide = _BLOCK
         _moments[(n,)](
-            found.table, found.boxes, gradient, result, gradient.shape[1], HIGH=high, WIDE=wide, num_warps=1
+            found.table, found.boxes, gradient, result, gradient.shape[1], HIGH=high, WIDE=wide,
+            COMPACT=kernel.is_compact, num_warps=1,
         )  # fmt: skip
     return result

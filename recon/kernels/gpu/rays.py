@@ -8,14 +8,13 @@ as there, the value of a Gaussian at a pixel is
 
 from __future__ import annotations
 
-import math
-
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.kernels.gpu.footprints import (
     HU,
     KV,
@@ -29,6 +28,8 @@ from recon.kernels.gpu.footprints import (
     beam_of,
     footprints,
     footprints_backward,
+    scaled,
+    shadow,
     store_box,
 )  # fmt: skip
 from recon.kernels.gpu.tiles import tile_lists
@@ -37,8 +38,6 @@ _BLOCK = 128
 _EDGE = 8  # pixels a tile's edge
 _GROUP = 4  # Gaussians that a tile processes at once
 _PIXELS = (8, 16)  # of a Gaussian at once, (rows, cols)
-_HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))  # exp(-q / 2) = 2^(q * this)
-_ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
 # Columns of the terms: α, η, W / |D₀|, the truncation c².
 _AU, _AV, _ETA, _WEIGHT, _CUT = (tl.constexpr(column) for column in range(5))
 _TERMS = tl.constexpr(8)
@@ -49,7 +48,7 @@ _A, _BT, _BV, _BTT, _BTV, _BVV, _L, _LU, _LV, _N = (tl.constexpr(column) for col
 @triton.jit(do_not_specialize=["n"])
 def _terms(  # type: ignore[no-untyped-def]
     means, scales, rotations, densities, table, terms, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz,
-    focal, sod, faint, cut, BLOCK: tl.constexpr,
+    focal, sod, faint, cut, unit, COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -67,10 +66,10 @@ def _terms(  # type: ignore[no-untyped-def]
         h = (a * pu + b * pv + pd) / s
         hh, along_u, along_v = hh + h * h, along_u + h / s * pu, along_v + h / s * pv
         broadest = tl.maximum(broadest, s)
-    most = tl.load(densities + i) * _ROOT_TWO_PI * broadest  # of any ray
+    most = tl.load(densities + i) * unit * broadest  # of any ray
     seen = seen & (most > faint)
     au, av, eta = along_u / (hh * focal), along_v / (hh * focal), 1.0 / (hh * depth * depth)
-    c2 = tl.minimum(cut * cut, 2.0 * tl.log(tl.where(seen, most, faint) / faint))
+    c2 = cut * cut if COMPACT else tl.minimum(cut * cut, 2.0 * tl.log(tl.where(seen, most, faint) / faint))
     tl.store(t + _AU, tl.where(seen, au, 0.0), live)
     tl.store(t + _AV, tl.where(seen, av, 0.0), live)
     tl.store(t + _ETA, tl.where(seen, eta, 0.0), live)
@@ -93,22 +92,28 @@ def _terms(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _at_pixels(du, dv, over, up, k, shear, kv, au, av, eta, c2):  # type: ignore[no-untyped-def]
-    """(N / Q <= c², τ, N, 1 + α·δ, 1 / Q, V / (W / |D₀|)) at offsets δ of pixels (over, up) from the axis, over f."""
+def _at_pixels(  # type: ignore[no-untyped-def]
+    du, dv, over, up, k, shear, kv, au, av, eta, c2, COMPACT: tl.constexpr
+):
+    """(N / Q <= c², τ, N, 1 + α·δ, 1 / Q, V / (W / |D₀|), the same with D for G) at offsets δ of pixels.
+
+    The pixels are at (over, up) from the axis, over f; G and D as in `cpu.project`.
+    """
     across = du - shear * dv
     square = k * across * across + kv * dv * dv
     lift = 1.0 + au * du + av * dv
     q = lift * lift + eta * square
     inside = (square <= c2 * q) & (q > 0.0)
     inverse = 1.0 / tl.where(inside, q, 1.0)
-    value = tl.sqrt((1.0 + up * up + over * over) * inverse) * tl.exp2(square * inverse * _HALF_LOG2_E)
-    return inside, across, square, lift, inverse, value
+    value, slope = shadow(scaled(square * inverse, COMPACT), COMPACT)
+    longer = tl.sqrt((1.0 + up * up + over * over) * inverse)
+    return inside, across, square, lift, inverse, longer * value, longer * slope
 
 
 @triton.jit
 def _render(  # type: ignore[no-untyped-def]
     table, terms, boxes, owners, starts, layers, rows, cols, tile_cols, shares, per, col0, row0, EDGE: tl.constexpr,
-    GROUP: tl.constexpr,
+    GROUP: tl.constexpr, COMPACT: tl.constexpr,
 ):  # fmt: skip
     tile, share = tl.program_id(0), tl.program_id(1)
     lane = tl.arange(0, EDGE * EDGE)
@@ -124,11 +129,11 @@ def _render(  # type: ignore[no-untyped-def]
         row_low, row_high = tl.load(box, held, 0), tl.load(box + 1, held, 0)
         col_low, col_high = tl.load(box + 2, held, 0), tl.load(box + 3, held, 0)
         du, dv = col[None, :] - tl.load(f + U, held, 0.0)[:, None], row[None, :] - tl.load(f + V, held, 0.0)[:, None]
-        inside, _, _, _, _, value = _at_pixels(
+        inside, _, _, _, _, value, _ = _at_pixels(
             du, dv, over, up, tl.load(f + K, held, 0.0)[:, None], tl.load(f + SHEAR, held, 0.0)[:, None],
             tl.load(f + KV, held, 0.0)[:, None], tl.load(t + _AU, held, 0.0)[:, None],
             tl.load(t + _AV, held, 0.0)[:, None], tl.load(t + _ETA, held, 0.0)[:, None],
-            tl.load(t + _CUT, held, 0.0)[:, None],
+            tl.load(t + _CUT, held, 0.0)[:, None], COMPACT,
         )  # fmt: skip
         inside = inside & (row[None, :] >= row_low[:, None]) & (row[None, :] < row_high[:, None])
         inside = inside & (col[None, :] >= col_low[:, None]) & (col[None, :] < col_high[:, None])
@@ -139,8 +144,9 @@ def _render(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _sums(  # type: ignore[no-untyped-def]
-    table, terms, boxes, gradient, sums, cols, per, col0, row0, HIGH: tl.constexpr, WIDE: tl.constexpr
-):
+    table, terms, boxes, gradient, sums, cols, per, col0, row0, HIGH: tl.constexpr, WIDE: tl.constexpr,
+    COMPACT: tl.constexpr,
+):  # fmt: skip
     i = tl.program_id(0)
     f, t, box = table + 8 * i, terms + _TERMS * i, boxes + 4 * i
     u, v, k = tl.load(f + U), tl.load(f + V), tl.load(f + K)
@@ -156,14 +162,15 @@ def _sums(  # type: ignore[no-untyped-def]
         for col_start in range(col_low, col_high, WIDE):
             col = col_start + lane % WIDE
             du, over = col - u, (col - col0) * per
-            inside, across, square, lift, inverse, value = _at_pixels(
-                du, dv, over, up, k, shear, kv, au, av, eta, c2
-            )  # fmt: skip
+            inside, across, square, lift, inverse, value, slope = _at_pixels(
+                du, dv, over, up, k, shear, kv, au, av, eta, c2, COMPACT
+            )
             inside = inside & (row < row_high) & (col < col_high)
-            a = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * weight * value
-            a = tl.where(inside, a, 0.0)  # outside the value may be infinite
-            aq = 0.5 * a * inverse * (square * inverse - 1.0)
-            ab, al = eta * aq - 0.5 * inverse * a, lift * aq
+            under = tl.load(gradient + row.to(tl.int64) * cols + col, inside, 0.0) * weight
+            # Outside the value may be infinite.
+            a, steep = tl.where(inside, under * value, 0.0), tl.where(inside, under * slope, 0.0)
+            aq = 0.5 * inverse * (square * inverse * steep - a)
+            ab, al = eta * aq - 0.5 * inverse * steep, lift * aq
             abt, abv = ab * across, ab * dv
             s, bt, bv = s + a, bt + abt, bv + abv
             btt, btv, bvv = btt + abt * across, btv + abt * dv, bvv + abv * dv
@@ -237,18 +244,18 @@ class Rays:
 
     def __init__(
         self, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
-        geometry: Geometry, view: int, faint: float, cut: float,
+        geometry: Geometry, view: int, faint: float, cut: float, kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:  # fmt: skip
         """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them."""
         self.parameters, self.geometry, self.view = (means, scales, rotations, densities), geometry, view
-        self.footprints = footprints(*self.parameters, geometry, view, faint, cut)
+        self.kernel, self.footprints = kernel, footprints(*self.parameters, geometry, view, faint, cut, kernel=kernel)
         n = densities.shape[0]
         axes, focal, sod = beam_of(geometry, view)
         self.terms = means.new_empty((n, _TERMS.value))
         self.boxes = torch.empty((n, 4), dtype=torch.int32, device=means.device)
         _terms[(triton.cdiv(n, _BLOCK),)](
             *self.parameters, self.footprints.table, self.terms, self.boxes, n, *geometry.detector_shape, *axes, focal,
-            sod, faint, cut, BLOCK=_BLOCK,
+            sod, faint, kernel.reach(cut), kernel.length, COMPACT=kernel.is_compact, BLOCK=_BLOCK,
         )  # fmt: skip
 
     def add_to(self, image: Tensor) -> None:
@@ -260,7 +267,7 @@ class Rays:
         _render[(lists.n_tiles, lists.shares)](
             self.footprints.table, self.terms, self.boxes, lists.owners, lists.starts, layers, *shape,
             lists.counts[1], lists.shares, 1 / focal, *self.geometry.origin(self.view),
-            EDGE=_EDGE, GROUP=_GROUP, num_warps=2,
+            EDGE=_EDGE, GROUP=_GROUP, COMPACT=self.kernel.is_compact, num_warps=2,
         )  # fmt: skip
         image += layers.sum(0)
 
@@ -275,7 +282,7 @@ class Rays:
         sums, moments = table.new_empty((n, 10)), table.new_empty((n, 6))
         _sums[(n,)](
             table, self.terms, self.boxes, gradient, sums, gradient.shape[1], 1 / focal,
-            *self.geometry.origin(self.view), HIGH=high, WIDE=wide, num_warps=1,
+            *self.geometry.origin(self.view), HIGH=high, WIDE=wide, COMPACT=self.kernel.is_compact, num_warps=1,
         )  # fmt: skip
         _bend[(triton.cdiv(n, _BLOCK),)](
             *self.parameters[:3], table, self.terms, self.boxes, sums, moments, d_means, d_log_scales, d_rotations, n,
@@ -283,5 +290,5 @@ class Rays:
         )  # fmt: skip
         footprints_backward(
             self.footprints, moments, *self.parameters, self.geometry, self.view,
-            d_means, d_log_scales, d_rotations, d_densities, d_centres,
+            d_means, d_log_scales, d_rotations, d_densities, d_centres, kernel=self.kernel,
         )  # fmt: skip

@@ -11,7 +11,6 @@ moments of δ itself the thin sides of a needle would be small differences of la
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -19,15 +18,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from recon.base.kernel import Kernel
 from recon.base.volume import Grid
-from recon.kernels.gpu.footprints import add_shape, add_to, shape_of
+from recon.kernels.gpu.footprints import add_shape, add_to, body, scaled, shape_of
 from recon.kernels.gpu.tiles import tile_lists
 
 _BLOCK = 128
 _EDGE = 8  # voxels a brick edge
 _GROUP = 4  # Gaussians that a brick processes at once
 _DEEP, _HIGH, _WIDE = 2, 8, 8  # voxels of a Gaussian at once
-_HALF_LOG2_E = tl.constexpr(-0.5 / math.log(2))
 _HUGE, _LEAST = tl.constexpr(3.0e38), tl.constexpr(1.0e-30)
 # Columns of the table: centre and half widths in voxels, the three squares' factors, the density.
 X, Y, Z, KX, SXY, SXZ, KY, SYZ, KZ, HX, HY, HZ, RHO = (tl.constexpr(column) for column in range(13))
@@ -41,12 +40,13 @@ class Placed:
     table: Tensor
     boxes: Tensor
     grid: Grid
+    kernel: Kernel
 
 
 @triton.jit(do_not_specialize=["n"])
 def _placed(  # type: ignore[no-untyped-def]
     means, scales, rotations, densities, table, boxes, n, x0, y0, z0, per_x, per_z, nx, ny, nz, faint, cut,
-    BLOCK: tl.constexpr,
+    COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -68,7 +68,10 @@ def _placed(  # type: ignore[no-untyped-def]
     ky = steep * steep
     density = tl.load(densities + i)
     seen = live & (density > faint) & (density < _HUGE) & (kx < _HUGE) & (ky < _HUGE) & (kz < _HUGE)
-    reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, density, 1.0) / faint), 0.0)))
+    if COMPACT:
+        reach = cut
+    else:
+        reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, density, 1.0) / faint), 0.0)))
     x = (tl.load(means + 3 * i) - x0) * per_x
     y = (tl.load(means + 3 * i + 1) - y0) * per_x
     z = (tl.load(means + 3 * i + 2) - z0) * per_z
@@ -104,28 +107,30 @@ def _placed(  # type: ignore[no-untyped-def]
 
 
 def place(
-    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, grid: Grid, faint: float, cut: float
-) -> Placed:
-    """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ."""
+    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, grid: Grid, faint: float, cut: float,
+    kernel: Kernel = Kernel.GAUSSIAN,
+) -> Placed:  # fmt: skip
+    """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ, compact ones at their end."""
     n = densities.shape[0]
     z, y, x = (float(axis[0]) for axis in grid.coordinates())
     nz, ny, nx = grid.shape
     edge_z, _, edge_x = grid.spacing
     placed = Placed(
-        means.new_empty((n, _WIDTH.value)), torch.empty((n, 6), dtype=torch.int32, device=means.device), grid
+        means.new_empty((n, _WIDTH.value)), torch.empty((n, 6), dtype=torch.int32, device=means.device), grid, kernel
     )
     if n > 0:
         _placed[(triton.cdiv(n, _BLOCK),)](
             means, scales, rotations, densities, placed.table, placed.boxes, n, x, y, z, 1 / edge_x, 1 / edge_z,
-            nx, ny, nz, faint, cut, BLOCK=_BLOCK,
+            nx, ny, nz, faint, kernel.reach(cut), COMPACT=kernel.is_compact, BLOCK=_BLOCK,
         )  # fmt: skip
     return placed
 
 
 @triton.jit
 def _fill(  # type: ignore[no-untyped-def]
-    table, owners, starts, layers, nz, ny, nx, bricks_y, bricks_x, shares, EDGE: tl.constexpr, GROUP: tl.constexpr
-):
+    table, owners, starts, layers, nz, ny, nx, bricks_y, bricks_x, shares, EDGE: tl.constexpr, GROUP: tl.constexpr,
+    COMPACT: tl.constexpr,
+):  # fmt: skip
     brick, share = tl.program_id(0), tl.program_id(1)
     lane = tl.arange(0, EDGE * EDGE * EDGE)
     ix = (brick % bricks_x) * EDGE + lane % EDGE
@@ -138,15 +143,15 @@ def _fill(  # type: ignore[no-untyped-def]
         held = start + member < last
         f = table + _WIDTH * tl.load(owners + start + member, held, 0)
         x, y, z = tl.load(f + X, held, 0.0), tl.load(f + Y, held, 0.0), tl.load(f + Z, held, 0.0)
-        kx, ky = tl.load(f + KX, held, 0.0) * _HALF_LOG2_E, tl.load(f + KY, held, 0.0) * _HALF_LOG2_E
-        kz, rho = tl.load(f + KZ, held, 0.0) * _HALF_LOG2_E, tl.load(f + RHO, held, 0.0)
+        kx, ky = scaled(tl.load(f + KX, held, 0.0), COMPACT), scaled(tl.load(f + KY, held, 0.0), COMPACT)
+        kz, rho = scaled(tl.load(f + KZ, held, 0.0), COMPACT), tl.load(f + RHO, held, 0.0)
         sxy, sxz, syz = tl.load(f + SXY, held, 0.0), tl.load(f + SXZ, held, 0.0), tl.load(f + SYZ, held, 0.0)
         hx, hy, hz = tl.load(f + HX, held, -1.0), tl.load(f + HY, held, -1.0), tl.load(f + HZ, held, -1.0)
         dx, dy, dz = ix[None, :] - x[:, None], iy[None, :] - y[:, None], iz[None, :] - z[:, None]
         inside = (tl.abs(dx) <= hx[:, None]) & (tl.abs(dy) <= hy[:, None]) & (tl.abs(dz) <= hz[:, None])
         a, b = dx + sxy[:, None] * dy + sxz[:, None] * dz, dy - syz[:, None] * dz
-        value = rho[:, None] * tl.exp2(kx[:, None] * a * a + ky[:, None] * b * b + kz[:, None] * dz * dz)
-        sums += tl.where(inside, value, 0.0)
+        value, _ = body(kx[:, None] * a * a + ky[:, None] * b * b + kz[:, None] * dz * dz, COMPACT)
+        sums += tl.where(inside, rho[:, None] * value, 0.0)
     voxel = ((share.to(tl.int64) * nz + iz) * ny + iy) * nx + ix
     tl.store(layers + voxel, tl.sum(sums, axis=0), (iz < nz) & (iy < ny) & (ix < nx))
 
@@ -158,19 +163,21 @@ def fill(placed: Placed) -> Tensor:
     layers = placed.table.new_empty((lists.shares, *shape))
     _fill[(lists.n_tiles, lists.shares)](
         placed.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.counts[2], lists.shares,
-        EDGE=_EDGE, GROUP=_GROUP, num_warps=4,
+        EDGE=_EDGE, GROUP=_GROUP, COMPACT=placed.kernel.is_compact, num_warps=4,
     )  # fmt: skip
     return layers[0] if lists.shares == 1 else layers.sum(0)
 
 
 @triton.jit
 def _moments(  # type: ignore[no-untyped-def]
-    table, boxes, gradient, moments, ny, nx, DEEP: tl.constexpr, HIGH: tl.constexpr, WIDE: tl.constexpr
-):
+    table, boxes, gradient, moments, ny, nx, DEEP: tl.constexpr, HIGH: tl.constexpr, WIDE: tl.constexpr,
+    COMPACT: tl.constexpr,
+):  # fmt: skip
     i = tl.program_id(0)
     f, box = table + _WIDTH * i, boxes + 6 * i
     x, y, z = tl.load(f + X), tl.load(f + Y), tl.load(f + Z)
-    kx, ky, kz = tl.load(f + KX) * _HALF_LOG2_E, tl.load(f + KY) * _HALF_LOG2_E, tl.load(f + KZ) * _HALF_LOG2_E
+    kx, ky = scaled(tl.load(f + KX), COMPACT), scaled(tl.load(f + KY), COMPACT)
+    kz = scaled(tl.load(f + KZ), COMPACT)
     sxy, sxz, syz = tl.load(f + SXY), tl.load(f + SXZ), tl.load(f + SYZ)
     hx, hy, hz = tl.load(f + HX), tl.load(f + HY), tl.load(f + HZ)
     z_low, z_high, y_low = tl.load(box), tl.load(box + 1), tl.load(box + 2)
@@ -190,10 +197,10 @@ def _moments(  # type: ignore[no-untyped-def]
                 inside = (iz < z_high) & (iy < y_high) & (ix < x_high)
                 inside = inside & (tl.abs(dx) <= hx) & (tl.abs(dy) <= hy) & (tl.abs(dz) <= hz)
                 t, v = dx + sxy * dy + sxz * dz, dy - syz * dz
-                weight = tl.exp2(kx * t * t + ky * v * v + kz * dz * dz)
-                g = tl.load(gradient + (iz.to(tl.int64) * ny + iy) * nx + ix, inside, 0.0) * weight
-                gt, gv, gz = g * t, g * v, g * dz
-                n0, nt, nv, nz = n0 + g, nt + gt, nv + gv, nz + gz
+                value, slope = body(kx * t * t + ky * v * v + kz * dz * dz, COMPACT)
+                g = tl.load(gradient + (iz.to(tl.int64) * ny + iy) * nx + ix, inside, 0.0)
+                gt, gv, gz = g * slope * t, g * slope * v, g * slope * dz
+                n0, nt, nv, nz = n0 + g * value, nt + gt, nv + gv, nz + gz
                 ntt, ntv, ntz = ntt + gt * t, ntv + gt * v, ntz + gt * dz
                 nvv, nvz, nzz = nvv + gv * v, nvz + gv * dz, nzz + gz * dz
     m = moments + 10 * i
@@ -263,7 +270,8 @@ def fill_backward(
     edge_z, _, edge_x = placed.grid.spacing
     moments = placed.table.new_empty((n, 10))
     _moments[(n,)](
-        placed.table, placed.boxes, gradient, moments, ny, nx, DEEP=_DEEP, HIGH=_HIGH, WIDE=_WIDE, num_warps=1
+        placed.table, placed.boxes, gradient, moments, ny, nx, DEEP=_DEEP, HIGH=_HIGH, WIDE=_WIDE,
+        COMPACT=placed.kernel.is_compact, num_warps=1,
     )  # fmt: skip
     _backward[(triton.cdiv(n, _BLOCK),)](
         placed.table, moments, placed.boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations,

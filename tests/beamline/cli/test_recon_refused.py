@@ -60,6 +60,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "budget and loss": ({}, ["--budget", "30s", "--loss", "l2"], 2, "exclude"),
     "budget and early stop": ({}, ["--budget", "30s", "--early-stop"], 2, "exclude"),
     "following with a start": ({}, ["-m", "r2", "--follow", "--start", "tv"], 2, "finished scan"),
+    "kernel misspelt": ({}, ["-m", "r2", "--kernel", "box"], 2, "compact:1.5"),
     "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),
     "no such device": ({}, ["-m", "r2", "--device", "abacus"], 2, "--device abacus"),
     "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5 is not there"),
@@ -110,8 +111,8 @@ def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str,
 
 @pytest.mark.parametrize(
     "option",
-    ["--steps 5", "--seconds 5", "--gaussians 5", "--start tv", "--loss l2", "--device cuda", "--early-stop",
-     "--checkpoint fit.h5", "--resume scan.h5", "--budget 30s", "--quality best"],
+    ["--steps 5", "--seconds 5", "--gaussians 5", "--start tv", "--loss l2", "--kernel compact:1.5",
+     "--device cuda", "--early-stop",     "--checkpoint fit.h5", "--resume scan.h5", "--budget 30s", "--quality best"],
 )  # fmt: skip
 @pytest.mark.parametrize("method", ["fbp", "sirt"])
 def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str, method: str) -> None:

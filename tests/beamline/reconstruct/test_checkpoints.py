@@ -16,6 +16,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions, differences, fit_origin
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import Checkpoint, write_checkpoint
+from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of
 from recon.splatting.gaussians import Gaussians
@@ -25,6 +26,7 @@ from tests.beamline.scans import TwoCylinders, write_exchange
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
 OTHERS = {"seed": 1, "start": "fbp"}
 SETTINGS = FitSettings()
+OTHER = next(kernel for kernel in Kernel if kernel is not SETTINGS.kernel)
 
 
 @pytest.fixture
@@ -54,6 +56,7 @@ CHANGES: dict[str, tuple[Callable[[PreparedProjections], PreparedProjections], F
     "pixel_pitch": (lambda p: replace(p, geometry=replace(p.geometry, pixel_pitch=2.0)), SETTINGS, OTHERS),
     "length_unit": (lambda p: replace(p, length_unit="px"), SETTINGS, OTHERS),
     "loss": (lambda p: p, replace(SETTINGS, loss="l2"), OTHERS),
+    "kernel": (lambda p: p, replace(SETTINGS, kernel=OTHER), OTHERS),
     "policy": (lambda p: p, replace(SETTINGS, policy=None), OTHERS),
     "seed": (lambda p: p, SETTINGS, {**OTHERS, "seed": 2}),
     "start": (lambda p: p, SETTINGS, {**OTHERS, "start": "tv"}),
@@ -76,6 +79,17 @@ def test_fewer_views_are_told_by_number(prepared: PreparedProjections) -> None:
     )
     found = differences(fit_origin(few, SETTINGS, OTHERS), fit_origin(prepared, SETTINGS, OTHERS))
     assert "n_views (20, 30 in the checkpoint)" in found
+
+
+def test_a_checkpoint_that_names_no_kernel_is_of_gaussians(tmp_path: Path, prepared: PreparedProjections) -> None:
+    origin = fit_origin(prepared, replace(SETTINGS, kernel=Kernel.GAUSSIAN), OTHERS)
+    older = {name: value for name, value in origin.items() if name != "setting kernel"}
+    state = {name: values for name, values in _state().items() if name != "kernel_exponent"}
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, older, 100))
+    resumed = CheckpointOptions(None, tmp_path / "fit.h5")
+    assert resumed.begin(origin, 100, lambda said: None) is not None
+    with pytest.raises(DataError, match=r"kernel \(compact:1.5, gaussian in the checkpoint\)"):
+        resumed.begin(fit_origin(prepared, replace(SETTINGS, kernel=Kernel.COMPACT), OTHERS), 100, lambda said: None)
 
 
 def test_views_held_out_do_not_matter(prepared: PreparedProjections) -> None:

@@ -30,6 +30,7 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.methods import build, by_name
 from recon.splatting.problem import Loss
@@ -323,12 +324,13 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
     assert np.isfinite(record.history["held_out"][-1])
 
 
-@pytest.mark.parametrize("loss", ["l2", "poisson"])
-def test_every_loss_is_fitted_and_kept(tmp_path: Path, loss: Loss) -> None:
-    method = replace(R2_FIT, start="tv", fit=FitSettings(loss=loss))
+@pytest.mark.parametrize(("loss", "kernel"), [("l2", Kernel.GAUSSIAN), ("poisson", Kernel.COMPACT)])
+def test_every_loss_and_kernel_is_fitted_and_kept(tmp_path: Path, loss: Loss, kernel: Kernel) -> None:
+    method = replace(R2_FIT, start="tv", fit=FitSettings(loss=loss, kernel=kernel))
     metrics = reconstruct_file(_options(tmp_path, **{**FIT, "method": method}), lambda e: None, SystemClock())
     parameters = read_reconstruction(tmp_path / "out.h5").parameters
     assert (parameters["loss"], parameters["start"], parameters["device"]) == (loss, "tv", "cpu")
+    assert parameters["kernel"] == kernel.value
     assert metrics["residual"] < 0.2
 
 

@@ -59,10 +59,10 @@ def compare(
     fast, double = as_leaves(g, device), in_double(g)
     kernel: Kernel = "cpu" if device is None else "gpu"
     if isinstance(where, Grid):
-        found, expected = voxelize(fast, where, truncation=WHOLE, kernel=kernel), voxelize(double, where)
+        found, expected = voxelize(fast, where, truncation=WHOLE, implementation=kernel), voxelize(double, where)
         weight = float(g.densities.max())
     else:
-        found = project(fast, where, truncation=WHOLE, model=model, kernel=kernel)
+        found = project(fast, where, truncation=WHOLE, model=model, implementation=kernel)
         expected = project(double, where, model=model)
         weight = float((g.densities * g.scales.amin(1)).max()) * math.sqrt(2 * math.pi)
     y = torch.from_numpy(np.random.default_rng(seed).normal(size=tuple(expected.shape)))

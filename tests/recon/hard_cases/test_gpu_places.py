@@ -29,7 +29,11 @@ def test_far_outside_there_is_nothing_and_no_gradient(far: float) -> None:
     places = [(far, 0.0, 3.0), (-far, 0.0, 3.0), (3.0, 0.0, far), (far, far, far)]
     for where in (BEAMS["parallel"], GRID):
         g = as_leaves(at(places, 1.1), DEVICE)
-        image = voxelize(g, where, kernel="gpu") if isinstance(where, Grid) else project(g, where, kernel="gpu")
+        image = (
+            voxelize(g, where, implementation="gpu")
+            if isinstance(where, Grid)
+            else project(g, where, implementation="gpu")
+        )
         assert not image.any()
         image.sum().backward()
         assert all(not slope.any() for slope in gradients(g).values())
@@ -67,8 +71,8 @@ def test_at_the_source_and_behind_it_there_is_nothing(model: RayModel | None) ->
     hidden = [(0.0, -10.0, 0.0), (0.0, -9.999, 0.0), (0.3, -10.0, 0.1), (0.0, -15.0, 0.0), (1.0, -1e6, 0.0)]
     both = at([(1.0, 0.0, 2.0), (-3.0, 4.0, 1.0), *hidden], 0.5)
     g, rest = as_leaves(both, DEVICE), as_leaves(both.select(torch.arange(2)), DEVICE)
-    image = project(g, SOURCE, model=model, kernel="gpu")
-    expected = project(rest, SOURCE, model=model, kernel="gpu")
+    image = project(g, SOURCE, model=model, implementation="gpu")
+    expected = project(rest, SOURCE, model=model, implementation="gpu")
     np.testing.assert_array_equal(image.detach().cpu(), expected.detach().cpu())
     image.sum().backward()
     for slope in gradients(g).values():
@@ -83,7 +87,7 @@ def test_anywhere_before_a_source_all_is_finite(model: RayModel | None) -> None:
     sigma = 10 ** rng.uniform(-3, 2, 15)
     one = Gaussians.from_physical(places, sigma[:, None] * rng.uniform(0.7, 1.4, (15, 3)), np.full(15, 0.8))
     g = as_leaves(one, DEVICE)
-    image = project(g, SOURCE, model=model, kernel="gpu")
+    image = project(g, SOURCE, model=model, implementation="gpu")
     assert torch.isfinite(image).all() and float(image.detach().min()) >= 0
     assert float(image.detach().max()) <= 1.001 * 0.8 * math.sqrt(2 * math.pi) * 1.4 * sigma.sum()
     image.sum().backward()
@@ -97,8 +101,8 @@ def test_a_density_of_zero_or_too_small_for_float32_is_nothing() -> None:
     faint = as_leaves(Gaussians(g.means, g.log_scales, g.quaternions, raw, 0.7), DEVICE)
     alone = faint.select(torch.tensor([4], device=DEVICE))
     for where, picture in ((BEAMS["parallel"], project), (GRID, voxelize)):
-        image = picture(faint, where, kernel="gpu")  # type: ignore[operator]
-        expected = picture(alone, where, kernel="gpu")  # type: ignore[operator]
+        image = picture(faint, where, implementation="gpu")  # type: ignore[operator]
+        expected = picture(alone, where, implementation="gpu")  # type: ignore[operator]
         np.testing.assert_array_equal(image.detach().cpu(), expected.detach().cpu())
         image.sum().backward()
     slopes = gradients(faint)
@@ -112,7 +116,7 @@ def test_units_of_density_at_the_ends_of_float32(unit: float) -> None:
     g = some((1.0, 0.7, 1.3), 2)
     odd = Gaussians(g.means, g.log_scales, g.quaternions, torch.zeros(2), unit)
     leaves = as_leaves(odd, DEVICE)
-    image = project(leaves, BEAMS["parallel"], kernel="gpu")
+    image = project(leaves, BEAMS["parallel"], implementation="gpu")
     expected = project(in_double(odd), BEAMS["parallel"]).detach()
     assert torch.isfinite(image).all()
     assert float((image.detach().cpu() - expected).abs().max()) <= 3e-3 * float(expected.max()) + 1e-37
@@ -127,7 +131,7 @@ def test_a_dynamic_range_of_1e8_leaves_each_pixel_its_digits() -> None:
     view = Geometry.parallel([0.0], (5, 8 * n), 1.0, 0.0, axis_row=0.0)
     places = np.stack((8 * np.arange(n) + 3.3, np.zeros(n), np.full(n, 2.2)), 1)
     g = Gaussians.from_physical(places, np.full(n, 0.6), size, density_unit=1.0)
-    found = project(as_leaves(g, DEVICE), view, truncation=WHOLE, kernel="gpu").detach().cpu().double()[0]
+    found = project(as_leaves(g, DEVICE), view, truncation=WHOLE, implementation="gpu").detach().cpu().double()[0]
     expected = project(in_double(g), view).detach()[0]
     for k in range(n):
         part = slice(8 * k, 8 * k + 8)
@@ -142,7 +146,7 @@ def test_a_pile_at_one_pixel_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> 
     groups, weight = 200, 1 + 0.9 * 2.0**-17
     one = Gaussians.from_physical([[0.0, 0.0, 0.0]], [0.9], [weight / (0.9 * math.sqrt(2 * math.pi))])
     pile = as_leaves(one.select(torch.zeros(groups * images._GROUP, dtype=torch.int64)), DEVICE)
-    shown = project(pile, Geometry.parallel([0.0], (1, 1), 1.0), truncation=WHOLE, kernel="gpu")
+    shown = project(pile, Geometry.parallel([0.0], (1, 1), 1.0), truncation=WHOLE, implementation="gpu")
     off = abs(float(shown.detach()) / (groups * images._GROUP * weight) - 1)
     assert off < 16 * STEP  # of it the weight's own: a dozen roundings
     one_by_one = np.cumsum(np.full(groups, weight, np.float32), dtype=np.float32)[-1]

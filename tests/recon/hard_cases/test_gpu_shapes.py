@@ -104,7 +104,11 @@ def test_gaussians_larger_than_the_field(sigma: float) -> None:
 def test_a_covariance_that_is_singular_to_rounding_is_finite(shape: Shape) -> None:
     for where in (*BEAMS.values(), GRID):
         g = as_leaves(some(shape, 6), DEVICE)
-        image = voxelize(g, where, kernel="gpu") if isinstance(where, Grid) else project(g, where, kernel="gpu")
+        image = (
+            voxelize(g, where, implementation="gpu")
+            if isinstance(where, Grid)
+            else project(g, where, implementation="gpu")
+        )
         assert torch.isfinite(image).all() and float(image.detach().min()) >= 0
         assert float(image.detach().max()) <= 6 * math.sqrt(2 * math.pi) * max(shape)
         image.sum().backward()
@@ -147,8 +151,10 @@ def test_a_quaternion_of_no_length_is_no_rotation_and_feels_nothing(length: floa
         as_leaves(Gaussians(g.means, g.log_scales, q, g.raw_densities, g.density_unit), DEVICE)
         for q in (still, identity)
     )
-    image = project(leaves, BEAMS["parallel"], kernel="gpu")
-    np.testing.assert_array_equal(image.detach().cpu(), project(plain, BEAMS["parallel"], kernel="gpu").detach().cpu())
+    image = project(leaves, BEAMS["parallel"], implementation="gpu")
+    np.testing.assert_array_equal(
+        image.detach().cpu(), project(plain, BEAMS["parallel"], implementation="gpu").detach().cpu()
+    )
     image.sum().backward()
     slopes = gradients(leaves)
     assert not slopes["quaternions"].any() and all(torch.isfinite(slope).all() for slope in slopes.values())

@@ -25,7 +25,7 @@ _ARRAYS = (
 # Those that other kernels call.
 _PARTS = {
     "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion",
-    "_softplus", "_sigmoid", "_adam_one",
+    "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body",
 }  # fmt: skip
 
 
@@ -50,20 +50,27 @@ def _compile_all() -> None:
     from recon.kernels.gpu import footprints, images, losses, parameters, rays, voxels
 
     block, pixels = {"BLOCK": footprints._BLOCK}, {"BLOCK": losses._BLOCK}
-    wanted = [
+    of_a_kernel = [
         (footprints, "_footprints", 4, block | {"CONE": False}),
         (footprints, "_footprints", 4, block | {"CONE": True}),
-        (footprints, "_footprints_backward", 4, block | {"CONE": False}),
-        (footprints, "_footprints_backward", 4, block | {"CONE": True}),
         (images, "_render", 2, {"EDGE": images._EDGE, "GROUP": images._GROUP, "MANY": images._MANY}),
         (images, "_moments", 1, {"HIGH": images._BLOCK[0], "WIDE": images._BLOCK[1]}),
         (rays, "_terms", 4, block),
         (rays, "_render", 2, {"EDGE": rays._EDGE, "GROUP": rays._GROUP}),
         (rays, "_sums", 1, {"HIGH": rays._PIXELS[0], "WIDE": rays._PIXELS[1]}),
-        (rays, "_bend", 4, block),
         (voxels, "_placed", 4, block),
         (voxels, "_fill", 4, {"EDGE": voxels._EDGE, "GROUP": voxels._GROUP}),
         (voxels, "_moments", 1, {"DEEP": voxels._DEEP, "HIGH": voxels._HIGH, "WIDE": voxels._WIDE}),
+    ]
+    wanted = [
+        *(
+            (module, name, warps, constants | {"COMPACT": compact})
+            for module, name, warps, constants in of_a_kernel
+            for compact in (False, True)
+        ),
+        (footprints, "_footprints_backward", 4, block | {"CONE": False}),
+        (footprints, "_footprints_backward", 4, block | {"CONE": True}),
+        (rays, "_bend", 4, block),
         (voxels, "_backward", 4, block | {"MEANS": True}),
         (losses, "_blur", 4, pixels | {"ACROSS": True}),
         (losses, "_blur", 4, pixels | {"ACROSS": False}),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of, state_from
@@ -44,12 +45,24 @@ def test_a_fit_taken_up_again_is_the_fit_that_was_not_left(random_gaussians: Mak
     assert whole.n > 20  # density control drew random numbers on the way
 
 
+@pytest.mark.parametrize("kernel", Kernel)
+def test_the_kernel_is_kept_and_an_older_checkpoint_is_of_gaussians(random_gaussians: Make, kernel: Kernel) -> None:
+    arrays = arrays_of(fit.init(random_gaussians(5, kernel=kernel), 0))
+    assert fit.gaussians_of(state_from(arrays)).kernel is kernel
+    del arrays["kernel_exponent"]
+    assert state_from(arrays).kernel is Kernel.GAUSSIAN
+
+
 def test_what_is_no_checkpoint_is_refused(random_gaussians: Make) -> None:
     arrays = arrays_of(fit.init(random_gaussians(5), 0))
     with pytest.raises(ValueError, match=r"first\.means.* missing"):
         state_from({k: v for k, v in arrays.items() if k != "first.means"})
     with pytest.raises(ValueError, match="shape"):
         state_from({**arrays, "second.raw": arrays["second.raw"][:-1]})
+    with pytest.raises(ValueError, match="kernel_exponent"):
+        state_from({**arrays, "kernel_exponent": np.ones(2)})
+    with pytest.raises(ValueError, match="no kernel of exponent 7"):
+        state_from({**arrays, "kernel_exponent": np.array(7.0)})
     with pytest.raises(ValueError, match="not finite"):
         state_from({**arrays, "parameters.raw": np.full(5, np.nan, np.float32)})
     other = fit.init(random_gaussians(5), np.random.Generator(np.random.MT19937(0)))

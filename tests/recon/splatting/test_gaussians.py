@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from recon.base.kernel import Kernel
 from recon.splatting.gaussians import Gaussians, inverse_softplus
 from tests.recon.conftest import Make
 
@@ -23,12 +24,16 @@ def test_inverse_softplus_is_the_inverse(value: float) -> None:
     assert np.logaddexp(0, inverse_softplus(np.asarray(value))) == pytest.approx(value, rel=1e-9)
 
 
-def test_a_checkpoint_restores_every_bit(random_gaussians: Make) -> None:
-    g = random_gaussians()
+@pytest.mark.parametrize("kernel", Kernel)
+def test_a_checkpoint_restores_every_bit(random_gaussians: Make, kernel: Kernel) -> None:
+    g = random_gaussians(kernel=kernel)
     back = Gaussians.from_arrays(g.arrays())
     for name in ("means", "log_scales", "quaternions", "raw_densities"):
         assert torch.equal(getattr(g, name), getattr(back, name))
-    assert g.density_unit == back.density_unit
+    assert (g.density_unit, g.kernel) == (back.density_unit, back.kernel)
+    assert g.select(torch.tensor([2, 0])).kernel is kernel
+    older = {name: values for name, values in g.arrays().items() if name != "kernel_exponent"}
+    assert Gaussians.from_arrays(older).kernel is Kernel.GAUSSIAN
 
 
 def test_an_incomplete_checkpoint_is_refused(random_gaussians: Make) -> None:

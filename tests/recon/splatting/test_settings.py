@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
@@ -18,12 +19,18 @@ def test_settings_out_of_range_are_refused() -> None:
         {"views_per_step": 0}, {"coarse": 0}, {"coarse": 2.5}, {"tv_size": 0}, {"tv_weight": -1.0},
         {"tv_weight": float("inf")}, {"ssim_weight": float("nan")}, {"pace": float("nan")}, {"pace": -1.0},
         {"decay": -1.0}, {"smallest": 0.0}, {"coarse_until": 2.0}, {"rates": (1e-3, 1e-3, 1e-3)},
+        {"kernel": "box"},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=next(iter(bad))):
             FitSettings(**bad)  # type: ignore[arg-type]
     for wrong in ({"sigmas": -1.0}, {"sigmas": float("nan")}, {"faint": -1.0}, {"faint": float("inf")}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Truncation(**wrong)
+
+
+def test_a_kernel_goes_by_its_name() -> None:
+    for kernel in Kernel:
+        assert FitSettings(kernel=kernel.value).kernel is kernel  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("noise", "weight"), [(1e-4, 0.02), (2e-3, 0.05), (4e-3, 0.2), (0.1, 0.25)])

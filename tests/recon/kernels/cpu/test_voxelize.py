@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from recon.base.kernel import Kernel
 from recon.kernels import reference
 from recon.kernels.cpu.voxelize import Layout
 
@@ -33,14 +34,14 @@ def _axes(origin: tuple[float, ...], spacing: tuple[float, ...], shape: tuple[in
 
 
 def _reference(
-    model: Model, quaternions: F32, axes: tuple[torch.Tensor, ...]
+    model: Model, quaternions: F32, axes: tuple[torch.Tensor, ...], kernel: Kernel = Kernel.GAUSSIAN
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
     means, scales, _, densities = model
     leaves = [
         torch.from_numpy(a.astype(np.float64)).requires_grad_() for a in (means, np.log(scales), quaternions, densities)
     ]
     p, log_s, q, d = leaves
-    return reference.voxelize(p, log_s.exp(), q, d, axes), leaves  # type: ignore[arg-type]
+    return reference.voxelize(p, log_s.exp(), q, d, axes, kernel), leaves  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -98,15 +99,18 @@ def test_the_backward_pass_is_the_adjoint_in_density(rng: np.random.Generator) -
     assert abs(np.vdot(volume, g) - right) < 1e-5 * np.vdot(volume, np.abs(g))
 
 
+@pytest.mark.parametrize("kernel", Kernel)
 @pytest.mark.parametrize("scales", [(30.0, 0.3, 0.3), (20.0, 20.0, 0.3), (300.0, 0.5, 0.5), (0.05, 0.05, 0.05)])
-def test_needles_discs_and_dots_keep_their_digits(rng: np.random.Generator, scales: tuple[float, ...]) -> None:
+def test_needles_discs_and_dots_keep_their_digits(
+    rng: np.random.Generator, scales: tuple[float, ...], kernel: Kernel
+) -> None:
     (means, _, rotations, densities), quaternions = _model(rng, 6)
     thin = np.tile(np.array(scales, np.float32), (6, 1))
     if max(scales) < 0.1:
         means = (np.round(means) + 0.02).astype(np.float32)  # else no voxel sees them
     model = (means, thin, rotations, densities)
-    layout = Layout(*model, (-6.0, -6.0, -6.0), 1.0, (13, 13, 13), 0.0, 5.0)
-    expected = _reference(model, quaternions, _axes((-6.0,) * 3, (1.0,) * 3, (13, 13, 13)))[0].detach().numpy()
+    layout = Layout(*model, (-6.0, -6.0, -6.0), 1.0, (13, 13, 13), 0.0, 5.0, kernel)
+    expected = _reference(model, quaternions, _axes((-6.0,) * 3, (1.0,) * 3, (13, 13, 13)), kernel)[0].detach().numpy()
     assert expected.max() > 0.05
     # A float32 rotation turns a needle by 6e-8: at its end, ten voxels off, a few 1e-6 of the thin width's slope.
     np.testing.assert_allclose(layout.fill(), expected, atol=3e-5)
@@ -143,12 +147,15 @@ def test_nothing_to_place_is_an_empty_volume() -> None:
 sizes = st.floats(-5, 5).map(lambda x: 10**x)
 
 
-@given(sizes, sizes, sizes, st.floats(-20, 20), st.floats(-20, 20), st.integers(0, 2**31), sizes)
-def test_any_gaussian_is_finite(a: float, b: float, c: float, x: float, z: float, seed: int, edge: float) -> None:
+@given(sizes, sizes, sizes, st.floats(-20, 20), st.floats(-20, 20), st.integers(0, 2**31), sizes, st.booleans())
+def test_any_gaussian_is_finite(
+    a: float, b: float, c: float, x: float, z: float, seed: int, edge: float, compact: bool
+) -> None:
+    kernel = Kernel.COMPACT if compact else Kernel.GAUSSIAN
     (means, _, rotations, _), _ = _model(np.random.default_rng(seed), 1)
     means[0] = x, 0.3, z
     model = (means, np.array([[a, b, c]], np.float32), rotations, np.ones(1, np.float32))
-    layout = Layout(*model, (-4.0, -3.0, -2.0), (edge, 1.0, 1.0), (5, 7, 9), 1e-6, 3.5)
+    layout = Layout(*model, (-4.0, -3.0, -2.0), (edge, 1.0, 1.0), (5, 7, 9), 1e-6, 3.5, kernel)
     volume = layout.fill()
     assert np.isfinite(volume).all() and volume.min() >= 0 and volume.max() <= 1.0001
     into = [np.zeros(s, np.float32) for s in ((1, 3), (1, 3), (1, 9), (1,))]

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
@@ -19,8 +20,8 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
-from tests.recon.helpers import as_leaves, in_double
-from tests.recon.kernels.gpu.on_gpu import DEVICE, UNIT, cone, parallel
+from tests.recon.helpers import as_leaves, gradients, in_double
+from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, EXACT, UNIT, cone, parallel
 
 gpu = importlib.import_module("recon.kernels.gpu")
 
@@ -39,14 +40,16 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettin
 
 
 @pytest.mark.parametrize(
-    ("make", "changes"),
+    ("make", "kernel", "changes"),
     [
-        (parallel, {"loss": "poisson", "views_per_step": 2}),
-        (cone, {"loss": "l1", "rays": RayModel(exact_above=0.05)}),
+        (parallel, Kernel.GAUSSIAN, {"loss": "poisson", "views_per_step": 2}),
+        (cone, Kernel.COMPACT, {"loss": "l1", "rays": RayModel(exact_above=0.05)}),
     ],
 )
-def test_a_fit_is_the_same_on_both_backends(make: object, changes: dict, random_gaussians: Make) -> None:
-    g, geometry = random_gaussians(14, 6.0), make((11, 14))  # type: ignore[operator]
+def test_a_fit_is_the_same_on_both_backends(
+    make: object, kernel: Kernel, changes: dict, random_gaussians: Make
+) -> None:
+    g, geometry = random_gaussians(14, 6.0, kernel=kernel), make((11, 14))  # type: ignore[operator]
     # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.
     policy = DensityPolicy(start=0.0, stop=1.0, every=2, threshold=1e-4, prune_below=0.3)
     settings = FitSettings(
@@ -72,12 +75,12 @@ def test_project_and_voxelize_go_where_they_are_sent(random_gaussians: Make) -> 
     g, geometry, grid = random_gaussians(9, 8.0), cone(), Grid((4, 6, 5), 0.9)
     model, cut = RayModel(exact_above=0.05), Truncation(9.0, 1e-12)
     there = as_leaves(g, DEVICE)
-    shown = project(there, geometry, truncation=cut, model=model, kernel="gpu").detach().cpu()
+    shown = project(there, geometry, truncation=cut, model=model, implementation="gpu").detach().cpu()
     np.testing.assert_allclose(shown, project(g, geometry, truncation=cut, model=model), rtol=1e-4, atol=1e-5)
-    dense = voxelize(there, grid, truncation=cut, kernel="gpu").detach().cpu()
+    dense = voxelize(there, grid, truncation=cut, implementation="gpu").detach().cpu()
     np.testing.assert_allclose(dense, voxelize(g, grid, truncation=cut), rtol=1e-4, atol=1e-6)
-    with pytest.raises(ValueError, match="gpu kernel works in float32"):
-        project(in_double(g), geometry, kernel="gpu")
+    with pytest.raises(ValueError, match="gpu implementation works in float32"):
+        project(in_double(g), geometry, implementation="gpu")
 
 
 def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,3 +99,20 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(ValueError, match=rf"{absent} was asked for, and torch sees 2 CUDA devices.*ask for cuda"):
             gpu.require(absent)
     assert gpu.require("cuda:0") == torch.device("cuda:0")
+
+
+@pytest.mark.parametrize("model", [AFFINE, EXACT], ids=["affine", "exact"])
+def test_a_compact_kernel_and_its_gradients_equal_the_reference(model: RayModel, random_gaussians: Make) -> None:
+    g, geometry, grid = random_gaussians(5, 5.0, kernel=Kernel.COMPACT), cone((9, 12)), Grid((3, 4, 3), 0.9)
+    fast, double = as_leaves(g, DEVICE), in_double(g)
+    for seen, expected in (
+        (project(fast, geometry, model=model, implementation="gpu"), project(double, geometry, model=model)),
+        (voxelize(fast, grid, implementation="gpu"), voxelize(double, grid)),
+    ):
+        found = seen.detach().cpu().double()
+        assert float((found - expected.detach()).abs().max()) < 3e-6 * float(expected.detach().max())
+        weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
+        (seen * weights.float().to(DEVICE)).sum().backward()
+        (expected * weights).sum().backward()
+    for name, gradient in gradients(double).items():
+        assert float((gradients(fast)[name] - gradient).abs().max()) < 2e-5 * float(gradient.abs().max()), name
