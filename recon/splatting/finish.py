@@ -68,7 +68,7 @@ def finish(
     can explain the views. Where they cannot, because pixels are coarse, the noise is low or matter lies outside the
     box, they would bend the volume (-6 dB on a teapot of 10⁵ photons, -12 dB on a region of interest). So where the
     projection of the voxels at the start differs from that of the Gaussians by more than 0.6 of the noise, and the
-    sweeps leave more than 1.4 times the noise, the sweeps are tried anew on p - G + A x: measured views p less the
+    sweeps leave more than the fit or 1.4 times the noise, they are tried anew on p - G + A x: measured views p less the
     views G of the Gaussians plus the projection A x of the voxels at the start; what voxels cannot explain then counts
     as noise. Of the two volumes the one is taken that explains its views better.
 
@@ -105,13 +105,14 @@ def finish(
             on_iteration=lambda *_: should_stop is not None and should_stop(), seed=problem.seed,
         )  # fmt: skip
 
+    fitted = _deviation(data - model, known)
     model -= projector.forward(start.data)
     noise, unlike = noise_level(data), float(np.std(model, dtype=np.float64))
     found = refined(data)
     if unlike <= _DIFFERENT * noise:
         return found
     left = _deviation(data - projector.forward(found.data), known)
-    if left <= _EXPLAINED * noise_level(whitened(data, known)):
+    if left <= min(fitted, _EXPLAINED * noise_level(whitened(data, known))):
         return found
     if should_stop is not None and should_stop():
         return volume
