@@ -107,12 +107,12 @@ def finish(
 
     fitted = _deviation(data - model, known)
     model -= projector.forward(start.data)
-    noise, unlike = noise_level(data), float(np.std(model, dtype=np.float64))
+    noise, unlike = noise_level(whitened(data, known)), _deviation(model, known)
     found = refined(data)
     if unlike <= _DIFFERENT * noise:
         return found
     left = _deviation(data - projector.forward(found.data), known)
-    if left <= min(fitted, _EXPLAINED * noise_level(whitened(data, known))):
+    if left <= min(fitted, _EXPLAINED * noise):
         return found
     if should_stop is not None and should_stop():
         return volume
