@@ -19,11 +19,14 @@ from beamline.config.monitor import configured_checks
 from beamline.config.references import reference_limits
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Event, fan_out
+from beamline.core.files import refuse_existing, whole_file
 from beamline.core.text import spans
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
+from beamline.projections.flagged_frames import worst_frames
 from beamline.projections.replay import Kind, by_kind, counts_of, replay
-from beamline.storage.flag_legend import counted
+from beamline.report.contact_sheet import contact_sheet
+from beamline.storage.flag_legend import FrameFlags, Mark, counted, mark_of
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.references import reference_groups
 from drivers.clock import SystemClock
@@ -40,10 +43,21 @@ UNITS = {check.name: check.unit for check in CHECKS}
     help="Configuration whose sections `monitor` and `references` give the limits. Default: those of a new scan.",
 )
 @set_option
+@click.option(
+    "--sheet",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write a picture of the worst frames with the regions of their flags to this new PNG file.",
+)
 @scan_options
 @json_option
 def monitor(
-    file: Path, follow: bool, config: Path | None, overrides: tuple[str, ...], as_json: bool, **said: Any
+    file: Path,
+    follow: bool,
+    config: Path | None,
+    overrides: tuple[str, ...],
+    sheet: Path | None,
+    as_json: bool,
+    **said: Any,
 ) -> None:
     """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.
 
@@ -54,6 +68,8 @@ def monitor(
     """
     if overrides and config is None:
         raise click.UsageError("--set changes a value of the configuration: give --config too.")
+    if sheet is not None:
+        refuse_existing(sheet)
     clock = SystemClock()
     with json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         checks, limits = CHECKS, None
@@ -63,11 +79,13 @@ def monitor(
         sink = fan_out(*(json_sinks or [terminal]))
         progress = counting("monitor", sink, clock)
         flags: list[Flag] = []
+        marks: list[Mark] = []
         active: set[tuple[str, Level]] = set()
         n = 0
         with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
             for judged in replay(source, checks, follow=clock if follow else None, should_stop=stopped):
                 n += 1
+                marks.append(mark_of(judged.flags))
                 if not follow:
                     progress(n, judged.n)
                 now = {(flag.check, flag.level) for flag in judged.flags}
@@ -79,6 +97,9 @@ def monitor(
             references = []
             if source.quantity == "counts":
                 references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
+            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_marks(marks))):
+                with whole_file(sheet) as partial:
+                    partial.write_bytes(contact_sheet(worst))
         for fault in references:
             sink(Event("warning", clock.now(), {"message": fault}))
         kinds = by_kind(flags)

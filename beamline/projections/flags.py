@@ -25,12 +25,14 @@ class UsableViews:
         weights: float32 [frame of the file], of each row that is a view; None: one for all.
         left_out: views with an alarm, which are not among them.
         said: what was done, in a line; empty where no view is flagged.
+        flags: of all frames, which this follows from; None where there are none.
     """
 
     frames: NDArray[np.int64]
     weights: NDArray[np.float32] | None = None
     left_out: int = 0
     said: str = ""
+    flags: FrameFlags | None = None
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """[view] weights of some rows of the file; None where they all weigh the same."""
@@ -48,13 +50,13 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     views, flags = source.image_key == FrameKind.PROJECTION, source.flags if judged is None else judged
     rows = np.flatnonzero(views)
     if flags is None or not flags.flagged[rows].any():
-        return UsableViews(rows)
+        return UsableViews(rows, flags=flags)
     alarmed = views & flags.alarmed
     warned = views & flags.flagged & ~alarmed
     if not use_flags:
         n = f"{alarmed.sum()} views with an alarm and {warned.sum()} with a warning"
         said = f"--flags ignore: {n} are used as they are."
-        return UsableViews(rows, said=said)
+        return UsableViews(rows, said=said, flags=flags)
     parts = []
     if alarmed.any():
         parts.append(f"{alarmed.sum()} have an alarm and are left out ({counted(flags.of(alarmed).counts())})")
@@ -63,4 +65,4 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
         parts.append(f"{warned.sum()} have a warning and weigh half ({counted(flags.of(warned).counts())})")
         weights = np.where(warned, np.float32(WARNED_WEIGHT), np.float32(1))
     said = f"Of {rows.size} views {', '.join(parts)}. --flags ignore takes all alike."
-    return UsableViews(np.flatnonzero(views & ~alarmed), weights, int(alarmed.sum()), said)
+    return UsableViews(np.flatnonzero(views & ~alarmed), weights, int(alarmed.sum()), said, flags)

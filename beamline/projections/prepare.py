@@ -21,6 +21,7 @@ from beamline.projections.selection import (
     pixel_size,
     unbinned,
 )
+from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
@@ -51,6 +52,7 @@ class PreparedProjections:
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
         left_out: views with an alarm of the monitor, which are not among those that the selection chose from.
+        flags: of all frames of the scan; None where there are none.
     """
 
     projections: Projections
@@ -63,6 +65,7 @@ class PreparedProjections:
     quantity: str
     view_weights: NDArray[np.float32] | None = None
     left_out: int = 0
+    flags: FrameFlags | None = None
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
         """Weights [view, row, col], read-only; None: one for all rays.
@@ -181,6 +184,7 @@ def assemble(
         quantity=source.quantity,
         view_weights=usable.weights_of(projections.view_ids),
         left_out=usable.left_out,
+        flags=usable.flags,
     )
 
 

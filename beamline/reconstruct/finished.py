@@ -58,8 +58,8 @@ def reconstruct_file(
                     "frames that are there with --unfinished."
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
-        facts = facts_of(source)
         prepared = prepare_projections(source, options.selection, warn)
+        facts = facts_of(source, prepared.flags)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_SHARE, advice="leave out --early-stop")

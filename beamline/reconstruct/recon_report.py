@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from beamline.projections.flagged_frames import reasons, worst_frames
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.report import figures
+from beamline.report.contact_sheet import FlaggedFrame, contact_sheet
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, residual_curve
-from beamline.storage.flag_legend import counted
+from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.open import ScanSource
-from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.writers.recon_file import Value
 from drivers.frame import FrameKind
 from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
@@ -39,7 +40,8 @@ class ScanFacts:
         sample: its name, where the file tells.
         table: facts for people, by name.
         frames: frames there are of those triggered, e.g. "110/110".
-        remarks: what the file says went wrong while it was taken.
+        remarks: what went wrong while it was taken, by what is in the file.
+        flagged: the worst of the flagged frames.
     """
 
     path: Path
@@ -48,6 +50,7 @@ class ScanFacts:
     table: Mapping[str, str]
     frames: str
     remarks: Sequence[str] = ()
+    flagged: Sequence[FlaggedFrame] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +139,13 @@ def label_of(method: str) -> str:
     return by_name(method).label
 
 
-def facts_of(source: ScanSource) -> ScanFacts:
-    """Facts of an open scan."""
+def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
+    """Facts of an open scan; `flags` count in place of the file's."""
     counts = {kind: int(np.sum(source.image_key == kind)) for kind in FrameKind}
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
     pitch, energy = source.pixel_size_mm, source.energy_kev
-    missing, flags = int(attributes.get("missing_triggers", 0)), source.flags
+    missing, flags = int(attributes.get("missing_triggers", 0)), source.flags if flags is None else flags
     table = {
         "file": source.path.name,
         "format": source.format,
@@ -157,8 +160,9 @@ def facts_of(source: ScanSource) -> ScanFacts:
     }
     table |= {str(k): _text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n = int(source.image_key.size)
-    remarks = [finding.message for finding in frames_flagged(source)]
-    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks)
+    remarks = [] if flags is None else reasons(flags)
+    flagged = [] if flags is None else worst_frames(source, flags)
+    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks, flagged)
 
 
 def compose(
@@ -214,10 +218,20 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
-        pictures=_pictures(made, prepared, truth, volumes, left),
+        pictures=[*_pictures(made, prepared, truth, volumes, left), *_flagged(context.facts.flagged)],
         command=context.command,
         footnotes=footnotes,
     )
+
+
+def _flagged(frames: Sequence[FlaggedFrame]) -> list[Picture]:
+    if not frames:
+        return []
+    caption = (
+        "The worst of the frames that the monitor flagged, as the camera gave them, with the place of the flag if it "
+        "has one. Red: an alarm, the view is left out; orange: a warning, it weighs half."
+    )
+    return [Picture("Flagged frames", caption, contact_sheet(frames))]
 
 
 def _pictures(

@@ -136,13 +136,16 @@ class FrameFlags:
         regions = None if self.regions is None else np.pad(self.regions, ((n, 0), (0, 0), (0, 0)), constant_values=-1)
         return FrameFlags(bits, self.legend, scores, regions)
 
+    def rows(self, entry: FlagBit, level: Level) -> NDArray[np.intp]:
+        """Frames that a check flagged at this level."""
+        alarms = self.bits >> entry.alarm_bit & 1
+        return np.flatnonzero(alarms if level is Level.ALARM else self.bits >> entry.bit & 1 & ~alarms)
+
     def counts(self) -> dict[str, dict[str, int]]:
         """Frames by check and level, for the checks and levels that flagged any; a frame counts by its worst level."""
         found: dict[str, dict[str, int]] = {}
         for entry in self.legend:
-            alarms = self.bits >> entry.alarm_bit & 1
-            warns = self.bits >> entry.bit & 1 & ~alarms
-            by_level = {Level.WARN: int(warns.sum()), Level.ALARM: int(alarms.sum())}
+            by_level = {level: self.rows(entry, level).size for level in (Level.WARN, Level.ALARM)}
             if any(by_level.values()):
                 found[entry.name] = {str(level): n for level, n in by_level.items() if n}
         return found

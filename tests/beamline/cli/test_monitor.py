@@ -81,3 +81,10 @@ def test_files_that_cannot_be_read(here: Path, name: str) -> None:
     (here / "text.h5").write_text("no scan")
     result = beamline("monitor", name)
     assert result.exit_code == 5 and name in result.stderr
+
+
+def test_the_worst_frames_may_be_had_as_a_picture(here: Path) -> None:
+    assert beamline("monitor", "scan.h5", "--sheet", "sheet.png").exit_code == 7
+    assert (here / "sheet.png").read_bytes().startswith(b"\x89PNG")
+    again = beamline("monitor", "scan.h5", "--sheet", "sheet.png")
+    assert again.exit_code == 5 and "never overwritten" in again.stderr

@@ -147,11 +147,14 @@ def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None
     levels = {4 + i: Level.ALARM for i in range(8, 18)}
     frames = [replace(f, counts=np.full_like(f.counts, 101)) if f.index in levels else f for f in frames_of(SCAN)]
     write_flagged(folder / "flagged.h5", frames, levels, SCAN.pixel_size_mm)
-    plain = ("-m", "sirt", "--iterations", "40", "--axis", "20.7", "--air", "none", "--no-report")
+    plain = ("-m", "sirt", "--iterations", "40", "--axis", "20.7", "--air", "none")
     for name in ("use", "ignore"):
-        result = beamline("recon", "flagged.h5", *plain, "--flags", name, "-o", f"{name}.h5")
+        result = beamline("recon", "flagged.h5", *plain, "--flags", name, "-o", f"{name}.h5")  # with the report
         assert result.exit_code == 0, result.output
         assert ("10 have an alarm and are left out" in result.stderr) is (name == "use")
+    page = (folder / "use.html").read_text(encoding="utf-8")
+    assert "Alarm (beam): frames 12-21, worst 1 fraction of the reference light in frame 12: the light" in page
+    assert "<h2>Flagged frames</h2>" in page
     used, ignored = (read_reconstruction(folder / f"{name}.h5") for name in ("use", "ignore"))
     truth = SCAN.truth(used.volume.grid)
     assert psnr(truth, used.volume.data) > psnr(truth, ignored.volume.data) + 10

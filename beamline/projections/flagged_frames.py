@@ -1,0 +1,85 @@
+"""The worst of the flagged frames of a scan, as a report shows them, and the reason of every flag in words."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import spans
+from beamline.monitor.check import Level
+from beamline.report.contact_sheet import FlaggedFrame
+from beamline.storage.flag_legend import FlagBit, FrameFlags
+from beamline.storage.readers.base import ScanSource
+from drivers.frame import FrameKind
+from recon.base.binning import bin_views
+
+MOST = 12
+APART = 3  # frames of a kind that are shown are at least so far apart: neighbours look alike
+PIXELS = 200  # a side of a picture, about
+
+
+def reasons(flags: FrameFlags) -> list[str]:
+    """A line for each check and level: frames, worst score, what it means; alarms first."""
+    lines = []
+    for level in (Level.ALARM, Level.WARN):
+        for i, entry in enumerate(flags.legend):
+            rows = flags.rows(entry, level)
+            if not rows.size:
+                continue
+            worst = ""
+            if flags.scores is not None:
+                at = rows[np.nanargmax(np.abs(flags.scores[rows, i]))]
+                worst = f", worst {flags.scores[at, i]:.3g} {entry.unit} in frame {at}"
+            name = f"{str(level).capitalize()} ({entry.name})"
+            lines.append(f"{name}: frames {spans(rows.tolist())}{worst}: {entry.meaning}.")
+    return lines
+
+
+def worst_frames(source: ScanSource, flags: FrameFlags, most: int = MOST) -> list[FlaggedFrame]:
+    """The worst frames of each check and level in turn, alarms first, in the order of the file."""
+    ranked = [
+        _ranked(flags, i, entry, level) for level in (Level.ALARM, Level.WARN) for i, entry in enumerate(flags.legend)
+    ]
+    chosen: list[int] = []
+    for turn in zip_longest(*(rows for rows in ranked if rows)):
+        chosen += [row for row in turn if row is not None and row not in chosen]
+    return [_frame(source, flags, row) for row in sorted(chosen[:most])]
+
+
+def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list[int]:
+    rows = flags.rows(entry, level)
+    if flags.scores is not None:
+        rows = rows[np.argsort(-np.abs(flags.scores[rows, check]), kind="stable")]
+    apart: list[int] = []
+    for row in rows.tolist():
+        if all(abs(row - other) >= APART for other in apart):
+            apart.append(row)
+        if len(apart) == MOST:
+            break
+    return apart
+
+
+def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
+    angle = float(np.degrees(source.angles[row]))
+    kind = FrameKind(int(source.image_key[row])).name.lower()
+    said, regions, alarm = [], [], False
+    for i, entry in enumerate(flags.legend):
+        if not flags.bits[row] >> entry.bit & 1:
+            continue
+        is_alarm = bool(flags.bits[row] >> entry.alarm_bit & 1)
+        alarm = alarm or is_alarm
+        score = "" if flags.scores is None else f" {flags.scores[row, i]:.3g}"
+        said.append(f"{entry.name} {Level.ALARM if is_alarm else Level.WARN}{score}")
+        if flags.regions is not None and flags.regions[row, i, 0] >= 0:
+            top, bottom, left, right = flags.regions[row, i].tolist()
+            regions.append((top, bottom, left, right))
+    title = f"frame {row}, {kind}" + (f", {angle:.1f}°" if np.isfinite(angle) else "")
+    return FlaggedFrame(_small(source.read([row])[0]), source.shape, title, said, regions, alarm)
+
+
+def _small(image: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Pixels joined until there are few; rows and columns that do not fill a join go."""
+    factor = max(1, min(image.shape[1] // PIXELS, *image.shape))
+    return np.asarray(bin_views(np.nan_to_num(image.astype(np.float32))[None], factor)[0])

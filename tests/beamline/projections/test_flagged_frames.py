@@ -1,0 +1,64 @@
+"""The frames that a report shows: the worst of each kind, with place and reason; every flag's reason in words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS
+from beamline.projections.flagged_frames import reasons, worst_frames
+from beamline.report.contact_sheet import contact_sheet
+from beamline.storage.flag_legend import TODAY, FrameFlags, mark_of
+from tests.beamline.array_source import ArraySource
+
+ONE, TWO = CHECKS[0].name, CHECKS[1].name
+REGION = (1, 3, 40, 90)
+
+
+def flags() -> FrameFlags:
+    """30 frames: the first check warns of 5 to 20, with a score that rises; the second raises an alarm in 10 and 11."""
+    marks = []
+    for row in range(30):
+        said = [Flag(ONE, Level.WARN, row, 0.1 * row, 0.0, "")] if 5 <= row <= 20 else []
+        said += [Flag(TWO, Level.ALARM, row, -3.0 - row, 0.0, "", REGION)] if row in (10, 11) else []
+        marks.append(mark_of(said))
+    return FrameFlags.of_marks(marks)
+
+
+def source() -> ArraySource:
+    rng = np.random.default_rng(0)
+    return ArraySource(rng.integers(0, 999, (30, 6, 600)).astype(np.uint16), [0] * 30, np.radians(np.arange(30.0)))
+
+
+def test_every_flag_has_its_frames_its_worst_score_and_its_meaning() -> None:
+    one, two = TODAY[:2]
+    assert reasons(flags()) == [
+        f"Alarm ({two.name}): frames 10-11, worst -14 {two.unit} in frame 11: {two.meaning}.",
+        f"Warn ({one.name}): frames 5-20, worst 2 {one.unit} in frame 20: {one.meaning}.",
+    ]
+    bare = FrameFlags(flags().bits, TODAY)
+    assert reasons(bare)[0] == f"Alarm ({two.name}): frames 10-11: {two.meaning}."
+
+
+@pytest.mark.parametrize(("most", "rows"), [(2, [11, 20]), (3, [11, 17, 20]), (30, [5, 8, 11, 14, 17, 20])])
+def test_the_worst_of_each_kind_come_first(most: int, rows: list[int]) -> None:
+    found = worst_frames(source(), flags(), most)  # type: ignore[arg-type]
+    assert [frame.title for frame in found] == [f"frame {row}, projection, {row:.1f}°" for row in rows]
+    (worst,) = [frame for frame in found if "frame 11," in frame.title]
+    assert worst.alarm and worst.regions == [REGION]
+    assert worst.reasons == [f"{ONE} warn 1.1", f"{TWO} alarm -14"]
+    assert worst.image.shape == (2, 200) and worst.extent == (6, 600)
+
+
+def test_nothing_is_shown_where_nothing_is_flagged() -> None:
+    empty = FrameFlags.of_marks([mark_of(())] * 30)
+    assert (reasons(empty), worst_frames(source(), empty)) == ([], [])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("n", [1, 4, 5])
+def test_the_sheet_is_a_picture(n: int) -> None:
+    found = worst_frames(source(), flags(), n)  # type: ignore[arg-type]
+    assert len(found) == n
+    png = contact_sheet(found)
+    assert png.startswith(b"\x89PNG") and len(png) > 5000
