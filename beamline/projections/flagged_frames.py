@@ -29,8 +29,9 @@ def reasons(flags: FrameFlags) -> list[str]:
             if not rows.size:
                 continue
             worst = ""
-            if flags.scores is not None:
-                at = rows[np.nanargmax(np.abs(flags.scores[rows, i]))]
+            scored = rows if flags.scores is None else rows[np.isfinite(flags.scores[rows, i])]
+            if flags.scores is not None and scored.size:
+                at = scored[np.argmax(np.abs(flags.scores[scored, i]))]
                 worst = f", worst {flags.scores[at, i]:.3g} {entry.unit} in frame {at}"
             name = f"{str(level).capitalize()} ({entry.name})"
             lines.append(f"{name}: frames {spans(rows.tolist())}{worst}: {entry.meaning}.")

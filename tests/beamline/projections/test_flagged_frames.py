@@ -39,6 +39,8 @@ def test_every_flag_has_its_frames_its_worst_score_and_its_meaning() -> None:
     ]
     bare = FrameFlags(flags().bits, TODAY)
     assert reasons(bare)[0] == f"Alarm ({two.name}): frames 10-11: {two.meaning}."
+    unknown = FrameFlags(flags().bits, TODAY, np.full((30, len(CHECKS)), np.nan, np.float32), flags().regions)
+    assert reasons(unknown) == reasons(bare)
 
 
 @pytest.mark.parametrize(("most", "rows"), [(2, [11, 20]), (3, [11, 17, 20]), (30, [5, 8, 11, 14, 17, 20])])
