@@ -1,8 +1,15 @@
-"""Bands: rows that turn dark while the others do not, as after a readout fault or a lost packet."""
+"""Bands: rows or columns that lose or gain light at once while the others do not: a lost packet, a slit that moved.
+
+A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
+column is compared with what the views before let expect (it goes on as it did), and what all have in common is the
+beam's. A band has begun where a few lines jump; it lasts while these lines differ from those beside them as they did
+then.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -11,84 +18,180 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import light, thinned
+from beamline.monitor.preview import light
+from beamline.monitor.view import Region
 from drivers.frame import Frame, FrameKind
 
 CALIBRATION = 5  # frames of a kind before a verdict
-MEMORY = 0.2  # weight of the newest frame in the reference
-SIGMAS = 8.0
-PATIENCE = 20  # flagged frames in a row after which the change is the new normal: the sample, not the camera
+BEFORE = 3  # frames whose mean step is a line's velocity
+MEMORY = 0.1  # weight of the newest frame in a line's usual change
+SIGMAS = 10.0
+PATIENCE = 20  # flagged frames in a row after which the band is the new normal
+NARROW = 0.25  # of the lines: more of them that jump are no band but the beam or the sample
+REMAINS = 0.5  # of the jump, while the band lasts
+STANDS_OUT = 0.25  # of the jump, from both neighbours: an edge that passes is like one of them
+LEAST_LIGHT = 0.5  # counts
+
+Lines = NDArray[np.float64]
+Blocks = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Per preview row: the logarithm of its usual light, its usual change from frame to frame, and how often seen."""
+    """Lines of one kind of frames, along one axis.
 
-    usual: NDArray[np.float64]
-    change: NDArray[np.float64]
-    seen: int = 1
+    Attributes:
+        last: logarithms of the light of the last frames without a band, oldest first.
+        change: each line's usual change that its velocity does not explain.
+        blocks: [line, block] counts of the last frame without a band.
+        first, after: lines of the band that lasts; equal where there is none.
+        jump: by which they differ from the lines beside them, more than before it.
+        flagged: frames in a row with this band.
+    """
+
+    last: tuple[Lines, ...] = ()
+    change: Lines | None = None
+    seen: int = 0
+    blocks: Blocks = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    first: int = 0
+    after: int = 0
+    jump: float = 0.0
     flagged: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class BandsState:
-    """The profiles of projections and of flats, None before the first."""
+    """Profiles [kind][axis]: of projections and of flats, their rows and their columns."""
 
-    projection: Profile | None = None
-    flat: Profile | None = None
+    projection: tuple[Profile, Profile] = field(default_factory=lambda: (Profile(), Profile()))
+    flat: tuple[Profile, Profile] = field(default_factory=lambda: (Profile(), Profile()))
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Score: the largest fraction of light that a preview row has lost. A row's light is its median over columns."""
+    """Score: fraction of its light that a preview row or column has lost (negative: gained).
+
+    The default: two black rows across two preview blocks of 8 take an eighth of the light of each.
+    """
 
     name: ClassVar[str] = "bands"
     bit: ClassVar[int] = 3
-    unit: ClassVar[str] = "fraction of the row's light"
-    meaning: ClassVar[str] = "rows lost light against their own past while the other rows did not: a dark band"
+    unit: ClassVar[str] = "fraction of the line's light"
+    meaning: ClassVar[str] = "rows or columns lost or gained light against their own past while the others did not"
     policy: ClassVar[Policy] = Policy.LOG
 
     alarm: Annotated[
         float,
-        Field(ge=0, description="fraction of light that a preview row may lose against its past and the other rows"),
-    ] = 0.15
+        Field(ge=0, lt=1, description="fraction of light that a preview row or column may lose against the others"),
+    ] = 0.1
 
     def start(self) -> BandsState:
         return BandsState()
 
     def look(self, state: BandsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BandsState]:
-        if frame.kind is FrameKind.PROJECTION:
-            profile, flag = self._compare(state.projection, frame.index, digest, context)
-            return Look(replace(state, projection=profile), flag)
+        if frame.kind is FrameKind.PROJECTION and context.view is not None:
+            profiles, flag = self._both(
+                state.projection, frame, (context.view.rows, context.view.cols), digest, context
+            )
+            return Look(replace(state, projection=profiles), flag)
         if frame.kind is FrameKind.FLAT:
-            profile, flag = self._compare(state.flat, frame.index, digest, context)
-            return Look(replace(state, flat=profile), flag)
+            counts = light(digest.preview, context)
+            profiles, flag = self._both(state.flat, frame, (counts.mean(axis=1), counts.mean(axis=0)), digest, context)
+            return Look(replace(state, flat=profiles), flag)
         return Look(state)
 
+    def _both(
+        self,
+        profiles: tuple[Profile, Profile],
+        frame: Frame,
+        lines: tuple[Blocks, Blocks],
+        digest: FrameDigest,
+        context: ScanContext,
+    ) -> tuple[tuple[Profile, Profile], Flag | None]:
+        """Rows, then columns: the profiles after the frame, and the finding."""
+        dark = np.zeros((1, 1), np.float32) if context.dark is None else context.dark
+        dark = np.broadcast_to(dark, digest.preview.shape)
+        rows, row_band = self._compare(profiles[0], lines[0], digest.preview, dark)
+        cols, col_band = self._compare(profiles[1], lines[1], digest.preview.T, dark.T)
+        if row_band is None and col_band is None:
+            return (rows, cols), None
+        block = math.sqrt(frame.counts.size / digest.preview.size)
+        shape = frame.counts.shape
+        score, limit, region, word = 0.0, 0.0, (0, 0, 0, 0), ""
+        for band, axis in ((row_band, 0), (col_band, 1)):
+            if band is not None and abs(band[2]) > abs(score):
+                first, after = (min(round(line * block), shape[axis]) for line in band[:2])
+                score, limit, word = band[2], band[3], ("rows", "columns")[axis]
+                region = (first, after, 0, shape[1]) if axis == 0 else (0, shape[0], first, after)
+        return (rows, cols), self._flag(frame.index, score, limit, region, word)
+
+    def _flag(self, view: int, score: float, limit: float, region: Region, word: str) -> Flag:
+        first, after = region[:2] if word == "rows" else region[2:]
+        advice = (
+            f"Within {word} {first} ... {after - 1} the light {'fell' if score > 0 else 'rose'} by up to "
+            f"{abs(score):.0%} at once, and not elsewhere: a band. Check the camera's link and readout, and slits; "
+            "repeat the view."
+        )
+        return Flag(self.name, Level.ALARM, view, score, limit, advice, region)
+
     def _compare(
-        self, profile: Profile | None, view: int, digest: FrameDigest, context: ScanContext
-    ) -> tuple[Profile, Flag | None]:
-        """Compare a frame's rows with the profile of its kind: the profile after it, and the finding."""
-        blocks = light(digest.preview, context, thinned(digest.preview, rows=False))
-        rows = np.log(np.maximum(np.median(blocks, axis=1), 0.5).astype(np.float64))
-        if profile is None or profile.usual.shape != rows.shape:
-            return Profile(rows, np.zeros_like(rows)), None
-        deviation = rows - profile.usual
-        deviation -= np.median(deviation)  # the beam dims all rows alike
-        loss = 1 - np.exp(deviation)
-        limit = np.maximum(self.alarm, SIGMAS * profile.change)
-        dark = np.flatnonzero(loss > limit)
-        if profile.seen >= CALIBRATION and dark.size and profile.flagged < PATIENCE:
-            worst = int(dark[np.argmax(loss[dark])])
-            advice = (
-                f"{dark.size} of {rows.size} preview rows (from {dark[0]}) lost up to {loss[worst]:.0%} of their light "
-                "at once: a dark band. Check the camera's link and readout; repeat the view."
+        self, profile: Profile, means: Blocks, blocks: Blocks, dark: Blocks
+    ) -> tuple[Profile, tuple[int, int, float, float] | None]:
+        """Compare the lines of a frame with those before: the profile after it, and (first, after, loss, limit)."""
+        lines = np.log(np.maximum(means.astype(np.float64), LEAST_LIGHT))
+        if not profile.last or profile.last[-1].shape != lines.shape:
+            return Profile((lines,), np.zeros_like(lines), 1, blocks), None
+        if profile.flagged:
+            first, after, darker = profile.first, profile.after, profile.jump < 0
+            excess = _contrast(lines, first, after, darker) - _contrast(profile.last[-1], first, after, darker)
+            if excess > REMAINS * abs(profile.jump) and profile.flagged < PATIENCE:
+                found = first, after, -math.expm1(-excess if darker else excess), self.alarm
+                return replace(profile, flagged=profile.flagged + 1), found
+            return Profile((lines,), profile.change, profile.seen, blocks), None
+        steps = len(profile.last) - 1
+        velocity = (profile.last[-1] - profile.last[0]) / steps if steps else np.zeros_like(lines)
+        change = lines - profile.last[-1] - velocity
+        change -= np.median(change)  # the beam dims all lines alike
+        assert profile.change is not None
+        limit = np.maximum(-math.log1p(-self.alarm), SIGMAS * profile.change)
+        jumped = np.flatnonzero(np.abs(change) > limit)
+        if profile.seen >= CALIBRATION and 0 < jumped.size <= max(1, NARROW * lines.size):
+            worst = int(jumped[np.argmax(np.abs(change[jumped]))])
+            first, after = _run(jumped, worst)
+            jump = float(change[worst])
+            before, now = (_contrast(x, first, after, jump < 0) for x in (profile.last[-1], lines))
+            along = _typical(blocks[worst] - dark[worst], profile.blocks[worst] - dark[worst]) * math.copysign(
+                1.0, jump
             )
-            flag = Flag(self.name, Level.ALARM, view, float(loss[worst]), float(limit[worst]), advice)
-            return replace(profile, flagged=profile.flagged + 1), flag
+            if now > STANDS_OUT * abs(jump) and min(now - before, along) > REMAINS * abs(jump):
+                found = first, after, -math.expm1(jump), -math.expm1(-float(limit[worst]))
+                return replace(profile, first=first, after=after, jump=jump, flagged=1), found
         weight = max(MEMORY, 1 / (profile.seen + 1))
-        return Profile(
-            usual=profile.usual + weight * (rows - profile.usual),
-            change=profile.change + weight * (np.abs(deviation) - profile.change),
-            seen=profile.seen + 1,
-        ), None
+        usual = profile.change + weight * (np.abs(change) - profile.change)
+        return Profile((*profile.last, lines)[-1 - BEFORE :], usual, profile.seen + 1, blocks), None
+
+
+def _run(lines: NDArray[np.intp], inside: int) -> tuple[int, int]:
+    """First line, and the one after the last, of the unbroken run of `lines` around one of them."""
+    breaks = np.flatnonzero(np.diff(lines) > 1)
+    starts, ends = np.append(0, breaks + 1), np.append(breaks, lines.size - 1)
+    which = int(np.searchsorted(lines[ends], inside))
+    return int(lines[starts[which]]), int(lines[ends[which]]) + 1
+
+
+def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
+    """By how much some lines are darker (or brighter) than those on both sides, as a difference of logarithms.
+
+    An edge of the sample lies between the two; at the frame's edge there is one.
+    """
+    left, right = lines[max(first - 1, 0) : first], lines[after : after + 1]
+    beside = [float(side.mean()) for side in (left, right) if side.size]
+    own = float(lines[first:after].mean())
+    if not beside:
+        return 0.0
+    return min(beside) - own if darker else own - max(beside)
+
+
+def _typical(now: Blocks, before: Blocks) -> float:
+    """Median change of the logarithm of the light along a line: a zinger is no band."""
+    return float(np.median(np.log(np.maximum(now, LEAST_LIGHT)) - np.log(np.maximum(before, LEAST_LIGHT))))

@@ -1,7 +1,13 @@
-"""Beam: is as much light coming as when the flats were taken? Judged at the detector's edges, where there is air."""
+"""Beam: is as much light coming as when the flats were taken, and does it stay?
+
+Against the flats it is judged where there is air: the brightest of the places in a view. It is a drift: said once, and
+again only after it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
+air.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -10,44 +16,57 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import edge_light, light, more_light
+from beamline.monitor.preview import light, more_light
+from beamline.monitor.view import Cells, Grid, View
 from drivers.frame import Frame, FrameKind
 
-CALIBRATION = 8  # projections
-SIGMAS = 5.0
-DARKNESS = 0.05  # of the flats: no sample lets so little through at both edges, the beam is off
+PLACES = (4, 16)  # parts of the field, down and across, the brightest of which is air
+COVERED = 0.1  # light that the brightest place has less than the flats: there is no air, or the beam fell before
+LASTS = 5  # views that a drift must last
+GONE = 0.5  # of the limit, below which a drift has gone
+PATIENCE = 20  # views after which a dip is the new normal
+MEMORY = 0.05  # weight of the newest view in the usual light
 
 
 @dataclass(frozen=True)
 class BeamState:
-    """What the first projections say.
+    """What it remembers.
 
     Attributes:
-        levels: light of the first projections, over `reference`.
-        reference: light at the left and right edge that counts as full: the flats', or the first projection's.
-        baseline: the level that is normal, None while calibrating.
-        scatter: relative standard deviation of `levels`.
+        drifting: views in a row beyond the limit; after `said` those are counted that are back.
+        said: the drift was flagged.
+        covered: that there is no air was said.
+        level: logarithm of the light over that of the first view, from its changes.
+        usual: level that is normal.
+        dipping: views in a row with a dip.
     """
 
-    levels: tuple[float, ...] = ()
-    reference: tuple[float, float] | None = None
-    baseline: float | None = None
-    scatter: float = 0.0
+    drifting: int = 0
+    said: bool = False
+    covered: bool = False
+    level: float = 0.0
+    usual: float = 0.0
+    dipping: int = 0
 
 
 @dataclass(frozen=True)
 class Beam:
-    """Score: fraction of the light that is gone (negative: there is more)."""
+    """Score: fraction of the light that is gone (negative: there is more).
+
+    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, which air beside the sample
+    allows; 10 % at once are no drift of a ring.
+    """
 
     name: ClassVar[str] = "beam"
     bit: ClassVar[int] = 0
     unit: ClassVar[str] = "fraction of the reference light"
-    meaning: ClassVar[str] = "the light differs from that of the flats, or of the first projections"
+    meaning: ClassVar[str] = "the light differs from that of the flats, or dipped against the views before"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="fraction by which the light may change, either way")] = 0.02
-    alarm: Annotated[float, Field(ge=0, description="fraction of the light whose loss is an alarm")] = 0.10
-    lost: Annotated[float, Field(ge=0, description="fraction of the light without which the beam is lost")] = 0.50
+    warn: Annotated[float, Field(ge=0, description="fraction by which the light may drift, either way")] = 0.02
+    alarm: Annotated[float, Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")] = (
+        0.10
+    )
 
     def start(self) -> BeamState:
         return BeamState()
@@ -56,54 +75,71 @@ class Beam:
         if frame.kind is FrameKind.FLAT and context.flat is not None:
             full = float(light(context.flat, context).mean()) * more_light(context, frame.exposure)
             score = 1 - float(light(digest.preview, context).mean()) / full if full > 0 else 0.0
-            return Look(state, self._judge(frame.index, score, self.warn, "than in the flats before"))
-        if frame.kind is not FrameKind.PROJECTION:
+            return Look(state, self._flat(frame.index, score))
+        if context.view is None or context.grid is None:
             return Look(state)
-        left, right = edge_light(digest.preview, context)
-        if state.reference is None and context.flat is not None:
-            scale = more_light(context, frame.exposure)
-            full_left, full_right = edge_light(context.flat, context)
-            state = replace(state, reference=(full_left * scale, full_right * scale))
-        elif state.reference is None:
-            state = replace(state, reference=(left, right))
-        full_left, full_right = state.reference or (left, right)
-        # The sample may cover one edge; the brighter one is the better witness of the beam.
-        level = max(left / full_left if full_left > 0 else 0.0, right / full_right if full_right > 0 else 0.0)
-        if state.baseline is None:
-            return self._calibrate(state, frame.index, level)
-        warn = max(self.warn, SIGMAS * state.scatter)
-        return Look(state, self._judge(frame.index, 1 - level / state.baseline, warn, "than in the flats"))
+        state, flag = self._dip(state, frame.index, context)
+        if flag is not None or not context.grid.flats or state.dipping:
+            return Look(state, flag)
+        return self._drift(state, frame.index, context.view, context.grid)
 
-    def _calibrate(self, state: BeamState, view: int, level: float) -> Look[BeamState]:
-        """Learn what is normal. Edges well below the flats mean less beam, or no air there: flagged once, then the
-        light is compared with that level."""
-        if level < DARKNESS:
-            return Look(state, self._judge(view, 1 - level, self.warn, "than in the flats"))
-        levels = (*state.levels, level)
-        flag = None
-        if level < 1 - self.alarm and len(levels) == 1:
-            advice = (
-                f"The detector's edges get {level:.0%} of the flats' light: the sample covers both edges, or the beam "
-                "is weaker than in the flats. From here on the light is compared with the first projections."
-            )
-            flag = Flag(self.name, Level.WARN, view, 1 - level, self.alarm, advice)
-        elif level >= 1 - self.alarm:
-            flag = self._judge(view, 1 - level, self.warn, "than in the flats")
-        state = replace(state, levels=levels)
-        if len(levels) == CALIBRATION:
-            middle = float(np.median(levels))
-            baseline = 1.0 if middle >= 1 - self.alarm else middle
-            state = replace(state, baseline=baseline, scatter=float(np.std(levels)) / middle)
-        return Look(state, flag)
-
-    def _judge(self, view: int, score: float, warn: float, than: str) -> Flag | None:
-        if abs(score) <= warn:
+    def _flat(self, row: int, score: float) -> Flag | None:
+        if abs(score) <= self.warn:
             return None
-        if score > self.lost:
-            advice = f"The beam is lost: {score:.0%} less light {than}. Check ring current, front end and shutter."
-            return Flag(self.name, Level.ALARM, view, score, self.lost, advice)
-        if score > self.alarm:
-            advice = f"{score:.0%} less light {than}. Check ring current, slits and filters; take new flats."
-            return Flag(self.name, Level.ALARM, view, score, self.alarm, advice)
-        advice = f"{abs(score):.1%} {'less' if score > 0 else 'more'} light {than}. Take flats more often."
-        return Flag(self.name, Level.WARN, view, score, warn, advice)
+        level, limit = (Level.ALARM, self.alarm) if abs(score) > self.alarm else (Level.WARN, self.warn)
+        advice = f"{_size(score)} light than in the flats before. Take flats more often."
+        return Flag(self.name, level, row, score, limit, advice)
+
+    def _dip(self, state: BeamState, row: int, context: ScanContext) -> tuple[BeamState, Flag | None]:
+        """A dip or a flash of more than `alarm` is flagged in every view, until it is over or has become normal."""
+        if context.change is None:
+            return state, None
+        level = state.level + math.log1p(context.change.gain)
+        score = -math.expm1(level - state.usual)
+        if abs(score) <= self.alarm or state.dipping >= PATIENCE:
+            usual = level if state.dipping >= PATIENCE else state.usual + MEMORY * (level - state.usual)
+            return replace(state, level=level, usual=usual, dipping=0), None
+        advice = (
+            f"{_size(score)} light than in the views before. Check ring current, slits and filters; take new flats."
+        )
+        flag = Flag(self.name, Level.ALARM, row, score, self.alarm, advice)
+        return replace(state, level=level, dipping=state.dipping + 1), flag
+
+    def _drift(self, state: BeamState, row: int, view: View, grid: Grid) -> Look[BeamState]:
+        score = -math.expm1(-_air(view, grid))
+        if score > COVERED:
+            if state.covered:
+                return Look(replace(state, drifting=0))
+            advice = (
+                f"No part of the frame gets more than {1 - score:.0%} of the flats' light: the sample covers all of "
+                "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
+            )
+            return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
+        away = abs(score) > (GONE * self.warn if state.said else self.warn)
+        drifting = 0 if away is state.said else state.drifting + 1
+        if drifting < LASTS:
+            return Look(replace(state, drifting=drifting))
+        state = replace(state, drifting=0, said=not state.said)
+        if not state.said:
+            return Look(state)
+        advice = f"{_size(score)} light than in the flats, where there is air. Take flats more often."
+        return Look(state, Flag(self.name, Level.WARN, row, score, self.warn, advice))
+
+
+def _size(score: float) -> str:
+    return f"{abs(score):.1%} {'less' if score > 0 else 'more'}"
+
+
+def _air(view: View, grid: Grid) -> float:
+    """Mean line integral of the brightest place of the lit field: 0 in air."""
+    depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
+    down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
+    sums, cells = (_places(part, down, across) for part in (depth, lit))
+    means = sums[cells > 0] / cells[cells > 0]
+    return float(means.min()) if means.size else 0.0
+
+
+def _places(image: Cells, down: int, across: int) -> Cells:
+    """Sums over a grid of places."""
+    rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
+    return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)

@@ -14,14 +14,12 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.monitor.change import Change
 from beamline.monitor.digest import FrameDigest
+from beamline.monitor.view import Grid, Region, View
 from drivers.frame import Frame
 
 State = TypeVar("State")
-
-
-Region = tuple[int, int, int, int]
-"""Pixels of a frame: (first row, row after the last, first column, column after the last)."""
 
 
 class Level(StrEnum):
@@ -51,6 +49,7 @@ class Flag:
         limit: the figure that it exceeds.
         advice: what it means and what to do.
         region: where in the frame; None: everywhere, or nowhere in particular.
+        first: the first row that it holds for, where that is not `view`: some findings need several views.
     """
 
     check: str
@@ -60,11 +59,12 @@ class Flag:
     limit: float
     advice: str
     region: Region | None = None
+    first: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ScanContext:
-    """What does not depend on the frame, and the references seen so far.
+    """What checks may know besides the frame: the scan, the references so far, and what all checks need of the frame.
 
     Attributes:
         saturation: the count from which a pixel is saturated.
@@ -73,6 +73,12 @@ class ScanContext:
         pass_starts: triggers at which a new pass of a fly scan begins, after any pause.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
+        grid: the cells of the views; None before the first projection.
+        light_left: of the view before, see beamline.monitor.view.light_left; 1 where it is no projection.
+        view: the frame on this grid; None where it is no projection, or has no light.
+        truncated: the sample is wider than the field, in this view or those before; or there are no flats to tell.
+        change: what it has that turning since the views before does not explain; None where these are too few, or at
+            uneven steps.
     """
 
     saturation: float
@@ -82,6 +88,11 @@ class ScanContext:
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan
+    grid: Grid | None = None
+    light_left: float = 1.0
+    view: View | None = None
+    truncated: bool = False
+    change: Change | None = None
 
 
 @dataclass(frozen=True, eq=False)

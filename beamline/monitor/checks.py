@@ -22,6 +22,9 @@ REGISTRY = {  # module in this folder: class of the check
     "timing": "Timing",
     "mass": "Mass",
     "dark": "Dark",
+    "lost": "Lost",
+    "gain": "Gain",
+    "motion": "Motion",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,10 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.monitor.change import SPAN, change_of
 from beamline.monitor.check import Check, Flag, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest
+from beamline.monitor.preview import more_light
+from beamline.monitor.view import View, grid_of, light_left, view_of
 from drivers.frame import Frame, FrameKind
+
+AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
+FORGET = 0.99  # a view: what was at the edge a quarter of a turn ago may come back
+DARK = 0.5  # light left of the view before: less is no view, see the check `lost`
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +32,8 @@ class Monitor:
         checks: with their limits.
         states: of the checks, in their order.
         kind, counted: of the latest group of frames: their kind, and how many there are.
+        recent: the last projections with light, oldest first.
+        cut: usual line integral at the worse edge of the field, over the views so far.
     """
 
     context: ScanContext
@@ -31,6 +41,8 @@ class Monitor:
     states: tuple[Any, ...]
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
+    recent: tuple[View, ...] = ()
+    cut: float = 0.0
 
 
 def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
@@ -39,7 +51,8 @@ def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
 
 
 def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, tuple[Flag, ...]]:
-    """Look at the next frame: the monitor after it, and what the checks found. O(pixels of the preview)."""
+    """Look at the next frame: the monitor after it, and what the checks found. O(blocks of the preview)."""
+    monitor = _with_view(monitor, frame, digest)
     looks = [
         check.look(state, frame, digest, monitor.context)
         for check, state in zip(monitor.checks, monitor.states, strict=True)
@@ -48,14 +61,40 @@ def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, 
     return after, tuple(look.flag for look in looks if look.flag is not None)
 
 
+def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
+    """The monitor with what all checks need of a projection."""
+    context = replace(monitor.context, view=None, change=None, light_left=1.0)
+    if frame.kind is not FrameKind.PROJECTION:
+        return replace(monitor, context=context)
+    grid = context.grid
+    if grid is None:
+        block = round(math.sqrt(frame.counts.size / digest.preview.size))
+        grid = grid_of(digest.preview.shape, block, context.dark, context.flat)
+    longer = more_light(context, frame.exposure) if grid.flats else 1.0
+    view = view_of(digest.preview, grid, frame.index, frame.angle, longer)
+    left = light_left(view, monitor.recent[-1] if monitor.recent else None, grid)
+    context = replace(context, grid=grid, light_left=left)
+    if left < DARK:
+        return replace(monitor, context=context)
+    change = change_of(view, monitor.recent, grid)
+    view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
+    recent = (*monitor.recent, view)[-SPAN:]
+    cut = max(max(view.edges), FORGET * monitor.cut)
+    wider = not grid.flats or cut > AIR
+    context = replace(context, view=view, change=change, truncated=wider)
+    return replace(monitor, context=context, recent=recent, cut=cut)
+
+
 def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     """The monitor with the frame's preview in the mean of its group, where it is a dark or a flat."""
     counted = monitor.counted + 1 if frame.kind is monitor.kind else 1
     context = monitor.context
     if frame.kind is FrameKind.DARK:
-        context = replace(context, dark=_mean(context.dark, digest.preview, counted))
+        context = replace(context, dark=_mean(context.dark, digest.preview, counted), grid=None)
     elif frame.kind is FrameKind.FLAT:
-        context = replace(context, flat=_mean(context.flat, digest.preview, counted), flat_exposure=frame.exposure)
+        context = replace(
+            context, flat=_mean(context.flat, digest.preview, counted), flat_exposure=frame.exposure, grid=None
+        )
     return replace(monitor, context=context, counted=counted, kind=frame.kind)
 
 

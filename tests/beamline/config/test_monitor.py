@@ -37,7 +37,7 @@ def test_limits_reach_their_check_and_no_other() -> None:
         ("monitor.mass.frames=2.5", r"monitor\.mass\.frames is 2\.5; expected a whole number >= 1"),
         (
             "monitor.beam.wran=0.1",
-            r"is not a known key \(did you mean warn\?\); legal keys there: warn, alarm, lost",
+            r"is not a known key \(did you mean warn\?\); legal keys there: warn, alarm",
         ),
         ("monitor.bean={warn: 0.1}", r"monitor\.bean is not .*beam.*legal keys there: on_alarm, act_after, policy"),
         ("monitor.timing=0.3", r"monitor\.timing is 0\.3; expected a group of keys: warn"),

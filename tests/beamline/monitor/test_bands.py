@@ -26,7 +26,7 @@ def test_black_rows_are_flagged_with_their_place(fake: Any, n: int, loss: float)
     flags = only(fake.flags(frames))
     assert [(f.view, f.level) for f in flags] == [(18, Level.ALARM)]
     assert flags[0].score == pytest.approx(loss, abs=0.02)
-    assert "from 5)" in flags[0].advice
+    assert flags[0].region == (20, 20 + max(n, 4), 0, 96)
 
 
 def test_a_band_in_a_flat(fake: Any) -> None:
@@ -64,3 +64,37 @@ def test_a_sample_seen_from_the_other_side_is_no_band(fake: Any) -> None:
     for i in range(20):  # an angle plan that jumps
         frames += fake.views(1, first=i * 137 % 180)
     assert only(fake.flags(frames, period=None)) == []
+
+
+@pytest.mark.parametrize("first", [0, 17, 48, 92])
+def test_black_columns_are_flagged_as_long_as_they_last_with_their_place(fake: Any, first: int) -> None:
+    frames = fake.references() + fake.views(30)
+    for view in frames[25:32]:
+        view.counts[:, first : first + 2] = 200
+    flags = only(fake.flags(frames))
+    assert [f.view for f in flags] == list(range(25, 32))
+    assert all(f.region is not None and f.region[2] <= first < f.region[3] <= first + 8 for f in flags)
+    assert "columns" in flags[0].advice
+
+
+def test_a_bright_band_is_one_too(fake: Any) -> None:
+    frames = fake.references() + fake.views(20)
+    frames[25].counts[12:16] *= 2
+    flags = only(fake.flags(frames))
+    assert [f.view for f in flags] == [25]
+    assert flags[0].score < 0
+
+
+def test_zingers_in_a_column_are_no_band(fake: Any) -> None:
+    frames = fake.references() + fake.views(40)
+    for i, view in enumerate(frames[20:]):
+        view.counts[i % 64, 30 + i] = 60000
+        view.counts[i % 50 + 7, 30 + i] = 60000
+    assert only(fake.flags(frames)) == []
+
+
+def test_an_edge_that_passes_is_no_band(fake: Any) -> None:
+    frames = fake.references() + fake.views(40, discs=())
+    for i, view in enumerate(frames[10:]):
+        view.counts[:, 90 - 2 * i :] = 200 + (view.counts[:, 90 - 2 * i :].clip(200) - 200) // 3
+    assert only(fake.flags(frames)) == []

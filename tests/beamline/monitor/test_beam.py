@@ -1,68 +1,71 @@
-"""The beam check reads the light at the edges against the flats, and does not mistake the sample for a lost beam."""
+"""The light is compared with the flats where there is air, and with the views before; a drift is said once."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from beamline.monitor.beam import Beam
+from beamline.monitor.beam import PATIENCE, Beam
 from beamline.monitor.check import Flag, Level
-
-WIDE = ((0.0, 0.0, 80.0, 0.004),)  # a disc wider than the detector: no air anywhere
+from tests.beamline.monitor.blobs import Blobs
 
 
 def only(flags: list[Flag]) -> list[Flag]:
     return [f for f in flags if f.check == "beam"]
 
 
-@pytest.mark.parametrize(
-    ("light", "level", "limit", "word"),
-    [
-        (0.95, Level.WARN, 0.02, "less light"),
-        (1.05, Level.WARN, 0.02, "more light"),
-        (0.80, Level.ALARM, 0.10, "ring current"),
-        (0.20, Level.ALARM, 0.50, "beam is lost"),
-        (0.0, Level.ALARM, 0.50, "beam is lost"),
-    ],
-)
-def test_a_changed_beam_is_flagged_with_its_size(
-    fake: Any, light: float, level: Level, limit: float, word: str
-) -> None:
-    frames = fake.references() + fake.views(10) + fake.views(4, first=10, light=light)
-    flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == [20, 21, 22, 23]
-    for flag in flags:
-        assert flag.level is level
-        assert flag.limit == limit
-        assert flag.score == pytest.approx(1 - light, abs=0.01)
-        assert word in flag.advice
+def drifting(light: Any, views: int = 120, **more: Any) -> list[Flag]:
+    return Blobs(views, counts=lambda view, image: image * light(view), **more).flags([Beam()])
 
 
-@pytest.mark.parametrize("light", [0.99, 1.01])
-def test_a_percent_is_no_finding(fake: Any, light: float) -> None:
-    assert only(fake.flags(fake.references() + fake.views(10) + fake.views(10, first=10, light=light))) == []
+@pytest.mark.parametrize("rate", [-5e-4, 5e-4])
+def test_a_drift_against_the_flats_is_said_once_when_it_reaches_the_limit(rate: float) -> None:
+    flags = drifting(lambda view: 1 + rate * view)
+    assert [(f.level, f.limit) for f in flags] == [(Level.WARN, 0.02)]
+    assert flags[0].view - 10 == pytest.approx(0.02 / abs(rate), abs=10)
+    assert flags[0].score == pytest.approx(-rate * (flags[0].view - 10), abs=0.003)
+    assert f"{'less' if rate < 0 else 'more'} light than in the flats" in flags[0].advice
 
 
-def test_a_beam_lost_before_the_first_view(fake: Any) -> None:
-    flags = only(fake.flags(fake.references() + fake.views(3, light=0.0)))
-    assert [f.level for f in flags] == [Level.ALARM] * 3
+def test_a_drift_that_went_and_comes_again_is_said_again() -> None:
+    flags = drifting(lambda view: 1 - 0.03 * abs(np.sin(view * np.pi / 60)))
+    assert [f.level for f in flags] == [Level.WARN] * 2
 
 
-def test_a_beam_that_fell_before_the_first_view_is_noted_and_then_compared_with_itself(fake: Any) -> None:
-    frames = fake.references() + fake.views(12, light=0.7) + fake.views(2, first=12, light=0.5)
-    flags = only(fake.flags(frames))
-    assert [(f.view, f.level) for f in flags] == [(10, Level.WARN), (22, Level.ALARM), (23, Level.ALARM)]
-    assert "70% of the flats" in flags[0].advice
-    assert flags[1].score == pytest.approx(1 - 0.5 / 0.7, abs=0.01)
+def test_noise_around_the_limit_is_said_once() -> None:
+    rng = np.random.default_rng(6)
+    assert len(drifting(lambda view: 0.98 + 0.002 * rng.normal())) <= 1
 
 
-def test_a_sample_that_covers_both_edges_is_said_once_and_the_beam_still_watched(fake: Any) -> None:
-    frames = fake.references() + fake.views(20, discs=WIDE) + fake.views(1, first=20, light=0.85, discs=WIDE)
-    flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == [10, 30]
-    assert "covers both edges" in flags[0].advice
-    assert flags[1].level is Level.ALARM
+def test_a_percent_is_no_finding() -> None:
+    assert drifting(lambda view: 0.99) == []
+
+
+def test_a_dip_is_an_alarm_in_each_of_its_views_and_not_after_it() -> None:
+    flags = drifting(lambda view: 0.8 if 40 <= view < 47 else 1.0)
+    assert [(f.view - 10, f.level) for f in flags] == [(view, Level.ALARM) for view in range(40, 47)]
+    assert flags[0].score == pytest.approx(0.2, abs=0.01)
+
+
+def test_a_dip_that_stays_becomes_normal() -> None:
+    flags = drifting(lambda view: 1.0 if view < 40 else 0.8)
+    assert [f.view - 10 for f in flags if f.level is Level.ALARM] == list(range(40, 40 + PATIENCE))
+    assert [f.level for f in flags if f.view > 50 + PATIENCE] in ([], [Level.INFO])
+
+
+def test_a_sample_that_covers_all_is_said_once_and_dips_are_still_seen() -> None:
+    flags = drifting(lambda view: 1.0 if view < 60 else 0.8, 70, depth=lambda view, image: image + 0.5)
+    assert [(f.level, f.view - 10) for f in flags] == [(Level.INFO, 0)] + [(Level.ALARM, i) for i in range(60, 70)]
+    assert "covers all of it" in flags[0].advice
+
+
+def test_a_sample_that_covers_the_edges_does_not_hide_air_above_it() -> None:
+    tall = np.zeros((32, 1))
+    tall[16:] = 0.5
+    flags = drifting(lambda view: 1 - 5e-4 * view, depth=lambda view, image: image * (tall > 0) + tall)
+    assert [f.level for f in flags] == [Level.WARN]
 
 
 def test_flats_are_compared_with_the_flats_before(fake: Any) -> None:
@@ -71,11 +74,11 @@ def test_flats_are_compared_with_the_flats_before(fake: Any) -> None:
     assert flags[0].score == pytest.approx(0.1, abs=0.01)
 
 
-def test_without_flats_the_first_views_are_the_reference(fake: Any) -> None:
-    flags = only(fake.flags(fake.darks() + fake.views(10) + fake.views(1, first=10, light=0.8)))
-    assert [f.view for f in flags] == [15]
+def test_without_flats_dips_are_seen(fake: Any) -> None:
+    flags = only(fake.flags(fake.darks() + fake.views(20) + fake.views(1, first=20, light=0.8)))
+    assert [f.view for f in flags] == [25]
 
 
-def test_limits_can_be_set(fake: Any) -> None:
-    frames = fake.references() + fake.views(10) + fake.views(1, first=10, light=0.95)
-    assert only(fake.flags(frames, checks=[Beam(warn=0.08)])) == []
+def test_limits_can_be_set() -> None:
+    scan = Blobs(80, counts=lambda view, light: light * (1 - 5e-4 * view))
+    assert scan.flags([Beam(warn=0.08)]) == []

@@ -17,7 +17,8 @@ from beamline.monitor.checks import ALARM_SHIFT, CHECKS, _distinct, bitmask
 from beamline.monitor.digest import digest
 
 REPOSITORY = Path(beamline.__file__).parents[1]
-BITS = {"beam": 0, "saturation": 1, "stuck": 2, "bands": 3, "timing": 4, "mass": 5, "dark": 6}
+BITS = {"beam": 0, "saturation": 1, "stuck": 2, "bands": 3, "timing": 4, "mass": 5, "dark": 6, "lost": 7, "gain": 8}
+BITS |= {"motion": 9}
 """As files hold them since the first version: a number here is never changed."""
 
 check_of_each_name = pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
@@ -39,7 +40,7 @@ def test_every_set_of_flags_has_its_own_bits(found: list[tuple[str, Level]]) -> 
 @pytest.mark.parametrize("change", [{"bit": 3}, {"name": "bands"}, {"bit": 16}, {"bit": -1}])
 def test_a_check_with_a_bit_or_a_name_that_is_taken_is_refused(change: dict[str, Any]) -> None:
     bands = next(check for check in CHECKS if check.name == "bands")
-    other = type("Other", (type(bands),), {"name": "other", "bit": 7} | change)()
+    other = type("Other", (type(bands),), {"name": "other", "bit": 15} | change)()
     with pytest.raises(ValueError, match=r"a bit \(0 \.\.\. 15\) of its own, got .*bands 3"):
         _distinct(*CHECKS, other)
 

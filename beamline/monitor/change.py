@@ -1,0 +1,171 @@
+"""Change: what a view has that the turning of the sample since the views before it does not explain.
+
+Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
+by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
+stage other than the last ones (turn). For the columns of the fit: d depth = -gain - across d/dx - down d/dy + turn
+velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The second pass
+weights cells by their residuals of the first (Huber 1964), so that a floater or a zinger moves nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numba
+import numpy as np
+
+from beamline.monitor.view import Cells, Grid, View
+
+SPAN = 4  # views before, of which the velocity is the mean of three steps
+HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
+MOST_STEPS = 4  # steps that a gap may have: after a longer one, velocities say nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """The change from the view before.
+
+    Attributes:
+        gain: relative change of the light, of all cells alike.
+        across, down: pixels of the frame by which the sample is right of, or below, where it should be.
+        turn: steps by which the stage turned further than its last ones; NaN where nothing turns visibly.
+        residual: float32 [row, col], change of the depth that these do not explain.
+        noise: robust standard deviation of the residual times the square root of the weight, over the lit cells.
+    """
+
+    gain: float
+    across: float
+    down: float
+    turn: float
+    residual: Cells
+    noise: float
+
+
+def change_of(view: View, before: Sequence[View], grid: Grid) -> Change | None:
+    """The change of a view from those before it, oldest first; None without SPAN of them at steps like the last one."""
+    if len(before) < SPAN:
+        return None
+    last = before[-SPAN:]
+    steps = _steps(view, last)
+    if steps is None:
+        return None
+    # A gain that has changed is no velocity.
+    gained = np.float32(sum(one.brighter for one in last[1:]))
+    found = np.zeros(5)
+    residual = np.empty_like(view.depth)
+    _fit(
+        view.depth,
+        last[-1].depth,
+        last[-2].depth,
+        last[0].depth - gained,
+        np.minimum(view.weight, last[-1].weight),
+        steps,
+        residual,
+        found,
+    )
+    gain, across, down, turn, noise = (float(x) for x in found)
+    return Change(math.expm1(-gain), across * grid.cell, down * grid.cell, turn / float(steps), residual, noise)
+
+
+def _steps(view: View, last: Sequence[View]) -> float | None:
+    """Steps since the view before: 1, more where views between were not used; None where the angles are uneven."""
+    usual = (last[-1].angle - last[0].angle) / (SPAN - 1)
+    if not math.isfinite(usual) or usual == 0:
+        return 1.0 if view.angle == last[-1].angle or not math.isfinite(view.angle) else None
+    inner = [after.angle - one.angle for one, after in pairwise(last)]
+    if max(abs(step / usual - 1) for step in inner) > 0.5:
+        return None
+    steps = (view.angle - last[-1].angle) / usual
+    return steps if 0.5 < steps < MOST_STEPS + 0.5 else None
+
+
+@numba.njit(nogil=True, cache=True)
+def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Binomial 1 2 1 along both axes; the frame's edges are mirrors."""
+    rows, cols = image.shape
+    for row in range(rows):
+        above, below = image[max(row - 1, 0)], image[min(row + 1, rows - 1)]
+        own = image[row]
+        for col in range(cols):
+            line[col] = 0.25 * (above[col] + below[col]) + 0.5 * own[col]
+        target = out[row]
+        for col in range(1, cols - 1):
+            target[col] = 0.25 * (line[col - 1] + line[col + 1]) + 0.5 * line[col]
+        target[0] = 0.75 * line[0] + 0.25 * line[min(1, cols - 1)]
+        target[cols - 1] = 0.75 * line[cols - 1] + 0.25 * line[max(cols - 2, 0)]
+
+
+@numba.njit(nogil=True, cache=True)
+def _fit(now, one, two, four, weight, steps, residual, found):  # type: ignore[no-untyped-def]
+    """Fills `residual` and `found`: minus gain, across and down in cells, turn in velocities, noise."""
+    rows, cols = now.shape
+    velocity = (one - four) * np.float32(steps / 3)
+    change = now - one - velocity
+    line = np.empty(cols, np.float32)
+    image, smooth, turning = np.empty_like(now), np.empty_like(now), np.empty_like(now)
+    # Half a step back, as `change` compares now with one: the gradient is that of the middle.
+    _smooth((one + two) * np.float32(0.5) + velocity, image, line)
+    _smooth(velocity, turning, line)
+    _smooth(change, smooth, line)
+    share = np.ones_like(now)
+    normal, right, solution = np.zeros((4, 4)), np.zeros(4), np.zeros(4)
+    basis = np.zeros(4)
+    for robust in range(2):
+        normal[:], right[:] = 0.0, 0.0
+        for row in range(rows):
+            above, below = max(row - 1, 0), min(row + 1, rows - 1)
+            for col in range(1, cols - 1):
+                w = weight[row, col] * share[row, col]
+                if w <= 0 or weight[row, col - 1] <= 0 or weight[row, col + 1] <= 0:
+                    continue
+                basis[0] = 1.0
+                basis[1] = 0.5 * (image[row, col - 1] - image[row, col + 1])
+                basis[2] = (image[above, col] - image[below, col]) / max(below - above, 1)
+                basis[3] = turning[row, col]
+                for i in range(4):
+                    right[i] += w * basis[i] * smooth[row, col]
+                    for j in range(i, 4):
+                        normal[i, j] += w * basis[i] * basis[j]
+        for i in range(4):
+            for j in range(i):
+                normal[i, j] = normal[j, i]
+        # A cause that moves nothing (no sample, one row, a disc that turns) gets no share of the change.
+        floor = 1e-9 * normal[0, 0]
+        for i in range(4):
+            normal[i, i] += floor + 1e-12
+        solution[:] = np.linalg.solve(normal, right)
+        if robust == 0:
+            deviation = np.empty(rows * cols, np.float32)
+            n = 0
+        for row in range(rows):
+            above, below = max(row - 1, 0), min(row + 1, rows - 1)
+            for col in range(cols):
+                left, beside = max(col - 1, 0), min(col + 1, cols - 1)
+                explained = (
+                    solution[0]
+                    + solution[1] * (image[row, left] - image[row, beside]) / max(beside - left, 1)
+                    + solution[2] * (image[above, col] - image[below, col]) / max(below - above, 1)
+                    + solution[3] * turning[row, col]
+                )
+                residual[row, col] = change[row, col] - explained if weight[row, col] > 0 else 0.0
+                if robust == 0 and weight[row, col] > 0 and (row + col) % 5 == 0:
+                    deviation[n] = abs(smooth[row, col] - explained) * np.sqrt(weight[row, col])
+                    n += 1
+                if robust == 0:
+                    share[row, col] = abs(smooth[row, col] - explained) * np.sqrt(weight[row, col])
+        if robust == 0:
+            limit = HUBER * 1.4826 * np.median(deviation[:n]) + 1e-9 if n > 0 else 1.0
+            for row in range(rows):
+                for col in range(cols):
+                    share[row, col] = min(1.0, limit / max(share[row, col], 1e-12))
+    n = 0
+    for row in range(rows):
+        for col in range(cols):
+            if weight[row, col] > 0 and (row + col) % 5 == 0:
+                deviation[n] = abs(residual[row, col]) * np.sqrt(weight[row, col])
+                n += 1
+    found[:4] = solution
+    found[4] = 1.4826 * np.median(deviation[:n]) if n > 0 else 0.0

@@ -1,0 +1,47 @@
+"""Lost: is there light at all? The only check whose alarms end a scan by default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from drivers.frame import Frame, FrameKind
+
+
+@dataclass(frozen=True)
+class LostState:
+    """Nothing: the last good view is the monitor's."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Score: share of the light that is gone from nine tenths of the frame, against the last view with light.
+
+    The default: half of the light goes neither by drift nor by the decay of a ring's current between two top-ups, and
+    a sample that turns takes no light from all places at once.
+    """
+
+    name: ClassVar[str] = "lost"
+    bit: ClassVar[int] = 7
+    unit: ClassVar[str] = "fraction of the light"
+    meaning: ClassVar[str] = "the beam is gone"
+    policy: ClassVar[Policy] = Policy.ABORT
+
+    alarm: Annotated[float, Field(ge=0.5, le=1, description="fraction of the light without which it is lost")] = 0.5
+
+    def start(self) -> LostState:
+        return LostState()
+
+    def look(self, state: LostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[LostState]:
+        score = 1 - context.light_left
+        if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
+            return Look(state)
+        advice = (
+            f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter; repeat "
+            "these views."
+        )
+        return Look(state, Flag(self.name, Level.ALARM, frame.index, score, self.alarm, advice))

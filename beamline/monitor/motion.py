@@ -1,0 +1,85 @@
+"""Motion: does the sample do anything but turn steadily?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from beamline.monitor.change import SPAN
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.scatter import Scatter
+from drivers.frame import Frame
+
+SIGMAS = 8.0
+
+
+@dataclass(frozen=True)
+class MotionState:
+    """Usual shifts across and down in pixels and turns in steps; `quiet`: views in which a jump echoes."""
+
+    across: Scatter = field(default_factory=Scatter)
+    down: Scatter = field(default_factory=Scatter)
+    turn: Scatter = field(default_factory=Scatter)
+    quiet: int = 0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Score: pixels by which the sample is elsewhere than its turning explains; steps of the stage where it is a slip.
+
+    Flagged is the view of the jump: the views from there on are as good as those before, but show another position.
+    The defaults: half a pixel is what reconstructions from views at two positions begin to show (a doubled edge is as
+    wide as the resolution). A flat face that comes into the beam's direction looks like a slip of up to two steps.
+    """
+
+    name: ClassVar[str] = "motion"
+    bit: ClassVar[int] = 9
+    unit: ClassVar[str] = "pixels, or steps of the stage"
+    meaning: ClassVar[str] = "the sample jumped or slipped: views before and after it do not fit together"
+    policy: ClassVar[Policy] = Policy.LOG
+
+    alarm: Annotated[float, Field(ge=0, description="pixels by which the sample may shift between two views")] = 0.5
+    steps: Annotated[float, Field(ge=0, description="steps by which the stage may turn too far at once")] = 3.0
+
+    def start(self) -> MotionState:
+        return MotionState()
+
+    def look(self, state: MotionState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MotionState]:
+        change = context.change
+        if change is None:
+            return Look(state)
+        usual = state.across, state.down, state.turn
+        found = change.across, change.down, change.turn
+        after = MotionState(
+            state.across.with_figure(change.across),
+            state.down.with_figure(change.down),
+            state.turn.with_figure(change.turn),
+            max(state.quiet - 1, 0),
+        )
+        if not state.across.ready or state.quiet:
+            return Look(after)
+        limits = self.alarm, self.alarm, self.steps
+        limit_across, limit_down, limit_turn = (
+            max(least, SIGMAS * s.sigma) for least, s in zip(limits, usual, strict=True)
+        )
+        across, down, turn = (x - s.mean for x, s in zip(found, usual, strict=True))
+        if abs(across) > limit_across or abs(down) > limit_down:
+            score, limit = math.hypot(across, down), min(limit_across, limit_down)
+            advice = (
+                f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
+                "on its holder, or something touched it. Fix it and begin anew, or reconstruct the views before and "
+                "after this one apart."
+            )
+        elif abs(turn) > limit_turn:
+            score, limit = turn, limit_turn
+            advice = (
+                f"The sample turned by {turn:+.1f} steps more than its step: triggers were lost, the stage slipped, or "
+                "the sample turned on its holder. Compare the stage's encoder with the plan."
+            )
+        else:
+            return Look(after)
+        return Look(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, frame.index, score, limit, advice))

@@ -1,0 +1,186 @@
+"""View: a projection as the checks see it, line integrals on a coarse grid; the same for a large frame and a small one.
+
+Made once a frame for all checks. The grid has 128 to 255 columns of square cells, which are as many pixels as that
+takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share
+of the field.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+COLS = 128  # cells at least, where the preview has as many blocks
+DARKEST = 1e-3  # transmission below which the logarithm would only show noise
+UNLIT = 0.05  # of the flats' bright part: a cell with less has no light worth a name
+EDGE = 2  # cells at either edge that say whether the sample ends within the field
+SEEN = 0.02  # transmission from which a place shows whether the beam is there
+BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
+
+Cells = NDArray[np.float32]
+Region = tuple[int, int, int, int]
+"""Pixels of a frame: (first row, row after the last, first column, column after the last)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The cells of a frame, and the light in them without a sample.
+
+    Attributes:
+        cell: pixels a side of a cell.
+        blocks: preview blocks a side of a cell.
+        dark: counts [row, col] of the cells without light; 0 where no dark was seen.
+        full: counts above it with the beam and no sample, at the flats' exposure.
+        lit: float32 [row, col], 1 where a cell has light enough to say something, else 0.
+        flats: there were flats; otherwise `full` is 1 and line integrals are relative.
+        row_dark, col_dark: dark counts of each preview row and column, means.
+        left, right: first and last column of cells of which most are lit.
+    """
+
+    cell: int
+    blocks: int
+    dark: Cells
+    full: Cells
+    lit: Cells
+    flats: bool
+    row_dark: Cells
+    col_dark: Cells
+    left: int
+    right: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.full.shape
+
+    def region(self, row: float, col: float, height: float, width: float) -> Region:
+        """Pixels of a box of cells around a place, within the grid."""
+        rows, cols = self.shape
+        top, left = max(0, math.floor(row + 0.5 - height / 2)), max(0, math.floor(col + 0.5 - width / 2))
+        below, right = min(rows, math.ceil(row + 0.5 + height / 2)), min(cols, math.ceil(col + 0.5 + width / 2))
+        return top * self.cell, below * self.cell, left * self.cell, right * self.cell
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A projection on the grid.
+
+    Attributes:
+        index: its row in the file.
+        angle: radians.
+        depth: float32 [row, col], line integrals; 0 where the cell is not lit.
+        weight: float32 [row, col], photons relative to the open beam: 0 where unlit, exp(-depth) elsewhere.
+        rows, cols: float32 [preview row], [preview col]: mean counts above the dark.
+        edges: line integrals at the left and the right edge of the lit cells, medians over rows.
+        brighter: change of the logarithm of the light since the view before, where it is known.
+    """
+
+    index: int
+    angle: float
+    depth: Cells
+    weight: Cells
+    rows: Cells
+    cols: Cells
+    edges: tuple[float, float]
+    brighter: float = 0.0
+
+
+def grid_of(
+    preview: tuple[int, int], block: int, dark: NDArray[np.float32] | None, flat: NDArray[np.float32] | None
+) -> Grid:
+    """The grid of frames whose preview has this shape, with blocks of `block` pixels a side."""
+    blocks = max(1, preview[1] // COLS)
+    blocks = min(blocks, preview[0])
+    dark = np.zeros(preview, np.float32) if dark is None else dark
+    low, rows, cols = _binned(dark, blocks)
+    if flat is None:
+        full = np.ones_like(low)
+        lit = full
+    else:
+        full = _binned(flat, blocks)[0] - low
+        bright = float(np.percentile(full, BRIGHT))
+        lit = (full > UNLIT * max(bright, 0.0)).astype(np.float32)
+        full = np.where(lit > 0, full, np.float32(1))
+    wide = np.flatnonzero(lit.mean(axis=0) > 0.5)
+    left, right = (int(wide[0]), int(wide[-1])) if wide.size else (0, lit.shape[1] - 1)
+    return Grid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
+
+
+def view_of(preview: NDArray[np.float32], grid: Grid, index: int, angle: float, more_light: float) -> View:
+    """A projection on the grid; `more_light`: its exposure over that of the flats."""
+    counts, rows, cols = _binned(preview, grid.blocks)
+    depth, weight = np.empty_like(counts), np.empty_like(counts)
+    scale = np.float32(1.0 / more_light)
+    _line_integrals(
+        counts, grid.dark, grid.full, grid.lit, scale, np.float32(DARKEST * (1 if grid.flats else 1e3)), depth, weight
+    )
+    left, right = depth[:, grid.left : grid.left + EDGE], depth[:, grid.right + 1 - EDGE : grid.right + 1]
+    edges = float(np.median(left)), float(np.median(right))
+    return View(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
+
+
+def light_left(view: View, last: View | None, grid: Grid) -> float:
+    """Light in nine tenths of the places at most, over that of the last good view; before any, over the flats.
+
+    A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.
+    Places where the sample lets nothing through say nothing.
+    """
+    if last is None:
+        if not grid.flats:
+            return 1.0
+        through = view.weight[grid.lit > 0]
+        return (
+            1.0
+            if through.size == 0 or np.percentile(through[::3], BRIGHT) >= UNLIT
+            else float(np.percentile(through, BRIGHT))
+        )
+    seen = last.weight > SEEN
+    if not seen.any():
+        return 1.0
+    return math.exp(float(np.percentile((last.depth - view.depth)[seen][::3], BRIGHT)))
+
+
+def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[Cells, Cells, Cells]:
+    """Means of the cells, and of each preview row and column."""
+    rows, cols = preview.shape
+    cells = np.zeros((rows // blocks, cols // blocks), np.float32)
+    row_mean, col_mean = np.empty(rows, np.float32), np.zeros(cols, np.float32)
+    _bin(preview, blocks, cells, row_mean, col_mean)
+    return cells, row_mean, col_mean
+
+
+@numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+def _bin(preview, blocks, cells, row_mean, col_mean):  # type: ignore[no-untyped-def]  # numba infers the types
+    rows, cols = preview.shape
+    for row in range(rows):
+        line = preview[row]
+        total = np.float32(0)
+        for col in range(cols):
+            total += line[col]
+            col_mean[col] += line[col]
+        row_mean[row] = total / cols
+        if row < cells.shape[0] * blocks:
+            out = cells[row // blocks]
+            for cell in range(out.size):
+                part = np.float32(0)
+                for col in range(cell * blocks, (cell + 1) * blocks):
+                    part += line[col]
+                out[cell] += part
+    cells /= np.float32(blocks * blocks)
+    col_mean /= np.float32(rows)
+
+
+@numba.njit(nogil=True, cache=True)
+def _line_integrals(counts, dark, full, lit, scale, darkest, depth, weight):  # type: ignore[no-untyped-def]
+    for row in range(counts.shape[0]):
+        for col in range(counts.shape[1]):
+            through = max((counts[row, col] - dark[row, col]) / full[row, col] * scale, darkest)
+            if lit[row, col] > 0 and through == through:
+                depth[row, col] = -np.log(through)
+                weight[row, col] = min(through, np.float32(1))
+            else:
+                depth[row, col] = 0.0
+                weight[row, col] = 0.0

@@ -1,0 +1,53 @@
+"""A jump of the sample is flagged in the view in which it happens, with its size and direction."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.motion import Motion
+from tests.beamline.monitor.blobs import BLOCK, Blobs
+
+
+def only(scan: Blobs) -> list[Flag]:
+    return scan.flags([Motion()])
+
+
+def jumping(down: float, across: float, slip: int = 0) -> Blobs:
+    """From view 40 on the sample is elsewhere; pixels, steps."""
+    scan = Blobs(70)
+    shift = down / BLOCK, across / BLOCK
+    scan.depth = lambda view, image: scan.line_integrals(view + slip, shift) if view >= 40 else image
+    return scan
+
+
+@pytest.mark.parametrize(("down", "across"), [(1.0, 0.0), (0.0, -1.0), (-3.0, 2.0)])
+def test_a_jump_is_flagged_once_with_its_size(down: float, across: float) -> None:
+    flags = only(jumping(down, across))
+    assert [(flag.view, flag.level) for flag in flags] == [(50, Level.ALARM)]
+    assert flags[0].score == pytest.approx(np.hypot(down, across), rel=0.15)
+    signs = re.search(r"by ([+-]).* px across and ([+-]).* px down", flags[0].advice)
+    assert signs is not None
+    for sign, moved in zip(signs.groups(), (across, down), strict=True):
+        assert moved == 0 or (moved > 0) is (sign == "+")
+
+
+def test_a_slip_of_the_stage_is_counted_in_steps() -> None:
+    flags = only(jumping(0, 0, slip=5))
+    assert [flag.view for flag in flags] == [50]
+    assert flags[0].score == pytest.approx(5, abs=0.7)
+    assert "steps more than its step" in flags[0].advice
+
+
+def test_a_quarter_of_a_pixel_is_no_finding() -> None:
+    assert only(jumping(0.2, 0.2)) == []
+
+
+def test_vibration_raises_the_limit() -> None:
+    scan = Blobs(120)
+    rng = np.random.default_rng(4)
+    scan.depth = lambda view, image: scan.line_integrals(view, tuple(rng.normal(0, 0.4 / BLOCK, 2)))
+    assert only(scan) == []
