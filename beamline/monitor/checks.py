@@ -25,6 +25,9 @@ REGISTRY = {  # module in this folder: class of the check
     "lost": "Lost",
     "gain": "Gain",
     "motion": "Motion",
+    "floater": "Floater",
+    "ghost": "Ghost",
+    "field": "FieldOfView",
 }
 
 

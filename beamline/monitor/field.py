@@ -1,0 +1,99 @@
+"""Field: does light reach all of the frame, and is the sample within it?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.view import BRIGHT, UNLIT, Grid, View
+from drivers.frame import Frame, FrameKind
+
+LASTS = 5  # views in a row with matter at an edge
+
+
+@dataclass(frozen=True)
+class FieldState:
+    """Unlit flats were said; views in a row with matter at the edges; that was said."""
+
+    unlit: bool = False
+    cut: int = 0
+    said: bool = False
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
+
+    The defaults: a line integral of 0.1 at the edges is a tenth of what a sample has in its middle, and more than phase
+    fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
+    """
+
+    name: ClassVar[str] = "field"
+    bit: ClassVar[int] = 13
+    unit: ClassVar[str] = "share of the frame, or line integral at its edge"
+    meaning: ClassVar[str] = "a part of the frame gets no light even without a sample"
+    policy: ClassVar[Policy] = Policy.LOG
+
+    dark: Annotated[float, Field(ge=0, lt=1, description="share of the frame that may be without light")] = 0.02
+    edge: Annotated[float, Field(ge=0, description="line integral at the edges up to which the sample is inside")] = 0.1
+
+    def start(self) -> FieldState:
+        return FieldState()
+
+    def look(self, state: FieldState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FieldState]:
+        if frame.kind is FrameKind.FLAT and context.dark is not None:
+            if state.unlit:
+                return Look(state)
+            flag = self._unlit(frame, digest.preview - context.dark)
+            return Look(replace(state, unlit=flag is not None), flag)
+        if context.view is None or context.grid is None or not context.grid.flats or state.said:
+            return Look(state)
+        cut = state.cut + 1 if max(context.view.edges) > self.edge else 0
+        if cut < LASTS:
+            return Look(replace(state, cut=cut))
+        return Look(replace(state, said=True), self._cut(frame.index, context.view, context.grid))
+
+    def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
+        bright = float(np.percentile(light[::2, ::2], BRIGHT))
+        unlit = light < UNLIT * bright
+        share = float(unlit.mean())
+        if bright <= 0 or share <= self.dark:
+            return None
+        step = frame.counts.shape[0] / light.shape[0]
+        strips = [
+            (first, after, axis) for axis in (0, 1) for first, after in _runs(unlit.mean(axis=1 - axis) > 0.5, step)
+        ]
+        named = ", ".join(f"{('rows', 'columns')[axis]} {first} ... {after - 1}" for first, after, axis in strips)
+        rows, cols = frame.counts.shape
+        first, after, axis = max(strips, key=lambda strip: strip[1] - strip[0], default=(0, rows, 0))
+        region = (first, min(after, rows), 0, cols) if axis == 0 else (0, rows, first, min(after, cols))
+        advice = (
+            f"{share:.0%} of the frame gets no light, without a sample ({named or 'here and there'}): a slit or an "
+            "aperture shadows it. Open it, or choose a smaller region of the camera."
+        )
+        return Flag(self.name, Level.WARN, frame.index, share, self.dark, advice, region)
+
+    def _cut(self, row: int, view: View, grid: Grid) -> Flag:
+        left, right = view.edges
+        sides = " and ".join(side for side, depth in (("left", left), ("right", right)) if depth > self.edge)
+        advice = (
+            f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there): "
+            "the total absorption says nothing, crumbs must be faster to be seen, and reconstructions are brighter at "
+            "the rim."
+        )
+        rows, last = grid.shape[0] * grid.cell, grid.right + 1
+        first = grid.left if left >= right else max(last - 2, 0)
+        region = (0, rows, first * grid.cell, (first + 2) * grid.cell)
+        return Flag(self.name, Level.INFO, row, max(left, right), self.edge, advice, region)
+
+
+def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:
+    """First pixel, and the one after the last, of each unbroken run of marked lines of the preview."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
+    return [(round(first * step), round(after * step)) for first, after in edges.reshape(-1, 2).tolist()]

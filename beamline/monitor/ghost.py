@@ -1,0 +1,178 @@
+"""Ghost: fog that crosses the field from side to side, with more or less light than any view should have.
+
+As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan), but they look at the mean of
+all rows on broad columns, for a hump as broad as a part of the field: 2 % of light in one cell are lost in the noise,
+and in the mean of thousands of pixels they are a hundred times its noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
+from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
+from beamline.monitor.view import Cells
+from drivers.frame import Frame
+
+COLUMNS = 32  # broad columns of the field
+PARTS = 8  # of the rows
+MOST_PARTS = 25.0  # percentile of the parts that must have
+ALIKE = 0.25  # of the mean: fog is as high as the frame, a floater is in some parts only
+LAGS = (-4, -3, -2, -1, 0)  # times the stride
+SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
+MOST_STRIDE = 3
+WIDTHS = (1 / 7, 1 / 3.5)  # half width of the hump's foot, of the field
+CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first light in the field to its last
+STRUCTURE, COMMON = 0.3, 0.05**2
+MARGIN = 1.2
+WIDER = 2.2  # as for a floater
+FASTER = 1.3
+SHOWS = 4.0  # standard deviations that a hump at the limit must reach, or its filter is left out
+CALIBRATION = 24  # views
+LEAST_NOISE = 3e-4
+MEMORY, OUTLIER = 0.03, 3.0
+PEAK = 5.0
+RULES = Rules(span=10, least=4, share=0.6, total=0.0, rows=0.0, cols=2.5, slack=0.15)
+
+
+@dataclass(frozen=True, eq=False)
+class GhostState:
+    """What it remembers.
+
+    Attributes:
+        profiles: float32 [part of the rows, broad column] of the last views, oldest first.
+        filters: for the angle's `step` in radians.
+        usual: what the filters usually give at each column, None before the first.
+        peaks: the highest of each of the last views.
+    """
+
+    profiles: tuple[Cells, ...] = ()
+    angle: float = math.nan
+    filters: Filters | None = None
+    step: float = math.nan
+    usual: Cells | None = None
+    peaks: Peaks = field(default_factory=no_peaks)
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """Score: relative change of the light in the middle of the fog, without its sign: in the few views of a window, fog
+    that leaves a place looks like a shadow that comes.
+    """
+
+    name: ClassVar[str] = "ghost"
+    bit: ClassVar[int] = 11
+    unit: ClassVar[str] = "relative change of the light"
+    meaning: ClassVar[str] = (
+        "fog crosses the field: a broad hump of more or less light that does not turn with the sample"
+    )
+    policy: ClassVar[Policy] = Policy.LOG
+
+    warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the fog")] = 0.01
+    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.1
+
+    def start(self) -> GhostState:
+        return GhostState()
+
+    def look(self, state: GhostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[GhostState]:
+        view, grid = context.view, context.grid
+        if view is None or grid is None or view.depth.shape[1] < COLUMNS:
+            return Look(state)
+        if context.change is None:
+            return Look(GhostState((_profiles(view.depth, view.weight),), view.angle))
+        step = abs(view.angle - state.angle)
+        profiles = (*state.profiles, _profiles(view.depth, view.weight))
+        state = replace(state, profiles=profiles[-max(CALIBRATION, -LAGS[0] * MOST_STRIDE + 1) :], angle=view.angle)
+        if len(profiles) < CALIBRATION:
+            return Look(state)
+        stride = max(1, min(MOST_STRIDE, round(SWEEP / max(step, 1e-9))))
+        radius = COLUMNS / 2 * (WIDER if context.truncated else 1.0)
+        if state.filters is None or not abs(radius * step / state.step - 1) < 0.2:
+            made = _designed(radius * step, stride, _noise(state.profiles, stride), self.warn)
+            state = replace(state, filters=made, step=radius * step, usual=None)
+        assert state.filters is not None
+        if not state.filters.speeds.size:
+            return Look(state)
+        chosen = np.stack([state.profiles[-1 + lag * stride] for lag in LAGS])
+        outputs = np.empty((state.filters.speeds.size, *chosen.shape[1:]), np.float32)
+        correlate(chosen, state.filters.weights, outputs)
+        return self._judge(state, frame.index, outputs, radius * step / (COLUMNS / 2), context)
+
+    def _judge(
+        self, state: GhostState, now: int, outputs: Cells, turn: float, context: ScanContext
+    ) -> Look[GhostState]:
+        """The highest output, relative to what is usual there, and the peaks of the views before it."""
+        assert state.filters is not None and context.grid is not None
+        parts, outputs = outputs, outputs.mean(axis=1)
+        spread = np.sqrt(np.mean(outputs**2, axis=0))
+        usual = np.maximum(spread, 1.0) if state.usual is None else state.usual
+        scores = outputs / np.maximum(usual, 1.0)
+        signal, col = np.unravel_index(np.abs(scores).argmax(), scores.shape)
+        score, depth = float(scores[signal, col]), float(outputs[signal, col] / state.filters.strength[signal])
+        old = state.peaks[state.peaks[:, 0] >= now - RULES.span]
+        usual = usual + np.float32(MEMORY) * (np.minimum(spread, OUTLIER * usual) - usual)
+        state = replace(state, usual=usual, peaks=old)
+        as_high = np.percentile(parts[signal, :, col] / outputs[signal, col], MOST_PARTS) > ALIKE
+        if abs(score) <= PEAK or abs(depth) <= self.warn or not as_high:
+            return Look(state)
+        new = np.array([[now, 0.0, col, score]])
+        state = replace(state, peaks=np.concatenate([old, new]))
+        trail = best_trail(old, new, RULES, (COLUMNS - 1) / 2, FASTER * turn, COLUMNS / 2)
+        if trail is None:
+            return Look(state)
+        light = abs(math.expm1(-depth))
+        level, limit = (Level.ALARM, self.alarm) if light > self.alarm else (Level.WARN, self.warn)
+        rows, cols = context.grid.shape
+        broad = cols / COLUMNS
+        region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
+        advice = (
+            f"Fog crosses the field: it changes the light by {light:.1%}, "
+            f"{abs(trail.speed) * broad * context.grid.cell:.0f} px a view, which no part of the sample does. "
+            "Something between source and detector reflects or shadows the beam and moves with the stage: find it; "
+            "repeat these views."
+        )
+        return Look(state, Flag(self.name, level, now, light, limit, advice, region, int(trail.first)))
+
+
+def _profiles(depth: Cells, weight: Cells) -> Cells:
+    """Mean line integral of the cells that are lit [part of the rows, broad column]."""
+    starts = np.arange(min(PARTS, depth.shape[0])) * depth.shape[0] // min(PARTS, depth.shape[0])
+    sums, lit = (_broad(np.add.reduceat(x, starts, axis=0)) for x in (depth, (weight > 0).astype(np.float32)))
+    return np.asarray(sums / np.maximum(lit, 1), np.float32)
+
+
+def _broad(cols: Cells) -> Cells:
+    """Sums over COLUMNS groups of columns."""
+    return np.add.reduceat(cols, np.arange(COLUMNS) * cols.shape[1] // COLUMNS, axis=1)
+
+
+def _noise(profiles: tuple[Cells, ...], stride: int) -> float:
+    """Noise of a profile, with what its sample does beyond moving on: from second differences over `stride` views."""
+    seen = np.stack([profile.mean(axis=0) for profile in profiles])
+    second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]
+    return max(1.4826 * float(np.median(np.abs(second))) / math.sqrt(6.0), LEAST_NOISE)
+
+
+def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
+    """The filters for a sample whose rim moves `rim` broad columns a view."""
+    views, cols = window(LAGS)
+    signals, speeds = [], []
+    for width in WIDTHS:
+        for crossing in CROSSINGS:
+            for sign in (-1.0, 1.0):
+                speed = sign * COLUMNS * (1 + 2 * width) / crossing
+                if abs(speed) > FASTER * rim:
+                    away = np.clip((cols - speed * stride * views) / (width * COLUMNS), -1, 1)
+                    signals.append(np.cos(0.5 * np.pi * away) ** 2)
+                    speeds.append(speed)
+    clutter = Clutter(MARGIN * rim * stride, STRUCTURE, COMMON, noise**2)
+    made = filters(LAGS, clutter, np.array(signals).reshape(len(speeds), views.size), np.array(speeds))
+    keep = made.strength * 2 * limit > SHOWS
+    return Filters(made.weights[keep], made.strength[keep], made.speeds[keep])
