@@ -1,0 +1,337 @@
+"""Scenes for the monitor's figures: clean scans that are hard, anomalies of a stated strength, and their playback
+without a file.
+
+A frame is the simulator's; it is digested and looked at as in a scan. Anomalies come from the simulator's own effects,
+whose labels say where they are; what no effect does (dark rows, a step of the gain) is done to the counts here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.monitor.digest import FrameDigest, digest
+from drivers.frame import Frame, FrameKind
+from simulators.effects.anomaly import Label
+from simulators.effects.chain import AnyEffect, Chain
+from simulators.effects.floaters import Floaters
+from simulators.effects.ghost import Ghost
+from simulators.effects.jump import Jump
+from simulators.effects.lost_beam import LostBeam
+from simulators.frame.detector import Detector
+from simulators.frame.domain import Domain
+from simulators.frame.pose import Pose
+from simulators.frame.shot import Image, Shot, fixed_rng
+from simulators.samples.sample import Sample
+from simulators.scenes.expose import expose
+from simulators.scenes.scene import Scene, load_scene
+from simulators.scenes.shots import Scan
+
+ROWS, COLS, PITCH = 128, 512, 2.6  # um
+WIDTH, HEIGHT = COLS * PITCH * 1e-3, ROWS * PITCH * 1e-3
+SATURATION = 65535
+BIN = 4
+LIGHT = {"photons_per_s": 1.0e5}
+SENSOR: tuple[Any, ...] = (
+    "photon_noise",
+    "dark_current",
+    {"kind": "hot_pixels", "fraction": 2.0e-4, "rate": 2000.0, "seed": 3},
+    {"kind": "zingers", "rate": 5.0},
+    "read_noise",
+    "offset",
+)
+PROFILE = {"kind": "beam_profile", "sigma": [1.6, 0.8], "stripes": 0.03, "stripe_period": 0.09, "drift": 2.0e-5}
+
+
+def battery(width: float = 1.2, n_particles: int = 400, seed: int = 11) -> dict[str, Any]:
+    """As high as the frame is: the can fills all rows, as a stack of slices out of a longer can does."""
+    return {"kind": "battery", "field_of_view": [width, 1.2], "n_particles": n_particles, "seed": seed}
+
+
+def scene(
+    phantom: Mapping[str, Any], *effects: Any, beam: Mapping[str, float] = LIGHT, views: int = 900, **more: Any
+) -> dict[str, Any]:
+    detector = {"shape": [ROWS, COLS], "pixel_size_um": PITCH, "exposure_s": 0.05} | more.pop("detector", {})
+    scan = {"views": views, "range_deg": 180.0, "period_s": 0.1, "darks": 10, "flats": 10}
+    return {"phantom": dict(phantom), "beam": dict(beam), "axis_offset_px": 3.4, "detector": detector, "scan": scan} | {
+        "effects": list(effects) + more.pop("sensor", list(SENSOR))
+    }
+
+
+def _solids(*solids: Mapping[str, Any]) -> dict[str, Any]:
+    return {"kind": "solids", "solids": list(solids)}
+
+
+SPARSE = _solids(
+    {"kind": "tube", "outer_radius": 0.6, "inner_radius": 0.57, "height": 1.2, "attenuation": 1.5},
+    {"kind": "ellipsoid", "semi_axes": [0.03, 0.03, 0.03], "attenuation": 9.0, "centre": [0.4, 0.1, 0.02]},
+    {"kind": "ellipsoid", "semi_axes": [0.02, 0.02, 0.02], "attenuation": 9.0, "centre": [-0.2, 0.45, -0.05]},
+    {"kind": "box", "edges": [0.12, 0.1, 0.14], "attenuation": 4.0, "centre": [-0.2, -0.12, 0.05]},
+)
+FLAT_FACES = _solids(  # faces in the beam's direction: the silhouette changes at once
+    {"kind": "box", "edges": [0.9, 0.5, 1.2], "attenuation": 1.5},
+    {"kind": "box", "edges": [0.3, 0.1, 0.14], "attenuation": 5.0, "centre": [-0.2, -0.12, 0.05]},
+)
+
+CLEAN: dict[str, Callable[[int], dict[str, Any]]] = {
+    # n: 0, 1, ... gives other samples
+    "battery": lambda n: scene(battery(seed=100 + n), PROFILE, {"kind": "ring_current", "lifetime": 36000.0}),
+    "coarse": lambda n: scene(battery(seed=200 + n), PROFILE, views=180),
+    "sparse": lambda n: scene(SPARSE, PROFILE),
+    "faces": lambda n: scene(FLAT_FACES, PROFILE),
+    "interior": lambda n: scene(battery(3.0, 1500, seed=300 + n), PROFILE),  # dense particles enter by rotation
+    "top_up": lambda n: scene(
+        battery(seed=400 + n),
+        {"kind": "ring_current", "lifetime": 3600.0, "top_up_every": 36.0, "refill": (2.0, 0.0)[n % 2]},
+    ),
+    "starved": lambda n: scene(battery(seed=500 + n), PROFILE, beam={"photons_per_s": 1200.0}),
+    "fringes": lambda n: scene(
+        battery(seed=600 + n),
+        {"kind": "phase_fringes", "delta_beta": 4.0, "distance": 30.0, "energy": 8.3485, "method": "wave"},
+        views=450,
+    ),
+    "rings": lambda n: scene(
+        battery(seed=700 + n),
+        PROFILE,
+        {"kind": "flat_structure", "specks": 500, "radius_um": 8.0},
+        "prnu",
+        sensor=[
+            "photon_noise",
+            "dark_current",
+            {"kind": "hot_pixels", "fraction": 1.0e-3, "rate": 4000.0, "seed": n},
+            {"kind": "zingers", "rate": 40.0},
+            {"kind": "dead_pixels", "fraction": 2.0e-4, "seed": n},
+            "read_noise",
+            "offset",
+        ],
+    ),
+    "shaky": lambda n: scene(
+        battery(seed=800 + n),
+        {"kind": "runout", "radial": [[2, 0.2, 30.0]], "radial_random_um": 0.1, "axial_random_um": 0.1},
+        PROFILE | {"wander": [0.0, 1.0e-3]},
+    ),
+}
+"""Clean scans by the difficulty that they hold."""
+
+
+class Remembered:
+    """A sample whose line integrals are kept for each pose: many scans of it cost one."""
+
+    def __init__(self, sample: Sample) -> None:
+        self._sample, self._kept = sample, dict[bytes, NDArray[np.float32]]()
+
+    @property
+    def radius(self) -> float:
+        return self._sample.radius
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self._sample.names
+
+    def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> NDArray[np.float64]:
+        if not isinstance(angle, Pose):
+            return self._sample.line_integrals(angle, detector)
+        parts = (angle.angle, angle.shift, angle.tilt)
+        key = repr(detector).encode() + b"".join(b"-" if part is None else part.tobytes() for part in parts)
+        if key not in self._kept:
+            self._kept[key] = self._sample.line_integrals(angle, detector).astype(np.float32)
+        return self._kept[key].astype(np.float64)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("attenuation", "labels"):
+            return getattr(self._sample, name)
+        raise AttributeError(name)
+
+
+@dataclass(frozen=True)
+class Several:
+    """Several effects of one kind as one: a scene names each kind once."""
+
+    parts: tuple[Any, ...]
+
+    name: ClassVar[str] = "several"
+    final: ClassVar[bool] = False
+
+    @property
+    def domain(self) -> Domain:
+        return self.parts[0].domain  # type: ignore[no-any-return]
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        for part in self.parts:
+            image = part.apply(image, shot)
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        return [replace(label, which=i) for i, part in enumerate(self.parts) for label in part.labels(shot)]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The light, or the gain, steps by `share` at the view and stays. Labelled for one view."""
+
+    view: int
+    share: float
+
+    name: ClassVar[str] = "steps"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        if shot.sample and shot.view >= self.view:
+            image *= 1 + self.share
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        rows, cols = shot.detector.shape
+        return [Label("gain", (0, rows, 0, cols))] if shot.sample and shot.view == self.view else []
+
+
+@dataclass(frozen=True)
+class DarkLines:
+    """Rows, or columns, without light in a range of views; the offset and its noise stay."""
+
+    lines: slice
+    axis: int
+    views: tuple[int, int]
+    share: float = 0.0
+
+    name: ClassVar[str] = "dark_lines"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        if shot.sample and self.views[0] <= shot.view < self.views[1]:
+            image[self.lines if self.axis == 0 else (slice(None), self.lines)] *= self.share
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        if not (shot.sample and self.views[0] <= shot.view < self.views[1]):
+            return []
+        rows, cols = shot.detector.shape
+        ends = self.lines.start, self.lines.stop
+        return [Label("band", (*ends, 0, cols) if self.axis == 0 else (0, rows, *ends))]
+
+
+Make = Callable[[np.random.Generator, int], Any]
+"""An anomaly, drawn from a generator, for a scan of so many views."""
+CALIBRATION = 40  # views before the first anomaly
+
+
+def _views(rng: np.random.Generator, views: int, least: int = CALIBRATION, spare: int = 30) -> int:
+    return int(rng.integers(min(least, views // 4), views - spare))
+
+
+def floater(radius: float, depth: float, motion: str = "turning") -> Make:
+    """A cloud of the standard deviation of a ball of `radius` px (radius / 2 along each axis), `depth` through its
+    middle. Turning: 1.5 to 3.75 times as far from the axis as the frame's edge; loose: 2 to 20 px a view."""
+
+    def make(rng: np.random.Generator, views: int) -> Floaters:
+        seed, half = int(rng.integers(2**31)), WIDTH / 2
+        distance, size = (1.5 * half, 3.75 * half), radius / 2 * PITCH * 1e-3
+        share = fixed_rng("floaters", seed).uniform(0.5, 1.0, 4)[3]  # the fourth draw, as in Floaters.crumbs
+        speed, first = float(rng.uniform(2, 20)) * PITCH * 1e-3, _views(rng, views)
+        span = int(2 * WIDTH / speed) + 1
+        return Floaters(
+            distance=distance,
+            count=1,
+            size=(size, size),
+            depth=depth / share,
+            heights=(-0.4 * HEIGHT, 0.4 * HEIGHT),
+            motion="turning" if motion == "turning" else "loose",
+            speed=speed,
+            views=None if motion == "turning" else (first, first + span),
+            seed=seed,
+        )
+
+    return make
+
+
+def ghost(gain: float) -> Make:
+    """As wide as an eighth to a third of the frame; it crosses it in 10 to 60 views."""
+
+    def make(rng: np.random.Generator, views: int) -> Ghost:
+        width = WIDTH * rng.uniform(0.125, 0.33)
+        speed = (WIDTH + 2 * width) / rng.uniform(10, 60)
+        return Ghost(_views(rng, views, spare=70), width, speed, gain * rng.choice([-1, 1]))
+
+    return make
+
+
+def jump(pixels: float, down: bool) -> Make:
+    """Across the beam, as it is when it happens, or vertically."""
+
+    def make(rng: np.random.Generator, views: int) -> Jump:
+        view = _views(rng, views)
+        angle, um = math.pi * view / views, pixels * PITCH * rng.choice([-1, 1])
+        across = (um * math.cos(angle), um * math.sin(angle), 0.0)
+        return Jump(view, (0.0, 0.0, um) if down else across)
+
+    return make
+
+
+def gain(share: float) -> Make:
+    return lambda rng, views: Steps(_views(rng, views), share * rng.choice([-1, 1]))
+
+
+def lost(share: float) -> Make:
+    def make(rng: np.random.Generator, views: int) -> LostBeam:
+        first = _views(rng, views)
+        return LostBeam((first, first + int(rng.integers(1, 20))), share=share)
+
+    return make
+
+
+def band(lines: int, axis: int) -> Make:
+    def make(rng: np.random.Generator, views: int) -> DarkLines:
+        at, first = int(rng.integers((ROWS, COLS)[axis] - lines)), _views(rng, views)
+        return DarkLines(slice(at, at + lines), axis, (first, first + int(rng.integers(1, 20))))
+
+    return make
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A frame as the monitor sees it, and its labels."""
+
+    frame: Frame
+    digest: FrameDigest
+    labels: Sequence[Label]
+
+
+def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:
+    """The scene with anomalies before the noise, each in its domain."""
+    effects: list[AnyEffect] = list(base.chain.effects)
+    for domain in {anomaly.domain for anomaly in anomalies}:
+        added = [anomaly for anomaly in anomalies if anomaly.domain == domain]
+        at = next(
+            (
+                i
+                for i, effect in enumerate(effects)
+                if effect.domain > domain or (effect.final and effect.domain == domain)
+            ),
+            len(effects),
+        )
+        effects[at:at] = added if domain == Domain.MOTION else [Several(tuple(added))]
+    return replace(base, chain=Chain(tuple(effects)))
+
+
+def seen(scene: Scene, seed: int, preview_bin: int = BIN) -> Iterator[Seen]:
+    """The frames of a scan of the scene."""
+    scan = Scan.of(scene, seed)
+    for row, planned in enumerate(scan):
+        shot = planned.shot
+        counts = expose(scene, shot)
+        angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan
+        trigger = shot.view if planned.kind is FrameKind.PROJECTION else row
+        frame = Frame(counts, planned.kind, row, trigger, row, angle, shot.time, shot.exposure)
+        yield Seen(frame, digest(counts, SATURATION, preview_bin), scene.chain.labels(shot))
+
+
+def base_scene(name: str, n: int) -> Scene:
+    read = load_scene(CLEAN[name](n))
+    return replace(read, sample=Remembered(read.sample))
