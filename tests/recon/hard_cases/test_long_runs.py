@@ -31,10 +31,10 @@ def _start_and_data() -> tuple[Gaussians, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("steps", "residual"),
-    [(1500, 0.004), pytest.param(30_000, 0.002, marks=[pytest.mark.slow, pytest.mark.timeout(600)])],
+    ("steps", "loss"),
+    [(1500, 9e-4), pytest.param(30_000, 6e-4, marks=[pytest.mark.slow, pytest.mark.timeout(600)])],
 )
-def test_steps_without_drift(steps: int, residual: float) -> None:
+def test_steps_without_drift(steps: int, loss: float) -> None:
     start, data = _start_and_data()
     settings = FitSettings(policy=None, tv_weight=0.0)
     problem = fit.problem_of(data, VIEWS, Grid.matching(VIEWS), 0.7, settings)
@@ -55,7 +55,11 @@ def test_steps_without_drift(steps: int, residual: float) -> None:
     assert (twentieths < 2.5 * np.minimum.accumulate(twentieths)).all()
     assert twentieths[-1] < 1.2 * twentieths.min()
     assert twentieths[-1] < 0.2 * twentieths[1]
-    assert fit.misfit_of(state, problem, settings) < residual
+    # What is minimised, at the end: 4.9e-4 to 5.5e-4 after 30 000 steps (10 runs, two versions of the kernels),
+    # 5.0e-4 to 7.3e-4 after 1500 (8 runs). The root mean square of a single state scatters more:
+    # 0.0013 to 0.0020 in all of them.
+    assert twentieths[-1] < loss
+    assert fit.misfit_of(state, problem, settings) < 0.003
     p = state.parameters
     assert all(np.isfinite(values).all() for arrays in (p, state.first, state.second) for values in arrays.values())
     # A gradient is across its quaternion, so that every step makes it longer: they are brought back now and then.
