@@ -56,8 +56,9 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
 
     begin = now()
     placed = sample_gaussians(
-        first, max(1, round(count / whole)), np.random.default_rng(0), field_radius=geometry.reach
-    )
+        first, max(1, round(count / whole)), np.random.default_rng(0), field_radius=geometry.reach,
+        kernel=FitSettings().kernel,
+    )  # fmt: skip
     start_seconds = (now() - begin) * whole
     voxelize(placed, slices)
     begin = now()
@@ -102,7 +103,9 @@ def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
     # Root mean square distance of a random point to its three nearest neighbours: 0.75 of a cell for one of them each.
     distance = 0.75 * (cells.size * float(np.prod(grid.spacing)) / count) ** (1 / 3)
     width = max(0.8 * distance, 0.5 * geometry.sample_pitch)
-    return Gaussians.from_physical(means, np.full((count, 3), width), np.full(count, 0.5 * unit), density_unit=unit)
+    return Gaussians.from_physical(
+        means, np.full((count, 3), width), np.full(count, 0.5 * unit), density_unit=unit, kernel=FitSettings().kernel
+    )
 
 
 def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians, now: Clock) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from recon.reconstruction import Reconstruction
 from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
 from recon.voxels.direct import Fbp, has_direct_method
 from recon.voxels.fbp import Filter
@@ -126,7 +127,8 @@ def within(
         result = recon.reconstruct(data, geometry, Fbp(filter), grid=grid, control=RunControl(now=now))
         return Budgeted(result, prepared, choice, speeds, now() - begin)
     field = Grid.of_field(geometry, geometry.sample_pitch)
-    placed = place(data, geometry, field, max(1, round(choice.share * unbinned)), np.random.default_rng(seed))
+    count, rng = max(1, round(choice.share * unbinned)), np.random.default_rng(seed)
+    placed = place(data, geometry, field, count, rng, kernel=FitSettings().kernel)
     before = now()
     slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
     voxelize(placed, slab)

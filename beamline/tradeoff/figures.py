@@ -17,7 +17,7 @@ from recon.methods import by_name
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _MARKERS = {
-    "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "cut-off": "P",
+    "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
     "loss": "X", "start": "*",
 }  # fmt: skip
 

@@ -72,8 +72,8 @@ def _in_words(name: str, value: Plain) -> str:
             return f"{value} loss"
         case "fit.ssim_weight", 0:
             return "no SSIM"
-        case "fit.truncation.sigmas", _:
-            return f"cut at {float(value):g} σ"
+        case "fit.kernel", _:
+            return f"{value} kernel"
     return f"{name.rsplit('.', 1)[-1]} {value}"
 
 

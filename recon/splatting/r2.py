@@ -10,6 +10,7 @@ from typing import ClassVar, Self, get_args
 
 from recon.assess.time_model import PRESETS, Quality
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.method import PRECISION, Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
@@ -27,7 +28,6 @@ _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
 _FACTORS = {"quick": (0.5,), "full": (0.5, 2.0)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
-_SIGMAS = {"quick": (3.0,), "full": (2.5, 3.0, 4.5)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,8 @@ class R2:
         found += [
             TrialSettings("binning", {"steps": steps, "gaussians": coarse}, binning=2) for steps in _BINNED_STEPS[depth]
         ]
-        found += [TrialSettings("cut-off", base | {"fit.truncation.sigmas": n}) for n in _SIGMAS[depth]]
+        others = [kernel.value for kernel in Kernel if kernel is not FitSettings().kernel]
+        found += [TrialSettings("kernel", base | {"fit.kernel": name}) for name in others]
         found.append(TrialSettings("start", base | {"start": "tv"}))
         found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
         found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
@@ -128,5 +129,5 @@ class R2:
 
     def work(self, n_views: int, binning: int) -> float:
         count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or 0
-        spread = self.fit.kernel.reach(self.fit.truncation.sigmas) / FitSettings().truncation.sigmas
+        spread = self.fit.kernel.reach(self.fit.truncation.sigmas) / FitSettings().kernel.radius
         return (self.planned_steps or 0) * (1 + count / 2e4 * spread**2)

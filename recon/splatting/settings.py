@@ -65,7 +65,7 @@ class FitSettings:
     coarse: int = 1
     coarse_until: float = 0.2
     rays: RayModel = field(default_factory=RayModel)
-    kernel: Kernel = Kernel.GAUSSIAN
+    kernel: Kernel = Kernel.COMPACT
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))

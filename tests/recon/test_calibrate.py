@@ -11,6 +11,7 @@ from recon.base.volume import Grid, Volume
 from recon.calibrate import calibrate
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count, first_volume
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 
 SHAPE = (24, 60)
@@ -51,6 +52,7 @@ def test_every_beam_is_measured_by_its_own_pixels_at_the_axis(beam: str, monkeyp
     assert spread[0].n == default_count(Grid.of_field(geometry, 0.1)) == 2000
     assert np.abs(spread[0].means.numpy()[:, :2]).max() <= 0.1 * 60 / 2 * 1.5
     assert 0.05 <= float(spread[0].scales.max()) < 0.5
+    assert spread[0].kernel is FitSettings().kernel
     assert min(speeds.fbp, speeds.start, speeds.step, speeds.fill) > 0
 
 

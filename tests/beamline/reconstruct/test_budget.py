@@ -26,6 +26,7 @@ from recon.assess.time_model import PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -71,6 +72,7 @@ def test_the_time_is_used_and_not_exceeded(
     assert done.result.volume.grid == Grid.matching(prepared.geometry)
     assert f"of {budget:.3g} s" in done.summary(budget)
     assert done.settings(budget)["measured_step_s"] == 0.01
+    assert done.result.settings["kernel"] is FitSettings().kernel
     assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
 
 

@@ -42,7 +42,7 @@ def test_what_becomes_of_a_process(
     assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
 
 
-def test_kernels_are_compiled_once_for_each_method_start_and_loss(
+def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
@@ -50,10 +50,11 @@ def test_kernels_are_compiled_once_for_each_method_start_and_loss(
     monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
     compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
     job = json.loads(out.read_text())
-    words = ("start", "fit.loss")
+    words = ("start", "fit.loss", "fit.kernel")
     kinds = [(trial["method"], *(trial["settings"].get(name, "") for name in words)) for trial in job["compile"]]
     assert sorted(kinds) == [
-        ("fbp", "", ""), ("r2", "", ""), ("r2", "", "l2"), ("r2", "", "poisson"), ("r2", "tv", ""), ("sirt", "", "")
+        ("fbp", "", "", ""), ("r2", "", "", ""), ("r2", "", "", "gaussian"), ("r2", "", "l2", ""),
+        ("r2", "", "poisson", ""), ("r2", "tv", "", ""), ("sirt", "", "", ""),
     ]  # fmt: skip
     assert job["data"] == str(tmp_path / "data.npz")  # whose geometry decides which kernels are used
 

@@ -17,7 +17,7 @@ METHODS = names()
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
     "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},
-    "loss": {"fit.loss", "fit.ssim_weight"}, "start": {"start"}, "cut-off": {"fit.truncation.sigmas"},
+    "loss": {"fit.loss", "fit.ssim_weight"}, "start": {"start"}, "kernel": {"fit.kernel"},
     "iterations": {"iterations"},
 }  # fmt: skip
 
@@ -62,9 +62,9 @@ def test_a_method_or_setting_that_there_is_not_is_refused() -> None:
 def test_labels_say_what_is_not_the_default() -> None:
     trial = Trial("method", "r2", 60, settings={"steps": 500, "gaussians": 50_000})
     assert trial.label == "r2, 60 views, 500 steps, 50k Gaussians"
-    changed = {**trial.settings, "fit.ssim_weight": 0.0, "fit.truncation.sigmas": 3.0}
+    changed = {**trial.settings, "fit.ssim_weight": 0.0, "fit.kernel": "gaussian"}
     assert replace(trial, settings=changed, binning=2).label == (
-        "r2, 60 views, bin 2, 500 steps, 50k Gaussians, no SSIM, cut at 3 σ"
+        "r2, 60 views, bin 2, 500 steps, 50k Gaussians, no SSIM, gaussian kernel"
     )
     assert (
         replace(trial, settings={**trial.settings, "start": "tv"}).label

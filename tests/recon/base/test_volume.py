@@ -18,12 +18,13 @@ TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 
 
 def _sample(width: float, height: float, seed: int = 0) -> Gaussians:
-    """Blobs in a cylinder of this radius and half height, one of them at its rim."""
+    """Blobs of a fit's kernel in a cylinder of this radius and half height, one of them at its rim."""
     rng = np.random.default_rng(seed)
     angle, radius = rng.uniform(0, 2 * np.pi, 25), width * np.sqrt(rng.uniform(0, 1, 25))
     radius[0] = width
     means = np.stack((radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-height, height, 25)), 1)
-    return Gaussians.from_physical(means, np.full((25, 3), 1.5), rng.uniform(0.05, 0.1, 25))
+    densities = rng.uniform(0.05, 0.1, 25)
+    return Gaussians.from_physical(means, np.full((25, 3), 1.5), densities, kernel=FitSettings().kernel)
 
 
 def _fitted(data: np.ndarray, views: Geometry, grid: Grid | None = None) -> Reconstruction:
