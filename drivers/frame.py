@@ -32,6 +32,7 @@ class Frame:
         angle: radians, the stage position at the trigger; NaN where the position does not matter (a dark).
         time: s since the Unix epoch, at the trigger.
         exposure: s.
+        replaces: row of the view that this one was taken again for; -1: none.
     """
 
     counts: NDArray[np.uint16]
@@ -42,3 +43,4 @@ class Frame:
     angle: float
     time: float
     exposure: float
+    replaces: int = -1

@@ -27,6 +27,7 @@ from beamline.projections.flagged_frames import worst_frames
 from beamline.projections.replay import Kind, by_kind, counts_of, replay
 from beamline.report.contact_sheet import contact_sheet
 from beamline.storage.flag_legend import FrameFlags, Mark, counted, mark_of
+from beamline.storage.readers.base import rows_replaced
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.references import reference_groups
 from drivers.clock import SystemClock
@@ -97,21 +98,25 @@ def monitor(
             references = []
             if source.quantity == "counts":
                 references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
+            again = set(rows_replaced(source).tolist())
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_marks(marks))):
                 with whole_file(sheet) as partial:
                     partial.write_bytes(contact_sheet(worst))
         for fault in references:
             sink(Event("warning", clock.now(), {"message": fault}))
         kinds = by_kind(flags)
-        alarmed = {flag.view for flag in flags if flag.level is Level.ALARM}
+        alarmed = {flag.view for flag in flags if flag.level is Level.ALARM} - again
         done = {
-            "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "flags": counts_of(kinds),
-            "references": references, "kinds": [{**asdict(kind.worst), "rows": kind.rows} for kind in kinds],
+            "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
+            "flags": counts_of(kinds), "references": references,
+            "kinds": [{**asdict(kind.worst), "rows": kind.rows} for kind in kinds],
         }  # fmt: skip
         for json_sink in json_sinks:
             json_sink(Event("done", clock.now(), done))
     if not as_json:
-        click.echo("\n".join([*table(kinds), *references, f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"]))
+        end = f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"
+        end += f"; {len(again)} views were taken again: rows {spans(sorted(again))} do not count" if again else ""
+        click.echo("\n".join([*table(kinds), *references, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

@@ -67,10 +67,11 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     if not as_json:
         click.echo(_results(result))
     if result.alarmed_frames:
+        again = f", beside {result.retaken} views that were taken again" if result.retaken else ""
         raise AlarmError(
             f"The scan is complete, but {result.alarmed_frames} of {result.n_frames} frames have an alarm of the "
-            f"monitor: {counted(result.flags)}. `beamline recon` leaves such views out. Look at {result.path.parent}; "
-            "repeat the scan where too many are lost."
+            f"monitor{again}: {counted(result.flags)}. `beamline recon` leaves such views out. Look at "
+            f"{result.path.parent}; repeat the scan where too many are lost."
         )
 
 
@@ -120,6 +121,8 @@ def _results(result: RunResult) -> str:
     lines = [f"{'scan':<10}{result.path}", f"{'frames':<10}{result.n_frames}"]
     if result.flags:
         lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
+    if result.retaken:
+        lines.append(f"{'retaken':<10}{result.retaken} views with an alarm; `beamline recon` uses the new ones")
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
     return "\n".join(lines)

@@ -24,6 +24,10 @@ class MonitorBase(Section):
     """An alarm of a check is logged, or it stops the scan."""
     act_after: Annotated[int, Field(ge=1)] = 10
     """Frames in a row with an alarm before the check's policy pauses or aborts the scan."""
+    retake: bool = False
+    """Views with an alarm are taken again, once, after the last view."""
+    retake_share: Annotated[float, Field(gt=0, le=1)] = 0.25
+    """Share of the views that are taken again at most."""
 
     @model_validator(mode="before")
     @classmethod

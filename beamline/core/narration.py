@@ -39,8 +39,9 @@ def sentence(event: Event) -> str | None:
             return f"Volume from {data['n_views']} views so far: {data['path']}"
         case "scan_done":
             alarms = f", {data['alarmed_frames']} WITH AN ALARM" if data.get("alarmed_frames") else ""
+            again = f", {data['retaken']} views taken again" if data.get("retaken") else ""
             return (
-                f"Scan {data['status']}: {data['n_frames']} frames{alarms}, {size(data['bytes'])}, "
+                f"Scan {data['status']}: {data['n_frames']} frames{again}{alarms}, {size(data['bytes'])}, "
                 f"{data['seconds']:.1f} s: {data['path']}"
             )
         case "recon_done":

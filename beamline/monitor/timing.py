@@ -36,7 +36,7 @@ class Timing:
         return TimingState()
 
     def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
-        if frame.kind is not FrameKind.PROJECTION or context.period is None:
+        if frame.kind is not FrameKind.PROJECTION or context.period is None or frame.replaces >= 0:
             return Look(state)
         after = TimingState(frame.trigger, frame.time)
         steps = frame.trigger - state.trigger

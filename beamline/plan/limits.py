@@ -32,6 +32,8 @@ class Facts:
     blur_px: float
     skew_px: float
     total_bytes: int
+    retake_bytes: int
+    retake_seconds: float
     free_bytes: int | None
 
 
@@ -55,9 +57,10 @@ def violations(facts: Facts) -> Iterator[str]:
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
             yield f"no {name}: scan.{name}.count is 0; take at least one, or say at: none where that is meant"
-    if facts.free_bytes is not None and facts.total_bytes * ROOM > facts.free_bytes:
+    needed = facts.total_bytes + facts.retake_bytes
+    if facts.free_bytes is not None and needed * ROOM > facts.free_bytes:
         yield (
-            f"the file needs {size(facts.total_bytes)} and a tenth more, the disk has {size(facts.free_bytes)} free; "
+            f"the file needs {size(needed)} and a tenth more, the disk has {size(facts.free_bytes)} free; "
             "free some, choose another storage.folder, or reduce views, roi or binning"
         )
 
@@ -93,6 +96,11 @@ def remarks(facts: Facts) -> Iterator[str]:
         yield (
             f"{plan.angles.size} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: "
             "filtered back-projection will show streaks towards the edge"
+        )
+    if plan.retakes:
+        yield (
+            f"views with an alarm of the monitor are taken again after the last view, up to {plan.retakes} "
+            f"(monitor.retake_share): {facts.retake_seconds:.0f} s and {size(facts.retake_bytes)} more at most"
         )
     yield from _reference("flats", plan.flats, plan.exposure, "their light will be scaled")
     yield from _reference("darks", plan.darks, plan.exposure, "their hot pixels and dark current are not the views'")

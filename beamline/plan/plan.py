@@ -46,6 +46,7 @@ class ScanPlan:
         settle: s to wait after each move of a step scan.
         darks, flats: reference frames.
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
+        retake_share: of the views, how many with an alarm of the monitor are taken again at most; 0: none.
     """
 
     angles: NDArray[np.float64]
@@ -56,6 +57,12 @@ class ScanPlan:
     darks: FieldPlan
     flats: FieldPlan
     scheme: str
+    retake_share: float = 0.0
+
+    @property
+    def retakes(self) -> int:
+        """Views that are taken again at most."""
+        return max(1, int(self.retake_share * self.angles.size)) if self.retake_share > 0 else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +102,16 @@ class Timeline:
 
     Attributes:
         blocks: in the order of acquisition.
-        duration: s, with taxi, settling, moves and reference frames.
+        duration: s, with taxi, settling, moves and reference frames; without views that are taken again.
         frame_bytes: of one frame's uint16 pixels.
-        total_bytes: of the whole file, pixels and previews.
+        total_bytes: of the whole file, pixels and previews; without views that are taken again.
         step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
         step: radians that these counts are.
         blur_px: how far a point at the detector's edge moves during an exposure, in pixels.
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: what the operator should know though it breaks nothing.
+        retake_seconds: for the most views that may be taken again.
     """
 
     blocks: tuple[Block, ...]
@@ -116,6 +124,7 @@ class Timeline:
     skew_px: float
     violations: tuple[str, ...]
     remarks: tuple[str, ...]
+    retake_seconds: float = 0.0
 
     @property
     def n_frames(self) -> int:

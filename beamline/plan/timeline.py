@@ -12,6 +12,7 @@ from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
 from beamline.plan.limits import Facts, remarks, violations
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
+from beamline.plan.retake import Retake, retake_block, spread
 from beamline.plan.triggers import Flight, Scale, plan_flight
 from drivers.frame import FrameKind
 from drivers.protocols import CameraTiming, StageLimits
@@ -57,6 +58,8 @@ def work_out(
     speed = views.speed * _half_width(camera, axis_col)
     frame_bytes = camera.shape[0] * camera.shape[1] * BYTES_PER_PIXEL
     preview_bytes = math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
+    retake_seconds = _retake_seconds(plan, views, stage, camera)
+    row_bytes = frame_bytes + preview_bytes
     facts = Facts(
         plan=plan,
         views=views,
@@ -67,7 +70,9 @@ def work_out(
         reach=_reach(views),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
-        total_bytes=(frame_bytes + preview_bytes) * sum(block.n for block in blocks),
+        total_bytes=row_bytes * sum(block.n for block in blocks),
+        retake_bytes=row_bytes * plan.retakes,
+        retake_seconds=retake_seconds,
         free_bytes=free_bytes,
     )
     step_counts = flight.interval if flight else 0
@@ -82,6 +87,7 @@ def work_out(
         skew_px=facts.skew_px,
         violations=(*broken, *violations(facts)),
         remarks=tuple(remarks(facts)),
+        retake_seconds=retake_seconds,
     )
 
 
@@ -179,6 +185,15 @@ def _reach(views: Block) -> tuple[float, float]:
     """The smallest and the largest angle that the stage would be sent to."""
     ends = np.array(pass_ends(views)).ravel() if views.trains else views.angles
     return float(ends.min()), float(ends.max())
+
+
+def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: CameraTiming) -> float:
+    """For the most views that may be taken again, evenly spread, from where the views ended."""
+    if not plan.retakes:
+        return 0.0
+    triggers = [retake.trigger for retake in spread([Retake(i, i) for i in range(views.n)], plan.retakes)]
+    block = retake_block(views, np.array(triggers, np.int64))
+    return block_seconds(block, stage, camera, plan.settle) + _return(views, stage)
 
 
 def _return(views: Block, stage: StageLimits) -> float:

@@ -15,7 +15,7 @@ from beamline.monitor.digest import digest
 from beamline.monitor.references import full_scale
 from beamline.monitor.watch import look, start
 from beamline.storage.flag_legend import FrameFlags, mark_of
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, rows_replaced
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
 
@@ -82,9 +82,12 @@ def replay(
     while True:
         ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
         n = source.refresh()
+        again = frozenset(rows_replaced(source).tolist())
         for frame in _frames(source, done):
             if should_stop():
                 return
+            if frame.index in again:  # what the monitor saw before it was taken again
+                frame = replace(frame, kind=FrameKind.PROJECTION)
             seen = digest(frame.counts, monitor.context.saturation, PREVIEW_BIN)
             monitor, flags = look(monitor, frame, seen)
             yield Judged(frame.index, frame.kind, flags, n)

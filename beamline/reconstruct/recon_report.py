@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from beamline.core.text import spans
 from beamline.projections.flagged_frames import reasons, worst_frames
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
@@ -19,7 +20,7 @@ from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, residual_curve
 from beamline.storage.flag_legend import FrameFlags, counted
-from beamline.storage.readers.open import ScanSource
+from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.writers.recon_file import Value
 from drivers.frame import FrameKind
 from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
@@ -160,6 +161,9 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     }
     table |= {str(k): _text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n = int(source.image_key.size)
+    again = rows_replaced(source)
+    if again.size:
+        table["views taken again"] = f"{again.size}, because of an alarm: rows {spans(again.tolist())} are not used"
     remarks = [] if flags is None else reasons(flags)
     flagged = [] if flags is None else worst_frames(source, flags)
     return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks, flagged)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from beamline.core.events import Emit
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import spans
 from beamline.plan.plan import Block, Timeline
+from beamline.plan.retake import middle_of_exposure, retake_block
 from beamline.scan.exposures import Exposures, Taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.supervision import UNSUPERVISED, Supervision
@@ -25,10 +26,11 @@ NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DA
 
 @dataclass(frozen=True)
 class TakenBlock:
-    """A block with its frames and missing triggers."""
+    """A block with its frames and missing triggers; `again`: its views were taken before."""
 
     block: Block
     taken: Taken
+    again: bool = False
 
 
 class Acquisition:
@@ -68,7 +70,7 @@ class Acquisition:
     @property
     def missing(self) -> list[int]:
         """Triggers, counted over the whole plan, that gave no frame so far (those never reached are not among them)."""
-        return [done.block.first_row + i for done in self._done for i in done.taken.missing]
+        return [done.block.first_row + i for done in self._done if not done.again for i in done.taken.missing]
 
     def frames(self) -> Generator[Frame, None, None]:
         """Frames, each with its own memory, its row in the file, its trigger and its angle.
@@ -111,26 +113,47 @@ class Acquisition:
             if block.kind is FrameKind.PROJECTION and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            done = TakenBlock(block, Taken())
-            self._done.append(done)
-            what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.n, "first_row": self.n_frames}
-            self._emit("block_started", {**what, "exposure": block.exposure, "period": block.period})
-            self._set_shutter_and_sample(block.kind)
-            yield from self._exposures.take(block, self.n_frames, done.taken)
-            if block.kind is FrameKind.FLAT:
-                self._devices.sample.back()
-            taken = done.taken
-            self._emit(
-                "block_done",
-                {
-                    **what,
-                    "frames": taken.frames,
-                    "missing": taken.missing,
-                    "lost": taken.lost,
-                    "ignored": taken.ignored,
-                    "extra": taken.extra,
-                },
-            )
+            yield from self._block(TakenBlock(block, Taken()))
+            if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
+                yield from self._again(block)
+
+    def _block(self, done: TakenBlock) -> Iterator[Frame]:
+        block, taken = done.block, done.taken
+        self._done.append(done)
+        what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.n, "first_row": self.n_frames}
+        self._emit("block_started", {**what, "exposure": block.exposure, "period": block.period})
+        self._set_shutter_and_sample(block.kind)
+        yield from self._exposures.take(block, self.n_frames, taken)
+        if block.kind is FrameKind.FLAT:
+            self._devices.sample.back()
+        self._emit(
+            "block_done",
+            {
+                **what,
+                "frames": taken.frames,
+                "missing": taken.missing,
+                "lost": taken.lost,
+                "ignored": taken.ignored,
+                "extra": taken.extra,
+            },
+        )
+
+    def _again(self, views: Block) -> Iterator[Frame]:
+        """The views that supervision wants again; each says which row it replaces. One that gives no frame replaces
+        none, and that is no failure of the scan."""
+        retakes = self._supervision.retakes()
+        if not retakes:
+            return
+        triggers = np.array([retake.trigger for retake in retakes], np.int64)
+        beyond = middle_of_exposure(views)[triggers]
+        done = TakenBlock(retake_block(views, triggers), Taken(), again=True)
+        for frame in self._block(done):
+            i = frame.trigger
+            angle = frame.angle - float(beyond[i])
+            yield replace(frame, angle=angle, trigger=views.n + i, replaces=retakes[i].row)
+        if done.taken.missing:
+            rows = spans([retakes[i].row for i in done.taken.missing])
+            self._emit("warning", {"message": f"The views in rows {rows} gave no frame when they were taken again."})
 
     def _still_needed(self, block: Block) -> bool:
         """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.
@@ -206,7 +229,8 @@ class Acquisition:
         return failed
 
     def _raise_outcome(self) -> None:
-        views = sum(done.taken.frames for done in self._done if done.block.kind is FrameKind.PROJECTION)
+        of_views = [done for done in self._done if done.block.kind is FrameKind.PROJECTION and not done.again]
+        views = sum(done.taken.frames for done in of_views)
         planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
@@ -228,7 +252,7 @@ class Acquisition:
 
     def _discrepancies(self) -> str:
         """Sentences on missing, extra and doubtful frames so far, each after a space."""
-        return "".join(f" {text}" for done in self._done if (text := _describe(done)))
+        return "".join(f" {text}" for done in self._done if not done.again and (text := _describe(done)))
 
 
 def _in_words(error: Exception) -> str:

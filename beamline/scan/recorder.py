@@ -19,8 +19,9 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import Monitor, look
 from beamline.plan.plan import Timeline
+from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
-from drivers.frame import Frame
+from drivers.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # at least and at most
@@ -49,7 +50,8 @@ class Recorder:
 
     Attributes:
         n_frames: written so far.
-        alarmed_frames: frames so far with an alarm of any check.
+        alarmed_views: views so far with an alarm of any check.
+        retaken: views that were taken again.
         references: the darks and flats so far.
     """
 
@@ -70,7 +72,9 @@ class Recorder:
         self._monitor_off = False
         self.n_frames = 0
         self._flagged: Counter[tuple[str, Level]] = Counter()
-        self.alarmed_frames = 0
+        self._alarmed: set[int] = set()
+        self.alarmed_views: list[Retake] = []
+        self.retaken = 0
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
         low, high = WAITING_FRAMES
@@ -128,6 +132,15 @@ class Recorder:
         return found
 
     @property
+    def alarmed_frames(self) -> int:
+        """Frames so far with an alarm of any check, without those that were taken again."""
+        return len(self._alarmed)
+
+    def expect_more(self, n: int, seconds: float) -> None:
+        """Frames beside the timeline's come next; may be called while no frame waits."""
+        self._progress.expect_more(self.n_frames, n, seconds)
+
+    @property
     def hangs(self) -> bool:
         """A frame is still being written; after `finish` this means that the disk does not answer."""
         return self._thread.is_alive()
@@ -172,7 +185,7 @@ class Recorder:
         self._writer.append(frame, found, flags)
         self.references.add(frame, found)
         self.n_frames += 1
-        self._report(flags)
+        self._report(frame, flags)
         data = self._progress.update(frame, self.n_frames)
         if data is not None:
             self._emit("frame", {**data, "mean": found.mean})
@@ -189,10 +202,16 @@ class Recorder:
             return ()
         return flags
 
-    def _report(self, flags: tuple[Flag, ...]) -> None:
+    def _report(self, frame: Frame, flags: tuple[Flag, ...]) -> None:
         """Count flags; emit a `flag` event where a check begins to flag or its level changes, not for every frame."""
         self._flagged.update((flag.check, flag.level) for flag in flags)
-        self.alarmed_frames += any(flag.level is Level.ALARM for flag in flags)
+        if frame.replaces >= 0:
+            self.retaken += 1
+            self._alarmed.discard(frame.replaces)
+        if any(flag.level is Level.ALARM for flag in flags):
+            self._alarmed.add(frame.index)
+            if frame.kind is FrameKind.PROJECTION:
+                self.alarmed_views.append(Retake(frame.index, frame.trigger))
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:
@@ -211,6 +230,12 @@ class _Progress:
         self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
         self._times: deque[float] = deque(maxlen=RATE_FRAMES)
         self._last_event = -EVENT_INTERVAL
+
+    def expect_more(self, done: int, n: int, seconds: float) -> None:
+        """After `done` frames `n` come that were not planned, in `seconds`."""
+        before, after = self._ahead[: done + 1] + seconds, self._ahead[done:]
+        self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
+        self._total += n
 
     def update(self, frame: Frame, n: int) -> Mapping[str, Any] | None:
         """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""

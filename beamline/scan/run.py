@@ -22,6 +22,7 @@ from beamline.core.stop import HoldRequest, ScanAborted, StopRequest
 from beamline.instrument.connect import Instrument, connect
 from beamline.instrument.operator import ask_operator
 from beamline.plan.plan import Block
+from beamline.plan.retake import Retake, spread
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
 from beamline.scan.ledger import LedgerError
@@ -71,7 +72,8 @@ class RunResult:
         n_frames: rows of the file.
         missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
         flags: frames that the monitor flagged: their number by check, then by level.
-        alarmed_frames: frames with an alarm.
+        alarmed_frames: frames with an alarm, without those that were taken again.
+        retaken: views that were taken again, because they had one.
         seconds: real time of the whole run.
         bytes: size of the scan file.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
@@ -82,6 +84,7 @@ class RunResult:
     missing: tuple[int, ...]
     flags: Mapping[str, Mapping[str, int]]
     alarmed_frames: int
+    retaken: int
     seconds: float
     bytes: int
     recon: Mapping[str, Any] | None
@@ -213,6 +216,7 @@ class _Run:
             missing=tuple(missing),
             flags=recorder.flags,
             alarmed_frames=recorder.alarmed_frames,
+            retaken=recorder.retaken,
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
             recon=None,
@@ -279,7 +283,8 @@ class _Run:
         ready, instrument = self.ready, self.instrument
         return Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
-            self.emit, Supervision(lambda: self._refusal(recorder), self.hold.take, self.ask),
+            self.emit,
+            Supervision(lambda: self._refusal(recorder), self.hold.take, self.ask, lambda: self._retakes(recorder)),
         )  # fmt: skip
 
     def _refusal(self, recorder: Recorder) -> str | None:
@@ -294,6 +299,26 @@ class _Run:
             f"The shutter is closed; the {recorder.n_frames} darks and flats are in the file. `beamline tune` looks "
             "for an exposure; references.on_fault: log takes the scan all the same."
         )
+
+    def _retakes(self, recorder: Recorder) -> Sequence[Retake]:
+        """Views with an alarm, evenly spread where there are more than the plan allows."""
+        most = self.ready.plan.retakes
+        if not most:
+            return ()
+        recorder.wait()
+        alarmed = recorder.alarmed_views
+        chosen = spread(alarmed, most)
+        if not chosen:
+            return ()
+        if len(chosen) < len(alarmed):
+            message = (
+                f"{len(alarmed)} views have an alarm, and {most} may be taken again (monitor.retake_share): "
+                f"{len(alarmed) - len(chosen)} between them stay as they are."
+            )
+            self.emit("warning", {"message": message})
+        recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
+        self.emit("state", {"state": "retaking", "message": f"Taking {len(chosen)} views with an alarm again"})
+        return chosen
 
     def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:
         """What is wrong with the darks and flats so far, by group; of a new one it is a warning."""

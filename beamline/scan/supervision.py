@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from beamline.core.events import Emit
 from beamline.core.stop import HoldRequest, StopRequest
 from beamline.monitor.check import Flag, Level, Policy
+from beamline.plan.retake import Retake
 from drivers.manual import Ask
 
 
@@ -26,11 +27,13 @@ class Supervision:
         hold: asked before each view of a step scan and before each pass of a fly scan: why it should wait; None: it
             goes on.
         ask: puts the request to go on to the operator, and returns when it was confirmed.
+        retakes: asked once, after the last projection: which of them to take again.
     """
 
     refusal: Callable[[], str | None] = lambda: None
     hold: Callable[[], str | None] = lambda: None
     ask: Ask = _nobody
+    retakes: Callable[[], Sequence[Retake]] = lambda: ()
 
 
 UNSUPERVISED = Supervision()

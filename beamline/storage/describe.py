@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import source_findings
 from drivers.frame import FrameKind
@@ -23,8 +23,8 @@ def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
 def describe_source(source: ScanSource) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
 
-    Angles are in degrees. `flags` are frames by check and level. `findings` are the messages of errors and warnings,
-    `reconstructable` whether no error stands against a reconstruction.
+    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `findings`
+    are the messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     findings = source_findings(source)
@@ -53,7 +53,10 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
 
 
 def _angles(source: ScanSource) -> dict[str, float | None]:
-    angles = np.degrees(source.angles[source.image_key == FrameKind.PROJECTION])
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    if (replaces := source.replaces) is not None:  # in the order in which they were planned
+        views = views[np.argsort(np.where(replaces[views] >= 0, replaces[views], views))]
+    angles = np.degrees(source.angles[views])
     if angles.size == 0 or not np.isfinite(angles).all():
         return {"first_angle_deg": None, "last_angle_deg": None, "step_deg": None}
     step = float(np.median(np.diff(np.unique(angles)))) if np.unique(angles).size > 1 else None
@@ -63,9 +66,13 @@ def _angles(source: ScanSource) -> dict[str, float | None]:
 def _flags(source: ScanSource) -> dict[str, Any]:
     flags = source.flags
     if flags is None:
-        return {"flagged_frames": None, "alarmed_frames": None, "flags": None}
-    flagged, alarmed = int(flags.flagged.sum()), int(flags.alarmed.sum())
-    return {"flagged_frames": flagged, "alarmed_frames": alarmed, "flags": flags.counts()}
+        return {"flagged_frames": None, "alarmed_frames": None, "flags": None, "retaken_views": None}
+    return {
+        "flagged_frames": int(flags.flagged.sum()),
+        "alarmed_frames": int(flags.alarmed.sum()),
+        "flags": flags.counts(),
+        "retaken_views": rows_replaced(source).size,
+    }
 
 
 def _size(path: Path) -> int:

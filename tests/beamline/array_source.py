@@ -24,6 +24,7 @@ class ArraySource:
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
     flags = None
+    replaces = None
     finished = True
     plan: dict[str, Any] = {}  # noqa: RUF012
 

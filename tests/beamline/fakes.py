@@ -79,13 +79,18 @@ class FakeInstrument:
         self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
     ) -> Timeline:
         """Work out `n` views over half a turn at `speed` (degrees/s, one pass) with 3 darks and 2 flats."""
-        self.period = 180 * passes / n / speed
-        angles = np.linspace(0, np.pi, n, endpoint=False)
-        angles = np.concatenate([angles[i::passes] for i in range(passes)])
-        plan = ScanPlan(angles, mode, 0.02, self.period, 0.05, FieldPlan(3, at, 0.02), FieldPlan(2, at, 0.03), "fixed")
+        plan = self.plan(n, mode, passes, at, speed)
         timeline = work_out(plan, self.stage.limits, self.stage.to_counts, self.camera.timing)
         assert timeline.violations == ()
         return timeline
+
+    def plan(
+        self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
+    ) -> ScanPlan:
+        self.period = 180 * passes / n / speed
+        angles = np.linspace(0, np.pi, n, endpoint=False)
+        angles = np.concatenate([angles[i::passes] for i in range(passes)])
+        return ScanPlan(angles, mode, 0.02, self.period, 0.05, FieldPlan(3, at, 0.02), FieldPlan(2, at, 0.03), "fixed")
 
 
 class Stage:

@@ -39,6 +39,8 @@ class ScanSource(Protocol):
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         attributes: whatever else the file says, for the record.
         flags: of the monitor, by frame; None where no monitor looked at the frames.
+        replaces: int64 [frame], the row of the view that a frame was taken again for (an INVALID frame from then on),
+            -1 in others; None where no view was taken again.
         plan: what the operator asked for, as our files record it; empty where it is not known.
         finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
@@ -71,6 +73,8 @@ class ScanSource(Protocol):
     def attributes(self) -> Attributes: ...
     @property
     def flags(self) -> FrameFlags | None: ...
+    @property
+    def replaces(self) -> NDArray[np.int64] | None: ...
     @property
     def plan(self) -> Mapping[str, Any]: ...
     @property
@@ -117,6 +121,12 @@ def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
     return rows - np.maximum.accumulate(starts)
 
 
+def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
+    """Rows of the views that were taken again, ascending."""
+    replaces = source.replaces
+    return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
+
+
 class ScanReader(ABC):
     """Base class of the readers: a format adds what it knows and `read`; the rest is here once.
 
@@ -148,6 +158,10 @@ class ScanReader(ABC):
 
     @property
     def flags(self) -> FrameFlags | None:
+        return None
+
+    @property
+    def replaces(self) -> NDArray[np.int64] | None:
         return None
 
     @property

@@ -139,6 +139,11 @@ class NXtomoSource(ScanReader):
     def flags(self) -> FrameFlags | None:
         return read_flags(self._file, self.n) if self._ours else None
 
+    @property
+    def replaces(self) -> NDArray[np.int64] | None:
+        rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n] if self._ours else np.full(0, -1)
+        return rows if (rows >= 0).any() else None
+
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the frames asked for, in that order."""
         indices = frame_indices(frames, self.n)
@@ -160,6 +165,7 @@ class NXtomoSource(ScanReader):
         time = self._seconds(self._places.entry, "frame_log/time")
         trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
         framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
+        replaces = self._column("frame_log/replaces", np.full(self.n, -1))
         for i in range(first, self.n):
             yield Frame(
                 counts=self.read([i])[0],
@@ -170,6 +176,7 @@ class NXtomoSource(ScanReader):
                 angle=float(self.angles[i]),
                 time=float(time[i]),
                 exposure=float(self.exposures[i]),
+                replaces=int(replaces[i]),
             )
 
     def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:

@@ -86,6 +86,11 @@ class Overlay(ScanReader):
         return None if flags is None else flags.after(len(self._front))
 
     @property
+    def replaces(self) -> NDArray[np.int64] | None:
+        rows, n = self._base.replaces, len(self._front)
+        return None if rows is None else np.concatenate([np.full(n, -1), np.where(rows < 0, -1, rows + n)])
+
+    @property
     def finished(self) -> bool:
         return self._base.finished
 

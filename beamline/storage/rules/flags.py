@@ -8,7 +8,7 @@ import numpy as np
 
 from beamline.core.text import spans
 from beamline.storage.flag_legend import FrameFlags, counted
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.finding import Finding
 from drivers.frame import FrameKind
 
@@ -25,12 +25,19 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
     flags = source.flags if judged is None else judged
     if flags is None or not flags.flagged.any():
         return
-    rows = np.flatnonzero(flags.alarmed)
+    rows, again = np.flatnonzero(flags.alarmed), rows_replaced(source)
     message = f"The monitor flagged {flags.flagged.sum()} of {flags.bits.size} frames: {counted(flags.counts())}."
     if not rows.size:
         yield Finding("info", "flags", message)
         return
     message += f" Rows with an alarm: {spans(rows.tolist())}."
+    if again.size:
+        message += f" {again.size} views were taken again, the first ones (rows {spans(again.tolist())}) are not used."
+        rows = np.setdiff1d(rows, again)
+        if not rows.size:
+            yield Finding("info", "flags", f"{message} None of those that are has an alarm.")
+            return
+        message += f" Of those that are, {rows.size} have an alarm: {spans(rows.tolist())}."
     views = source.image_key == FrameKind.PROJECTION
     left, lost = int((views & ~flags.alarmed).sum()), int((views & flags.alarmed).sum())
     if lost and left < FEWEST_VIEWS:

@@ -6,8 +6,8 @@
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time of each frame; its flags, flag_scores, flag_regions and
-                                frame_valid; flag_legend: bits of the flags
+      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; its flags,
+                                flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
@@ -49,6 +49,7 @@ ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
 PREVIEW = "/entry/digest/preview"
 COMMITTED = "/entry/progress/frames_committed"
+REPLACES = "/entry/frame_log/replaces"
 FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
@@ -69,6 +70,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "/entry/frame_log/trigger": ("<i8", ""),
         "/entry/frame_log/framestamp": ("<i8", ""),
         "/entry/frame_log/time": ("<f8", "s"),
+        REPLACES: ("<i8", ""),
         FLAGS: ("<u4", ""),
         "/entry/digest/minimum": ("<f8", ""),
         "/entry/digest/maximum": ("<f8", ""),
@@ -127,6 +129,7 @@ class Record:
     framestamp: int = -1
     time: float = np.nan
     mark: Mark = UNMARKED
+    replaces: int = -1
 
 
 def iso_time(seconds: float) -> str:
@@ -238,7 +241,10 @@ class Rows:
         self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in paths}
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Row `row`, which may exist or be the next: pixels first, then what is said about them."""
+        """Row `row`, which may exist or be the next: pixels first, then what is said about them.
+
+        A view that it replaces becomes an invalid frame, so that no program takes both.
+        """
         said = {
             "image_key": 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
             "kind": int(record.kind),
@@ -247,6 +253,7 @@ class Rows:
             "trigger": record.trigger,
             "framestamp": record.framestamp,
             "time": record.time,
+            "replaces": record.replaces,
             "flags": record.mark.bits,
             "frame_valid": record.mark.valid,
             "flag_scores": record.mark.scores,
@@ -258,6 +265,9 @@ class Rows:
         for name, column in self._columns.items():
             self._grow(column, row + 1)
             column[row] = said[name] if name in said else vars(digest)[name]
+        if record.replaces >= 0:
+            for name in ("image_key", "kind"):
+                self._columns[name][record.replaces] = int(FrameKind.INVALID)
 
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:

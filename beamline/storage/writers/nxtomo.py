@@ -111,8 +111,9 @@ class NXtomoWriter:
         """
         self._check(frame, digest)
         record = layout.Record(
-            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time, mark_of(flags)
-        )
+            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time, mark_of(flags),
+            frame.replaces,
+        )  # fmt: skip
         try:
             self._table.write(self._rows, frame.counts, digest, record)
             self._rows += 1

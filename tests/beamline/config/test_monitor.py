@@ -39,7 +39,10 @@ def test_limits_reach_their_check_and_no_other() -> None:
             "monitor.beam.wran=0.1",
             r"is not a known key \(did you mean warn\?\); legal keys there: warn, alarm",
         ),
-        ("monitor.bean={warn: 0.1}", r"monitor\.bean is not .*beam.*legal keys there: on_alarm, act_after, policy"),
+        (
+            "monitor.bean={warn: 0.1}",
+            r"monitor\.bean is not .*beam.*legal keys there: on_alarm, act_after, retake, retake_share, policy",
+        ),
         ("monitor.timing=0.3", r"monitor\.timing is 0\.3; expected a group of keys: warn"),
         ("monitor.policy.beam=halt", r"monitor\.policy\.beam is 'halt'; expected log \| warn \| pause \| abort"),
         ("monitor.on_alarm=stopp", r"monitor\.on_alarm is 'stopp' \(did you mean stop\?\); expected log \| stop"),

@@ -1,0 +1,176 @@
+"""Views with an alarm are taken again after the last one: bounded, once, at their angles, and used in their place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.config.load import load
+from beamline.core.stop import ScanStopped, StopRequest
+from beamline.projections.flags import usable_views
+from beamline.projections.replay import judged_flags
+from beamline.scan.run import run_scan
+from beamline.storage.describe import describe
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import validate
+from drivers.frame import FrameKind
+from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
+from tests.beamline.ran import Ran
+
+WORDS = ("monitor.retake=true", "monitor.retake_share=0.5", "scan.angles.views=16", "scan.settle_s=0")
+FIRST, N = 5, 16  # the first view's row; 3 darks and 2 flats before, 2 flats after
+MIDDLE = {"fly": 11.25 / 0.5 * 0.02 / 2, "step": 0.0}  # degrees turned in half an exposure
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+@settings(max_examples=6, deadline=None)
+@given(repeats=st.sets(st.integers(FIRST + 1, FIRST + N - 1), min_size=1, max_size=14), seed=st.integers(0, 9))
+def test_each_view_with_an_alarm_is_taken_again_at_its_angle(mode: str, repeats: set[int], seed: int) -> None:
+    with TemporaryDirectory() as folder:
+        ran = Ran(Path(folder), FakeInstrument(Faults(repeats=repeats)), *WORDS, f"scan.mode={mode}")
+        assert ran.error is None and ran.result is not None
+        n = min(len(repeats), N // 2)
+        assert (ran.result.retaken, ran.result.n_frames) == (n, 23 + n)
+        assert ran.result.alarmed_frames == len(repeats) - n
+        assert ("retaking" in ran.states) and len(ran.of("warning")) == (len(repeats) > n)
+        assert ran.of("frame")[-1].data["n"] == ran.of("frame")[-1].data["of"] == 23 + n
+        ran.assert_safe()
+        with open_scan(ran.result.path) as source:
+            frames = list(source.frames())
+            again = [frame for frame in frames if frame.replaces >= 0]
+            assert [frame.index for frame in again] == list(range(FIRST + N, FIRST + N + n))  # before the last flats
+            assert {frame.replaces for frame in again} <= repeats
+            for frame in again:
+                first = frames[frame.replaces]
+                assert (first.kind, frame.kind) == (FrameKind.INVALID, FrameKind.PROJECTION)
+                assert frame.angle == pytest.approx(first.angle, abs=COUNT)
+                stood = decode(frame.counts)[0] * COUNT
+                assert np.degrees(stood - frame.angle) == pytest.approx(MIDDLE[mode], abs=0.01)
+            views = usable_views(source, use_flags=True).frames
+            left = repeats - {frame.replaces for frame in again}
+            assert views.size == N - len(left)
+            steps = np.degrees(source.angles[views]) / 11.25
+            assert np.unique(np.rint(steps)).size == views.size and np.abs(steps - np.rint(steps)).max() < 0.002
+            # The same checks over the file find the same: a view taken again is no late trigger.
+            flags, judged = source.flags, judged_flags(source)
+            assert flags is not None
+            np.testing.assert_array_equal(judged.alarmed, flags.alarmed)
+
+
+def test_file_info_and_validate_count_them(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 9, 20})), *WORDS)
+    assert ran.error is None and ran.result is not None
+    path = ran.result.path
+    facts = describe(path)
+    assert (facts["retaken_views"], facts["alarmed_frames"]) == (3, 3)
+    assert facts["kinds"] == {"projection": 16, "flat": 4, "dark": 3, "invalid": 3}
+    assert (facts["first_angle_deg"], facts["last_angle_deg"]) == (0, pytest.approx(168.75, abs=0.01))
+    (found,) = [finding for finding in validate(path) if finding.rule == "flags"]
+    assert found.severity == "info"
+    assert "3 views were taken again, the first ones (rows 8-9, 20) are not used. None of those" in found.message
+    with h5py.File(path) as file:
+        assert list(file["entry/frame_log/replaces"][FIRST + N :]) == [8, 9, 20, -1, -1]
+        assert list(file["entry/frame_log/trigger"][FIRST + N : FIRST + N + 3]) == [16, 17, 18]
+        assert file["exchange/data"].shape[0] == 16
+        theta = file["exchange/theta"][()]
+        assert np.sort(theta) == pytest.approx(np.arange(16) * 11.25, abs=0.02)
+        # The pixels of both are there: those of a repeated frame are the ones of the frame before.
+        data = file["entry/instrument/detector/data"]
+        assert np.array_equal(data[8], data[7]) and not np.array_equal(data[21], data[8])
+
+
+def test_nothing_is_taken_again_unless_it_was_asked_for(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8})), "scan.angles.views=16")
+    assert ran.result is not None
+    assert (ran.result.retaken, ran.result.alarmed_frames, ran.result.n_frames) == (0, 1, 23)
+
+
+def test_a_scan_without_alarms_takes_nothing_again(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(), *WORDS)
+    assert ran.result is not None
+    assert (ran.result.retaken, ran.result.n_frames) == (0, 23)
+    assert "retaking" not in ran.states
+
+
+def test_one_attempt_is_made(tmp_path: Path) -> None:
+    """Frame 8 shows the one before; of the two taken again, the second one shows the first, and has an alarm, too."""
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 9, FIRST + N + 1})), *WORDS)
+    assert ran.error is None and ran.result is not None
+    assert (ran.result.retaken, ran.result.alarmed_frames) == (2, 1)
+    (found,) = [finding for finding in validate(ran.result.path) if finding.rule == "flags"]
+    assert found.severity == "warning"
+    assert "Of those that are, 1 have an alarm: 22. A reconstruction leaves the 1 views among them out" in found.message
+
+
+def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Path) -> None:
+    stop = StopRequest()
+    instrument = FakeInstrument(
+        Faults(repeats={8, 10, 12, 14}), on_frame=lambda number: stop.stop() if number == FIRST + N + 1 else None
+    )
+    ran = Ran(tmp_path, instrument, *WORDS, stop=stop)
+    assert type(ran.error) is ScanStopped
+    assert "Stopped after 16 of 16 projections" in str(ran.error)
+    ran.assert_safe()
+    assert ran.folder is not None
+    with open_scan(ran.folder / "scan.h5") as source:
+        assert source.finished
+        again = [frame.replaces for frame in source.frames() if frame.replaces >= 0]
+        assert again == [8, 10, 12][: len(again)] and len(again) in (2, 3)
+        left = [row for row in (8, 10, 12, 14) if row not in again]
+        flags = source.flags
+        assert flags is not None and (source.image_key[left] == FrameKind.PROJECTION).all()
+        assert flags.alarmed[left].all()
+
+
+def test_a_stop_before_the_last_view_takes_nothing_again(tmp_path: Path) -> None:
+    stop = StopRequest()
+    instrument = FakeInstrument(Faults(repeats={8}), on_frame=lambda number: stop.stop() if number == 12 else None)
+    ran = Ran(tmp_path, instrument, *WORDS, stop=stop)
+    assert type(ran.error) is ScanStopped and "retaking" not in ran.states
+
+
+def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 10}, lost={FIRST + N})), *WORDS)
+    assert ran.error is None and ran.result is not None
+    assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)
+    assert "rows 8 gave no frame when they were taken again" in ran.of("warning")[0].data["message"]
+    with open_scan(ran.result.path) as source:
+        assert source.image_key[8] == FrameKind.PROJECTION and source.image_key[10] == FrameKind.INVALID
+
+
+SCENE = """simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.02, height: 1,
+attenuation: 9.0, centre: [0.06, 0, 0]}]}, beam: {photons_per_s: 1.0e+5}, effects: [%s
+{kind: lost_beam, views: [6, 9], share: 0.02}, dark_current, read_noise, offset]}"""
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_lost_beam_on_the_simulated_instrument(tmp_path: Path, mode: str) -> None:
+    """What is taken again is what a scan without the fault has at this place, but for noise."""
+    words = [
+        *WORDS, f"scan.mode={mode}", "simulation.clock=virtual", "recon.live=false", "scan.exposure_s=0.05",
+        "scan.period_s=0.5", "devices.stage.low_deg=-20", "devices.camera.roi=[1144, 2016, 16, 64]",
+        SCENE % ("motion_blur," if mode == "fly" else ""),
+    ]  # fmt: skip
+    config = load(Path(__file__).parents[3] / "configs" / "simulated.yaml", words, environment={})
+    result = run_scan(config, tmp_path)
+    assert (result.retaken, result.alarmed_frames) == (3, 0)
+    good = load(
+        Path(__file__).parents[3] / "configs" / "simulated.yaml",
+        [*words, words[-1].replace("views: [6, 9]", "views: [900, 901]")],
+        environment={},
+    )
+    clean = run_scan(good, tmp_path / "clean")
+    with open_scan(result.path) as source, open_scan(clean.path) as other:
+        for row in np.flatnonzero(source.replaces >= 0):
+            there = source.replaces[row]
+            views = (source.read([row]), other.read([there]), other.read([there - 1]), other.read([there + 1]))
+            new, same, before, after = (view[0].astype(np.float64).mean(axis=0) for view in views)
+            apart = [float(np.abs(new - view).mean()) for view in (same, before, after)]
+            assert apart[0] < 0.5 * min(apart[1:])
+            assert source.angles[row] == pytest.approx(other.angles[there], abs=2e-5)
