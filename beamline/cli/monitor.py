@@ -26,7 +26,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.projections.flagged_frames import worst_frames
 from beamline.projections.replay import Kind, by_kind, counts_of, replay
 from beamline.report.contact_sheet import contact_sheet
-from beamline.storage.flag_legend import FrameFlags, Mark, counted, mark_of
+from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import rows_replaced
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.references import reference_groups
@@ -79,19 +79,17 @@ def monitor(
             checks, limits = configured_checks(read.monitor), reference_limits(read.references)
         sink = fan_out(*(json_sinks or [terminal]))
         progress = counting("monitor", sink, clock)
-        flags: list[Flag] = []
-        marks: list[Mark] = []
+        found: list[tuple[Flag, ...]] = []
         active: set[tuple[str, Level]] = set()
         n = 0
         with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
             for judged in replay(source, checks, follow=clock if follow else None, should_stop=stopped):
                 n += 1
-                marks.append(mark_of(judged.flags))
+                found.append(judged.flags)
                 if not follow:
                     progress(n, judged.n)
                 now = {(flag.check, flag.level) for flag in judged.flags}
                 for flag in judged.flags:
-                    flags.append(flag)
                     if (flag.check, flag.level) not in active:
                         sink(Event("flag", clock.now(), asdict(flag)))
                 active = now
@@ -99,13 +97,14 @@ def monitor(
             if source.quantity == "counts":
                 references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
             again = set(rows_replaced(source).tolist())
-            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_marks(marks))):
+            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags(found))):
                 with whole_file(sheet) as partial:
                     partial.write_bytes(contact_sheet(worst))
         for fault in references:
             sink(Event("warning", clock.now(), {"message": fault}))
+        flags = [flag for each in found for flag in each]
         kinds = by_kind(flags)
-        alarmed = {flag.view for flag in flags if flag.level is Level.ALARM} - again
+        alarmed = {row for flag in flags if flag.level is Level.ALARM for row in flag.rows} - again
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
             "flags": counts_of(kinds), "references": references,

@@ -49,7 +49,8 @@ class Flag:
         limit: the figure that it exceeds.
         advice: what it means and what to do.
         region: where in the frame; None: everywhere, or nowhere in particular.
-        first: the first row that it holds for, where that is not `view`: some findings need several views.
+        first: the first row that it holds for, where that is not `view`: some findings need several views. All are of
+            the frame's kind, without another between.
     """
 
     check: str
@@ -60,6 +61,11 @@ class Flag:
     advice: str
     region: Region | None = None
     first: int | None = None
+
+    @property
+    def rows(self) -> range:
+        """Rows of the file that it holds for."""
+        return range(self.view if self.first is None else self.first, self.view + 1)
 
 
 @dataclass(frozen=True, eq=False)

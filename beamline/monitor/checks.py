@@ -48,6 +48,17 @@ CHECKS: tuple[Check, ...] = _distinct(
 _BITS = {check.name: check.bit for check in CHECKS}
 
 
+def flagged_rows(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
+    """Rows of a file by check and level; a row with a warning and an alarm of a check counts by its alarm."""
+    rows: dict[tuple[str, Level], set[int]] = {}
+    for flag in flags:
+        rows.setdefault((flag.check, flag.level), set()).update(flag.rows)
+    for check, level in rows:
+        if level is Level.WARN:
+            rows[check, level] -= rows.get((check, Level.ALARM), set())
+    return {key: found for key, found in rows.items() if found}
+
+
 def bitmask(flags: Iterable[Flag]) -> int:
     """The flags of a frame as 32 bits; see ALARM_SHIFT. An INFO has no bit: nothing is wrong with the frame."""
     bits = 0

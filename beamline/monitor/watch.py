@@ -58,7 +58,13 @@ def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, 
         for check, state in zip(monitor.checks, monitor.states, strict=True)
     ]
     after = replace(_with_reference(monitor, frame, digest), states=tuple(look.state for look in looks))
-    return after, tuple(look.flag for look in looks if look.flag is not None)
+    unbroken = frame.index - after.counted + 1
+    return after, tuple(_from(look.flag, unbroken) for look in looks if look.flag is not None)
+
+
+def _from(flag: Flag, row: int) -> Flag:
+    """The flag, without rows before this one."""
+    return flag if flag.first is None else replace(flag, first=max(flag.first, row))
 
 
 def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.monitor.check import Check, Flag, Level, ScanContext
-from beamline.monitor.checks import CHECKS
+from beamline.monitor.checks import CHECKS, flagged_rows
 from beamline.monitor.digest import digest
 from beamline.monitor.references import full_scale
 from beamline.monitor.watch import look, start
-from beamline.storage.flag_legend import FrameFlags, mark_of
+from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
@@ -106,7 +107,7 @@ def replay(
 
 def judged_flags(source: ScanSource) -> FrameFlags:
     """Flags as the monitor would have written them, of the frames that are there."""
-    return FrameFlags.of_marks([mark_of(judged.flags) for judged in replay(source)])
+    return FrameFlags.of_flags([judged.flags for judged in replay(source)])
 
 
 def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
@@ -115,8 +116,8 @@ def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
     for flag in flags:
         found.setdefault((flag.check, flag.level), []).append(flag)
     kinds = [
-        Kind(check, level, tuple(flag.view for flag in each), max(each, key=_excess))
-        for (check, level), each in found.items()
+        Kind(*key, tuple(sorted(rows)), max(found[key], key=_excess))
+        for key, rows in flagged_rows(chain.from_iterable(found.values())).items()
     ]
     levels = (Level.ALARM, Level.WARN, Level.INFO)
     return tuple(sorted(kinds, key=lambda kind: (levels.index(kind.level), -len(kind.rows))))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from queue import Full, Queue
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ import numpy as np
 from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import Emit
 from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import flagged_rows
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import Monitor, look
 from beamline.plan.plan import Timeline
@@ -50,8 +51,6 @@ class Recorder:
 
     Attributes:
         n_frames: written so far.
-        alarmed_views: views so far with an alarm of any check.
-        retaken: views that were taken again.
         references: the darks and flats so far.
     """
 
@@ -71,10 +70,9 @@ class Recorder:
         self._active: set[tuple[str, Level]] = set()
         self._monitor_off = False
         self.n_frames = 0
-        self._flagged: Counter[tuple[str, Level]] = Counter()
-        self._alarmed: set[int] = set()
-        self.alarmed_views: list[Retake] = []
-        self.retaken = 0
+        self._found: list[Flag] = []
+        self._triggers: dict[int, int] = {}  # of the views, by row
+        self._replaced: set[int] = set()
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
         low, high = WAITING_FRAMES
@@ -127,14 +125,28 @@ class Recorder:
     def flags(self) -> dict[str, dict[str, int]]:
         """Frames flagged so far: their number by check, then by level."""
         found: dict[str, dict[str, int]] = {}
-        for (check, level), n in sorted(self._flagged.items()):
-            found.setdefault(check, {})[str(level)] = n
+        for (check, level), rows in sorted(flagged_rows(self._found).items()):
+            found.setdefault(check, {})[str(level)] = len(rows)
         return found
 
     @property
     def alarmed_frames(self) -> int:
         """Frames so far with an alarm of any check, without those that were taken again."""
-        return len(self._alarmed)
+        return len(self._alarmed - self._replaced)
+
+    @property
+    def alarmed_views(self) -> list[Retake]:
+        """Views so far with an alarm of any check, with the trigger that each would be taken again by."""
+        return [Retake(row, self._triggers[row]) for row in sorted(self._alarmed & self._triggers.keys())]
+
+    @property
+    def retaken(self) -> int:
+        """Views that were taken again."""
+        return len(self._replaced)
+
+    @property
+    def _alarmed(self) -> set[int]:
+        return {row for flag in self._found if flag.level is Level.ALARM for row in flag.rows}
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Frames beside the timeline's come next; may be called while no frame waits."""
@@ -204,14 +216,11 @@ class Recorder:
 
     def _report(self, frame: Frame, flags: tuple[Flag, ...]) -> None:
         """Count flags; emit a `flag` event where a check begins to flag or its level changes, not for every frame."""
-        self._flagged.update((flag.check, flag.level) for flag in flags)
+        self._found += [replace(flag, advice="") for flag in flags]
+        if frame.kind is FrameKind.PROJECTION:
+            self._triggers[frame.index] = frame.trigger
         if frame.replaces >= 0:
-            self.retaken += 1
-            self._alarmed.discard(frame.replaces)
-        if any(flag.level is Level.ALARM for flag in flags):
-            self._alarmed.add(frame.index)
-            if frame.kind is FrameKind.PROJECTION:
-                self.alarmed_views.append(Retake(frame.index, frame.trigger))
+            self._replaced.add(frame.replaces)
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import h5py
@@ -45,7 +46,8 @@ class Mark:
 
     Attributes:
         bits: as `beamline.monitor.checks.bitmask` makes them.
-        scores: float32 [check], in the order of the legend; NaN where the check did not flag the frame.
+        scores: float32 [check], in the order of the legend; NaN where the check did not flag the frame, or only when
+            it saw later ones.
         regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: none.
     """
 
@@ -99,6 +101,15 @@ class FrameFlags:
             np.array([mark.scores for mark in marks], np.float32).reshape(-1, len(CHECKS)),
             np.array([mark.regions for mark in marks], np.int32).reshape(-1, len(CHECKS), 4),
         )
+
+    @classmethod
+    def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
+        """[row] what the checks found in each frame of a file; a flag that holds for rows before its own marks them."""
+        flags = cls.of_marks([mark_of(each) for each in found])
+        for flag in chain.from_iterable(found):
+            rows = flag.rows
+            flags.bits[rows.start : rows.stop] |= np.uint32(bitmask([flag]))
+        return flags
 
     def mark(self, frame: int) -> Mark:
         """The row of a frame as today's checks would write it; a check that is no more is left out."""
@@ -172,7 +183,9 @@ def write_legend(file: h5py.File) -> None:
     group.create_dataset("alarm_bit", data=[check.bit + ALARM_SHIFT for check in CHECKS], dtype="<i4")
     group.create_dataset("unit", data=[check.unit for check in CHECKS], dtype=text)
     group.create_dataset("meaning", data=[check.meaning for check in CHECKS], dtype=text)
-    file[SCORES].attrs["description"] = "score of each check of flag_legend; NaN where it did not flag the frame"
+    file[SCORES].attrs["description"] = (
+        "score of each check of flag_legend; NaN where it did not flag the frame, or only when it saw later ones"
+    )
     file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
     file[REGIONS].attrs["units"] = "pixel"
     file[VALID].attrs["description"] = "0: a check raised an alarm; the frame's pixels are as the camera gave them"

@@ -320,15 +320,18 @@ def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:
     return replace(base, chain=Chain(tuple(effects)))
 
 
-def seen(scene: Scene, seed: int, preview_bin: int = BIN) -> Iterator[Seen]:
-    """The frames of a scan of the scene."""
-    scan = Scan.of(scene, seed)
-    for row, planned in enumerate(scan):
-        shot = planned.shot
+def seen(scene: Scene, seed: int, preview_bin: int = BIN, views: range | None = None) -> Iterator[Seen]:
+    """The frames of a scan of the scene, or of some of its `views` after the darks and flats."""
+    row, scan = 0, Scan.of(scene, seed)
+    for planned in scan:
+        shot, projection = planned.shot, planned.kind is FrameKind.PROJECTION
+        if projection and views is not None and shot.view not in views:
+            continue
         counts = expose(scene, shot)
-        angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan
-        trigger = shot.view if planned.kind is FrameKind.PROJECTION else row
+        angle = shot.angle if projection else math.nan
+        trigger = shot.view - (views.start if views else 0) if projection else row
         frame = Frame(counts, planned.kind, row, trigger, row, angle, shot.time, shot.exposure)
+        row += 1
         yield Seen(frame, digest(counts, SATURATION, preview_bin), scene.chain.labels(shot))
 
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.version import version
-from beamline.monitor.checks import CHECKS
+from beamline.monitor.checks import ALARM_SHIFT, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
@@ -268,6 +268,14 @@ class Rows:
         if record.replaces >= 0:
             for name in ("image_key", "kind"):
                 self._columns[name][record.replaces] = int(FrameKind.INVALID)
+
+    def add_flags(self, rows: range, bits: int) -> None:
+        """Mark rows that exist: a check that has seen later frames found something in them."""
+        flags = self._columns["flags"][rows.start : rows.stop]
+        marked = flags | np.uint32(bits)
+        if (marked != flags).any():
+            self._columns["flags"][rows.start : rows.stop] = marked
+            self._columns["frame_valid"][rows.start : rows.stop] = marked >> ALARM_SHIFT == 0
 
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:

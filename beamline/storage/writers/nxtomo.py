@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.text import size
 from beamline.monitor.check import Flag
+from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of
@@ -104,7 +105,7 @@ class NXtomoWriter:
         self._progress = self._file[layout.COMMITTED]
 
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
-        """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found.
+        """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found, in rows before it too.
 
         DataError for a wrong shape, type or index (nothing is written), or a disk that does not take it (the frames
         before stay readable; nothing more can be appended).
@@ -116,6 +117,9 @@ class NXtomoWriter:
         )  # fmt: skip
         try:
             self._table.write(self._rows, frame.counts, digest, record)
+            for flag in flags:
+                if len(flag.rows) > 1:
+                    self._table.add_flags(flag.rows, bitmask([flag]))
             self._rows += 1
             if self._rows - self._committed >= self._flush_every:
                 self.flush()

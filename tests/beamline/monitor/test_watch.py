@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from beamline.monitor import watch as scan
-from beamline.monitor.check import ScanContext
+from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import digest
 from drivers.frame import Frame, FrameKind
 
@@ -60,3 +60,23 @@ def test_a_frame_may_have_several_flags(fake: Any) -> None:
     frames[-1].counts[30] = 65535
     checks = {flag.check for flag in fake.flags(frames)}
     assert {"lost", "saturation"} <= checks
+
+
+@dataclass(frozen=True)
+class Early:
+    """Says of every projection that the three rows before it had it too."""
+
+    name: ClassVar[str] = "early"
+
+    def start(self) -> None:
+        return None
+
+    def look(self, state: None, frame: Frame, digest: Any, context: ScanContext) -> Look[None]:
+        return Look(state, Flag(self.name, Level.WARN, frame.index, 1.0, 0.0, "", first=frame.index - 3))
+
+
+def test_a_finding_reaches_back_to_the_first_of_the_frames_of_its_kind(fake: Any) -> None:
+    flags = fake.flags(fake.references() + fake.views(5) + fake.flats(1), checks=[Early()])
+    assert [list(flag.rows) for flag in flags[10:]] == [
+        [10], [10, 11], [10, 11, 12], [10, 11, 12, 13], [11, 12, 13, 14], [15],
+    ]  # fmt: skip

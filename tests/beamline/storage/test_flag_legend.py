@@ -98,6 +98,24 @@ def test_marks_become_flags_and_flags_marks() -> None:
     assert FrameFlags.of_marks([]).counts() == {}
 
 
+def test_a_finding_that_needed_several_views_marks_them_all_in_the_file_as_in_memory(tmp_path: Path) -> None:
+    found: list[list[Flag]] = [[] for _ in range(9)]
+    found[5] = [Flag("floater", Level.WARN, 5, 7.0, 4.5, "", (0, 1, 2, 3), first=2)]
+    found[6] = [Flag("floater", Level.WARN, 6, 6.0, 4.5, ""), Flag("ghost", Level.ALARM, 6, 0.2, 0.1, "", first=5)]
+    flags = FrameFlags.of_flags(found)
+    assert flags.flagged.nonzero()[0].tolist() == [2, 3, 4, 5, 6] and flags.alarmed.nonzero()[0].tolist() == [5, 6]
+    assert flags.counts() == {"floater": {"warn": 5}, "ghost": {"alarm": 2}}
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+        frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
+        for row, each in enumerate(found):
+            writer.append(replace(frame, index=row), digest(frame.counts), each)
+    with h5py.File(writer.path) as file:
+        log = file["entry/frame_log"]
+        np.testing.assert_array_equal(log["flags"][()], flags.bits)
+        np.testing.assert_array_equal(log["frame_valid"][()], ~flags.alarmed)
+        np.testing.assert_array_equal(log["flag_scores"][()], flags.scores)
+
+
 def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:
     """Nothing can be created while a scan is written, and a follower may read the legend at any time."""
     with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
