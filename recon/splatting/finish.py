@@ -69,9 +69,9 @@ def finish(
     can explain the views. Where they cannot, because pixels are coarse, the noise is low or matter lies outside the
     box, they would bend the volume (-6 dB on a teapot of 10⁵ photons, -12 dB on a region of interest). So where the
     projection of the voxels at the start differs from that of the Gaussians by more than 0.6 of the noise, and the
-    sweeps leave more than the fit or 1.05 times the noise, they are tried anew on p - G + A x: measured views p less the
-    views G of the Gaussians plus the projection A x of the voxels at the start; what voxels cannot explain then counts
-    as noise. The second volume is taken unless it leaves its views worse explained by more than a tenth.
+    sweeps leave more than the fit or 1.05 times the noise, they are tried anew on p - G + A x: measured views p less
+    the views G of the Gaussians plus the projection A x of the voxels at the start; what voxels cannot explain then
+    counts as noise. The second volume is taken unless it leaves its views worse explained by more than a tenth.
 
     Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`. Measured on 26 small scans: 0.5
