@@ -24,7 +24,7 @@ from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
 
-_ROWS = 32  # of a slab; enough for total variation along z
+ROWS = 32  # of a slab; enough for total variation along z
 _HELD_OUT = 8  # one of so many views
 _LEAST_VIEWS = 2 * _HELD_OUT
 _SMALLEST = 64  # pixels a side: smaller detectors are not joined
@@ -38,6 +38,7 @@ def _candidates() -> tuple[Method, ...]:
 
 @dataclass(frozen=True)
 class _Score:
+    at: int
     method: Method
     residual: float
 
@@ -59,7 +60,7 @@ class Auto:
     name: ClassVar[str] = "auto"
     label: ClassVar[str] = "Automatic choice"
     colour: ClassVar[str] = "tab:green"
-    traits: ClassVar[Traits] = Traits(device=True)
+    traits: ClassVar[Traits] = Traits(device=True, budget=True)
 
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
@@ -76,38 +77,13 @@ class Auto:
         return replace(found, settings=settings, method=chosen.name)
 
     def _choose(self, problem: ReconProblem, control: RunControl) -> tuple[Method, str]:
-        n = problem.geometry.n_views
-        if n < _LEAST_VIEWS:
-            return self.candidates[0], f"{n} views are too few to hold any out"
-        if not problem.geometry.is_straight:
-            return self.candidates[0], "rolled or tilted views"
-        part, where = _part(problem)
-        order = np.argsort(np.mod(part.geometry.angles, part.geometry.period), kind="stable")
-        unseen = np.sort(order[_HELD_OUT // 2 :: _HELD_OUT])
-        seen = np.setdiff1d(np.arange(n), unseen)
-        trial = _of_views(part, seen)
-        scores, refused, begin = [], [], control.now()
-        for i, method in enumerate(self.candidates):
-            if control.should_stop is not None and control.should_stop():
-                return self.candidates[0], "stopped before the choice"
-            device = problem.device if method.traits.device else "cpu"
-            try:
-                volume = method.run(
-                    replace(trial, device=device), RunControl(control.should_stop, now=control.now)
-                ).volume
-            except ValueError as error:
-                refused.append(f"{method.name}: {error}")
-                continue
-            scores.append(_Score(method, _residual(volume, _of_views(part, unseen))))
-            if control.on_progress is not None:
-                seconds = control.now() - begin
-                last = scores[-1].residual
-                control.on_progress(Progress(i + 1, len(self.candidates), seconds, last, last, 0, n))
-        if not scores:
-            raise ValueError("; ".join(refused))
-        chosen = _best(scores)
-        listed = ", ".join(f"{s.method.name} {s.residual:.4g}" for s in sorted(scores, key=lambda s: s.residual))
-        return chosen, f"residual of views held out, {where}: {listed}"
+        part, where = part_of(problem)
+        if part is None:
+            return self.candidates[0], where
+        at, residuals = predicts_best(part, self.candidates, control)
+        if at is None:
+            return self.candidates[0], residuals
+        return self.candidates[at], f"residual of views held out, {where}: {residuals}"
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
@@ -120,7 +96,49 @@ class Auto:
         return sum(method.work(n_views, binning) for method in self.candidates)
 
 
-def _best(scores: Sequence[_Score]) -> Method:
+def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunControl) -> tuple[int | None, str]:
+    """Which of the methods predicts best what one of eight views shows that it has not seen; all residuals in words.
+
+    None where `control` ends the trials before two are done; one that it cuts short is not judged.
+
+    Raises:
+        ValueError: no method takes these views or data.
+    """
+    n, geometry = part.geometry.n_views, part.geometry
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+    unseen = np.sort(order[_HELD_OUT // 2 :: _HELD_OUT])
+    trial, judge = _of_views(part, np.setdiff1d(np.arange(n), unseen)), _of_views(part, unseen)
+    scores, refused, begin = [], [], control.now()
+    quiet = RunControl(control.should_stop, now=control.now)
+
+    def stopped() -> bool:
+        return control.should_stop is not None and control.should_stop()
+
+    for i, method in enumerate(methods):
+        if stopped():
+            break
+        device = part.device if method.traits.device else "cpu"
+        try:
+            volume = method.run(replace(trial, device=device), quiet).volume
+        except ValueError as error:
+            refused.append(f"{method.name}: {error}")
+            continue
+        if stopped():
+            break
+        scores.append(_Score(i, method, _residual(volume, judge)))
+        if control.on_progress is not None:
+            last = scores[-1].residual
+            control.on_progress(Progress(i + 1, len(methods), control.now() - begin, last, last, 0, n))
+    if len(scores) < min(2, len(methods)) and stopped():
+        return None, "stopped before the choice"
+    if not scores:
+        raise ValueError("; ".join(refused))
+    listed = [f"{s.method.name} {s.residual:.4g}" for s in sorted(scores, key=lambda s: s.residual)]
+    late = [method.name for method in methods[scores[-1].at + 1 :]] if stopped() else []
+    return _best(scores).at, ", ".join(listed + [f"{name} not tried in time" for name in late])
+
+
+def _best(scores: Sequence[_Score]) -> _Score:
     """The smallest residual; where FISTA-TV has it, a fit finished by the same iteration is as good if it is near.
 
     From a fit the iteration comes nearer to the sample than its views held out can tell: 0.1 to 0.9 dB.
@@ -129,24 +147,31 @@ def _best(scores: Sequence[_Score]) -> Method:
     if isinstance(best.method, FistaTv):
         fits = [s for s in scores if isinstance(s.method, R2) and s.residual <= _NEAR * best.residual]
         best = min(fits, key=lambda s: s.residual, default=best)
-    return best.method
+    return best
 
 
-def _part(problem: ReconProblem) -> tuple[ReconProblem, str]:
-    """A part of the problem for trials, and its name: a slab of rows, or all rows with joined pixels."""
+def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
+    """A part of the problem for trials, and its name: a slab of so many rows, or all rows with joined pixels.
+
+    None where nothing can be held out or projected, and why.
+    """
     geometry, (rows, cols) = problem.geometry, problem.geometry.detector_shape
     data, weights = problem.projections, problem.use.weights
+    if geometry.n_views < _LEAST_VIEWS:
+        return None, f"{geometry.n_views} views are too few to hold any out"
+    if not geometry.is_straight:
+        return None, "rolled or tilted views"
     if not geometry.is_cone:
-        if rows <= _ROWS:
+        if rows <= height:
             return problem, "all rows"
         some = masked(data[:: max(1, len(data) // 8)])[0]
         matter = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
-        first = int(np.argmax(matter[_ROWS:] - matter[:-_ROWS]))
-        slab = slice(first, first + _ROWS)
-        views = geometry.rows(first, first + _ROWS)
+        first = int(np.argmax(matter[height:] - matter[:-height]))
+        slab = slice(first, first + height)
+        views = geometry.rows(first, first + height)
         use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, slab]))
         cut = np.ascontiguousarray(data[:, slab])
-        where = f"rows {first} to {first + _ROWS - 1}"
+        where = f"rows {first} to {first + height - 1}"
         return replace(problem, projections=cut, geometry=views, grid=_grid(views, problem.grid), use=use), where
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"

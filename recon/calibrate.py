@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.time_model import Speeds
+from recon.assess.plans import Speeds
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
+from recon.splatting.finish import SUBSETS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
+from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.projector import Projector
+from recon.voxels.tv import TotalVariationProx, difference_weights
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]
@@ -25,6 +30,7 @@ Clock = Callable[[], float]
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60
 _STEP_VIEWS, _STEPS = 4, 6
+_SWEPT_VIEWS = 8
 
 
 def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
@@ -45,7 +51,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     """
     field = Grid.for_fit(geometry, grid)
     count = default_count(field)
-    slab, part = _slab(projections, geometry)
+    slab, part, low = _slab(projections, geometry)
     slices = Grid.of_field(part, part.sample_pitch)
     whole = field.shape[0] / slices.shape[0]
     views = geometry.n_views / part.n_views
@@ -68,21 +74,37 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     step_seconds, view_seconds = _step(projections, geometry, grid, _spread_out(projections, geometry, count), now)
     # Placing scales its densities by a projection of twelve views, which is about a third of as many steps.
     start_seconds += 4 * step_seconds + view_seconds * geometry.n_views
-    return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds)
+    sweep = sweep_seconds(low, slices, now) * grid.shape[0] / slices.shape[0]
+    return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds, sweep)
 
 
-def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
-    """A few views of the rows with most in them."""
+def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
+    """Time of a sweep of FISTA-TV over all views; infinite for rolled or tilted ones, which voxels do not take.
+
+    A few views are projected there and back, and one proximal step of total variation is taken, to measure it.
+    """
+    if not geometry.is_straight:
+        return math.inf
+    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
+    projector = Projector(some, grid)
+    begin = now()
+    x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
+    projected = now()
+    TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
+    parts = subsets_of(geometry, SUBSETS)
+    return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
+
+
+def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry, Geometry]:
+    """A few views of the rows with most in them, and the geometry of these and of all views of these rows."""
     rows = geometry.detector_shape[0]
     height = min(_SLAB_ROWS, rows)
     views = _around(geometry, _SLAB_VIEWS)
     weight = projections[views].sum(axis=(0, 2), dtype=np.float64)
     sums = np.convolve(weight, np.ones(height), "valid")
     first = int(np.argmax(sums))
-    return (
-        np.ascontiguousarray(projections[views, first : first + height]),
-        geometry.select(views).rows(first, first + height),
-    )
+    low = geometry.rows(first, first + height)
+    return np.ascontiguousarray(projections[views, first : first + height]), low.select(views), low
 
 
 def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:

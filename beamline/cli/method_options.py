@@ -10,7 +10,8 @@ import click
 from click.core import ParameterSource
 
 from beamline.cli.options import POSITIVE
-from recon.assess.time_model import PRESETS, parse_budget
+from recon.assess.plans import PRESETS
+from recon.assess.time_model import parse_budget
 from recon.auto import Auto
 from recon.base.kernel import Kernel
 from recon.base.method import Method
@@ -28,7 +29,7 @@ SETTINGS = {
 """Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
 _TRAITS = {
-    "budget": "presets", "quality": "presets", "device": "device", "checkpoint": "checkpoints", "resume": "checkpoints",
+    "budget": "budget", "quality": "presets", "device": "device", "checkpoint": "checkpoints", "resume": "checkpoints",
 }  # fmt: skip
 """Options for methods with a trait, and the trait."""
 
@@ -36,7 +37,7 @@ _PLANS = ("budget", "quality")
 _TIMED = ("steps", "seconds", "gaussians")
 _OF_A_FIT = (*_TIMED, "start", "loss", "kernel", "device", "early_stop", "finish", "checkpoint", "resume")
 # The options that exclude each of those that choose a plan.
-_CHOSEN = {"budget": ("quality", *_OF_A_FIT), "quality": ("budget", *_TIMED, "finish")}
+_CHOSEN = {"budget": ("quality", *_OF_A_FIT, "iterations"), "quality": ("budget", *_TIMED, "finish")}
 _FINISHED = tuple(name for name in _OF_A_FIT if name not in _TIMED)  # of scans that are finished only
 
 
@@ -72,7 +73,7 @@ def method_with(name: str, options: Mapping[str, Any]) -> Method:
         options: values by option; None stands for the method's own.
     """
     if name == Auto.name:
-        return Auto()
+        return Auto(tuple(method_with(method.name, options) for method in Auto().candidates))
     method = by_name(name)
     paths = {option: SETTINGS.get(option, option) for option, value in options.items() if value is not None}
     return build(method, {path: options[option] for option, path in paths.items() if has_setting(method, path)})
@@ -85,7 +86,10 @@ def options_of_a_method(ctx: click.Context) -> list[str]:
 
 def takers(option: str) -> tuple[str, ...]:
     """Names of the methods that take an option."""
-    return with_trait(_TRAITS[option]) if option in _TRAITS else taking(SETTINGS[option])
+    if option not in _TRAITS:
+        return taking(SETTINGS[option])
+    trait = _TRAITS[option]
+    return (*((Auto.name,) if getattr(Auto.traits, trait) else ()), *with_trait(trait))
 
 
 def _of(option: str) -> str:
@@ -138,7 +142,8 @@ _OPTIONS = (
         "--budget",
         callback=time_given,
         metavar="30s|2m|1h",
-        help="Time from line integrals to volume: chooses method, Gaussians, steps and binning to end in time.",
+        help=f"Time from line integrals to volume ({_of('budget')}): chooses method, steps, Gaussians and binning "
+        "to end in time.",
     ),
     click.option(
         "--quality",

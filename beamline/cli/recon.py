@@ -31,7 +31,7 @@ from beamline.reconstruct.follow import follow as follow_scan
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
 from drivers.clock import SystemClock
-from recon.assess.time_model import Quality
+from recon.assess.plans import Quality
 from recon.auto import Auto
 from recon.methods import DEFAULT, names
 from recon.voxels.fbp import Filter
@@ -115,7 +115,7 @@ def recon(
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
     if method is None:
-        method = DEFAULT if follow or options_of_a_method(context) else Auto.name
+        method = DEFAULT if follow or set(options_of_a_method(context)) - {"budget"} else Auto.name
     refuse_contradictions(context, method, follow)
     if follow and values["flags"] == "judge":
         raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")

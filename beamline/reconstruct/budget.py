@@ -1,9 +1,10 @@
-"""Reconstruction within a time: measure this machine on this scan, choose settings, and end when the time is over."""
+"""Reconstruction within a time: measure this machine on this scan, choose method and settings, and end in time."""
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,33 +14,32 @@ import recon
 from beamline.projections.correction import Warn
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
-from recon.assess.time_model import CURVES, Choice, Speeds, choose, parts_of
+from recon.assess.plans import Choice, Speeds, plans
+from recon.assess.time_model import parts_of
+from recon.auto import ROWS, part_of, predicts_best
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Progress, RunControl
+from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.volume import Grid
-from recon.calibrate import calibrate
+from recon.calibrate import calibrate, sweep_seconds
 from recon.reconstruction import Reconstruction
-from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
+from recon.splatting.finish import SUBSETS, SWEEPS
 from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
-from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
-from recon.voxels.direct import Fbp, has_direct_method
-from recon.voxels.fbp import Filter
+from recon.voxels.direct import has_direct_method
 from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.projector import Projector
-from recon.voxels.tv import TotalVariationProx, difference_weights
-
-Now = Callable[[], float]
 
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
 _RESERVE = 0.02  # of the budget, for what no part has measured
 _SLAB = 16  # slices
 _FINISH_SHARE = 0.5  # of what is left after placing, at most
-_TIMED_VIEWS = 8
 # What goes before the sweeps of a finish, in sweeps: the largest eigenvalue of a subset, projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
+_TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
+# Of the time a trial may take so much by prediction, and in fact a quarter more.
+_TRIAL, _TRIAL_SLACK = 0.375, 1.25
+_LEVEL = 0.3  # dB: by the curves of two scans such methods are level
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +50,16 @@ class Budgeted:
         result: what came out.
         prepared: the views it is of, with joined pixels if the choice joins them.
         choice, speeds: what was chosen, and the measurements behind it.
+        because: why this method, in words; empty where there was no other.
         seconds: of everything, calibration included.
-        placed: Gaussians at the start.
     """
 
     result: Reconstruction
     prepared: PreparedProjections
     choice: Choice
     speeds: Speeds
+    because: str
     seconds: float
-    placed: int = 0
 
     def settings(self, budget: float) -> dict[str, Any]:
         """For the record."""
@@ -68,115 +68,192 @@ class Budgeted:
             "budget": budget,
             "budget_used": self.seconds,
             "chosen_method": self.result.method,
+            "chosen_because": self.because,
             "chosen_binning": c.binning,
             "chosen_share": c.share,
             "expected_steps": c.steps,
             "expected_gain_db": c.gain,
+            "expected_s": c.seconds,
             "measured_fbp_s": s.fbp,
             "measured_start_s": s.start,
             "measured_step_s": s.step,
             "measured_fill_s": s.fill,
+            "measured_sweep_s": s.sweep,
         }
 
     def summary(self, budget: float) -> str:
-        """The choice in a line."""
-        fit = ""
-        if self.choice.fits:
-            fit = f", {self.result.history[-1].step} steps from {self.placed} Gaussians"
-        return f"{_named(self.choice, fit)}: {parts_of(self.seconds)} of {parts_of(budget)}"
+        """The choice and why, in a line."""
+        why = f"; {self.because}" if self.because else ""
+        return f"{_named(self.choice, self.result)}: {parts_of(self.seconds)} of {parts_of(budget)}{why}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Budget:
+    """A budget in use: what is left of it, and the choices that it allows; the methods by preference."""
+
+    seconds: float
+    begin: float
+    now: Callable[[], float]
+    methods: Mapping[str, Method]
+    speeds: Speeds
+    largest: int
+
+    @property
+    def left(self) -> float:
+        return self.seconds - (self.now() - self.begin)
+
+    def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
+        """The best choice of each method (or of one) within this share of what is left."""
+        # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
+        left = max(share * self.left, sys.float_info.min)
+        return plans(left, self.speeds, self.largest, self.methods if name is None else [name])
+
+    def preferred(self, found: Sequence[Choice]) -> Choice:
+        """The first of the methods that is level with the one of which most is expected."""
+        level = [c for c in found if c.gain >= found[0].gain - _LEVEL]
+        order = list(self.methods)
+        return min(level, key=lambda c: order.index(c.method))
+
+    def method(self, choice: Choice, default_count: int) -> Method:
+        return replace(self.methods[choice.method], **choice.settings(default_count))  # type: ignore[type-var]
 
 
 def within(
     budget: float,
     prepared: PreparedProjections,
+    methods: Sequence[Method],
     seed: int,
-    filter: Filter,
-    now: Now,
-    on_progress: Callable[[Progress], None],
-    stopped: Callable[[], bool],
+    control: RunControl,
     warn: Warn,
 ) -> Budgeted:
-    """Reconstruct within `budget` seconds by `now`, the measuring included.
+    """Reconstruct within `budget` seconds by the clock of `control`, the measuring included.
 
-    Placing is run and timed before the fit gets what is left, and filling is timed on a slab of what was placed: only
-    the choice rests on predictions. Where even the cheapest choice will be late, `warn` gets a warning before the work.
+    For each method the settings that the time suffices for follow from its measured curves. Where there are several,
+    they are tried on some rows, and the one that predicts views held out best gets what is left; where a trial would
+    take more than 0.375 of the time, it is the first one of which as much is expected as of any. Placing of Gaussians
+    is run and timed before the fit gets what is left, and filling is timed on a slab. Where even the cheapest choice
+    will be late, `warn` gets a warning before the work.
+
+    Args:
+        methods: to choose from, with measured curves, by preference; the choice sets their steps and Gaussians.
 
     Raises:
         ValueError: the views cannot be reconstructed.
     """
-    begin = now()
+    now, begin = control.now, control.now()
     data, geometry = prepared.projections.data, prepared.geometry
     speeds = calibrate(data, geometry, Grid.matching(geometry), now)
     unbinned = default_count(Grid.of_field(geometry, geometry.sample_pitch))  # the curves count in these
-    spent = now() - begin
-    # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
-    choice = choose(max(budget - spent, sys.float_info.min), speeds, min(geometry.detector_shape))
-    if not choice.fits and not has_direct_method(geometry):
-        # There is only the volume that Gaussians are placed by; the fewest of them, and a step, are the next best.
-        choice = replace(choice, share=min(curve.share for curve in CURVES) / choice.binning**3)
-    late = spent + _least(choice, speeds) - budget
-    if late > 0:
+    direct = has_direct_method(geometry)
+    taking = {method.name: method for method in methods if direct or not method.traits.direct}
+    plan = _Budget(budget, begin, now, taking, speeds, min(geometry.detector_shape))
+    spent = budget - plan.left
+    found = plan.choices()
+    choice, because = found[0], ""
+    late = spent + choice.seconds - budget
+    if late > 0 and math.isfinite(late) and not math.isfinite(choice.gain):
         warn(
-            f"{parts_of(budget)} are too few for this scan: measuring this machine took {parts_of(spent)}, and the "
-            f"cheapest choice, {_named(choice)}, will be about {parts_of(late)} late."
+            f"{parts_of(budget)} are too few for this scan: measuring this machine took {parts_of(spent)}, and "
+            f"the cheapest choice, {_named(choice)}, will be about {parts_of(late)} late."
         )
+    if len(found) > 1:
+        choice, because = _chosen(plan, found, prepared, seed, control)
     prepared = joined(prepared, choice.binning)
+    method = plan.method(choice, unbinned)
+    end = begin + budget * (1 - _RESERVE)
+    if isinstance(method, R2):
+        result = _fitted(method, prepared, seed, end, control)
+    else:
+        result = _run(method, prepared, seed, end, control)
+    return Budgeted(result, prepared, choice, speeds, because, now() - begin)
+
+
+def _chosen(
+    plan: _Budget, found: Sequence[Choice], prepared: PreparedProjections, seed: int, control: RunControl
+) -> tuple[Choice, str]:
+    """The method that predicts views of some rows best, with the settings that the rest of the time suffices for."""
+    geometry = prepared.geometry
+    listed = ", ".join(f"{c.method} {c.gain:.1f}" for c in found)
+    expected = f"expected by other scans, dB above FBP: {listed}; nothing was tried: "
+    by_curves = plan.preferred(found)
+    use = DataUse(prepared.ray_weights())
+    problem = ReconProblem(prepared.projections.data, geometry, Grid.matching(geometry), use, seed, "cpu")
+    # Those that take no time first, then the most promising ones, since the time may end before the last.
+    tried = sorted((c for c in plan.choices(1 - _TRIAL) if c.binning == 1), key=lambda c: bool(c.counted))
+    if len(tried) < 2:
+        return by_curves, f"{expected}too little time"
+    seconds = _TRIAL * plan.left
+    for rows in _TRIAL_ROWS:
+        part, where = part_of(problem, rows)
+        if part is None:
+            return by_curves, expected + where
+        share = math.prod(part.grid.shape) / math.prod(problem.grid.shape)
+        if share * sum(c.seconds for c in tried) <= seconds:
+            break
+    else:
+        return by_curves, f"{expected}the scan has too few rows for a trial in this time"
+    count = default_count(Grid.of_field(part.geometry, part.geometry.sample_pitch))
+    trial = RunControl(_until(control, control.now() + _TRIAL_SLACK * seconds), now=control.now)
+    at, residuals = predicts_best(part, [plan.method(c, count) for c in tried], trial)
+    if at is None:
+        return plan.preferred(plan.choices()), f"{expected}too little time"
+    return plan.choices(name=tried[at].method)[0], f"residual of views held out, {where}: {residuals}"
+
+
+def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
+    """The volume of a method on voxels by `end`."""
+    use, control = DataUse(prepared.ray_weights()), replace(control, should_stop=_until(control, end))
     data, geometry = prepared.projections.data, prepared.geometry
-    grid = Grid.matching(geometry)
-    if not choice.fits:
-        result = recon.reconstruct(data, geometry, Fbp(filter), grid=grid, control=RunControl(now=now))
-        return Budgeted(result, prepared, choice, speeds, now() - begin)
-    field = Grid.of_field(geometry, geometry.sample_pitch)
-    count, rng = max(1, round(choice.share * unbinned)), np.random.default_rng(seed)
-    placed = place(data, geometry, field, count, rng, kernel=FitSettings().kernel)
+    return recon.reconstruct(data, geometry, method, seed=seed, use=use, control=control)
+
+
+def _fitted(method: R2, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
+    """A fit from as many Gaussians as the method says, which ends, finished and filled, by `end`."""
+    data, geometry, now = prepared.projections.data, prepared.geometry, control.now
+    grid, field = Grid.matching(geometry), Grid.of_field(geometry, geometry.sample_pitch)
+    assert isinstance(method.gaussians, int)
+    placed = place(data, geometry, field, method.gaussians, np.random.default_rng(seed), kernel=method.fit.kernel)
     before = now()
     slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
     voxelize(placed, slab)
-    fill = (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
-    end = begin + budget * (1 - _RESERVE) - fill
+    end -= (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
     sweeps, finishing = finish_within(_FINISH_SHARE * (end - now()), geometry, grid, now)
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    control = RunControl(should_stop=lambda: stopped() or now() >= end, on_progress=on_progress, now=now)
-    fit = R2(seconds=max(0.0, end - now() - finishing), gaussians=placed, finish=sweeps)
+    fit = replace(method, steps=None, seconds=max(0.0, end - now() - finishing), gaussians=placed, finish=sweeps)
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
-    result = recon.reconstruct(data, geometry, fit, grid=grid, seed=seed, use=use, control=control)
-    return Budgeted(result, prepared, choice, speeds, now() - begin, placed.n)
+    control = replace(control, should_stop=_until(control, end))
+    return recon.reconstruct(data, geometry, fit, grid=grid, seed=seed, use=use, control=control)
 
 
-def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Now) -> tuple[int, float]:
+def _until(control: RunControl, end: float) -> Callable[[], bool]:
+    """Stops with `control`, or when its clock shows `end`."""
+    return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
+
+
+def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Callable[[], float]) -> tuple[int, float]:
     """Sweeps of a fit's finish that `seconds` suffice for, at most `SWEEPS`, and the seconds that they will take.
 
-    A few views are projected there and back, and one proximal step of total variation is taken, to measure it. Fewer
-    than two sweeps are none: what goes before them takes as long.
+    Fewer than two sweeps are none: what goes before them takes as long.
     """
-    if not geometry.is_straight or seconds <= 0:
+    if seconds <= 0:
         return 0, 0.0
-    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _TIMED_VIEWS))[:_TIMED_VIEWS])
-    projector = Projector(some, grid)
-    begin = now()
-    x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
-    projected = now()
-    TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
-    parts = subsets_of(geometry, SUBSETS)
-    sweep = (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
+    sweep = sweep_seconds(geometry, grid, now)
     if geometry.is_cone:
         sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
-    before = (_EIGENVALUE_ROUNDS / parts + _FIRST_SWEEPS) * sweep
+    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
+    if not before + 2 * sweep <= seconds:
+        return 0, 0.0
     sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
-    return (sweeps, before + sweeps * sweep) if sweeps >= 2 else (0, 0.0)
+    return sweeps, before + sweeps * sweep
 
 
-def _named(choice: Choice, fit: str = "") -> str:
-    joined = f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else ""
-    return f"{R2.name if choice.fits else Fbp.name}{fit}{joined}"
-
-
-def _least(choice: Choice, speeds: Speeds) -> float:
-    """Seconds that a choice takes at the least: for a fit placing, a step and filling; as `choose` counts them."""
-    first = speeds.fbp / choice.binning**3
-    if not choice.fits:
-        return first
-    return first + (speeds.start + speeds.fill) * choice.share + speeds.step / choice.binning**2
+def _named(choice: Choice, result: Reconstruction | None = None) -> str:
+    text = choice.method
+    if result is not None and result.history:
+        text += f", {result.history[-1].step} {choice.counted}"
+    if result is not None and choice.fits:
+        text += f" from {result.settings['gaussians_at_start']} Gaussians"
+    return text + (f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else "")
 
 
 def joined(prepared: PreparedProjections, factor: int) -> PreparedProjections:

@@ -22,8 +22,10 @@ from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from drivers.clock import Clock
+from recon.auto import Auto
 from recon.base.method import DataUse, Method, Progress, RunControl
 from recon.base.volume import Grid
+from recon.methods import with_trait
 from recon.splatting.backend import backend_for
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
@@ -58,8 +60,8 @@ def reconstruct_file(
                     "frames that are there with --unfinished."
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
+        facts = facts_of(source)
         prepared = prepare_projections(source, options.selection, warn)
-        facts = facts_of(source, prepared.flags)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_SHARE, advice="leave out --early-stop")
@@ -106,13 +108,16 @@ def check_device(device: str) -> None:
 def _refuse_foreign(options: ReconOptions) -> None:
     """Raises ConfigError for options that the method would silently ignore."""
     given = {
-        "a quality preset": options.quality is not None,
-        "a time budget": options.budget is not None,
-        "checkpoints": options.checkpoints.wanted,
+        "a quality preset": (options.quality is not None, "presets"),
+        "a time budget": (options.budget is not None, "budget"),
+        "checkpoints": (options.checkpoints.wanted, "checkpoints"),
     }
-    foreign = [name for name, wanted in given.items() if wanted]
-    if foreign and not isinstance(options.method, R2):
-        raise ConfigError(f"{options.method.name} does not take {' and '.join(foreign)}: they are for {R2.name}.")
+    for what, (wanted, trait) in given.items():
+        if wanted and not getattr(options.method.traits, trait):
+            owners = ", ".join(with_trait(trait))
+            raise ConfigError(
+                f"{options.method.name} does not take {what} (of {owners}): leave that out, or choose another method."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,11 +227,12 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
 
 def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
     """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the joined pixels a side."""
-    warm_up(geometry=job.prepared.geometry)  # compilation happens once on a machine and is not part of the budget
+    method = job.options.method
+    methods = method.candidates if isinstance(method, Auto) else (method,)
+    for one in methods:  # compilation happens once on a machine and is not part of the budget
+        warm_up(one, job.prepared.geometry)
+    control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
-        done = within(
-            budget, job.prepared, job.options.seed, job.options.filter, job.clock.now, job.listener(budget),
-            job.stop_latch, job.warn,
-        )  # fmt: skip
+        done = within(budget, job.prepared, methods, job.options.seed, control, job.warn)
     outcome = job.outcome(done.result, job.stop_latch.stopped, done.summary(budget), **done.settings(budget))
     return replace(outcome, seconds=done.seconds), done.prepared, done.choice.binning

@@ -9,7 +9,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.open import SourceOptions
-from recon.assess.time_model import Quality
+from recon.assess.plans import Quality
 from recon.base.method import Method
 from recon.methods import names, streams
 from recon.splatting.r2 import R2

@@ -1,4 +1,4 @@
-"""Quality against time: presets, settings for a time budget, and the time that the next decibel would take."""
+"""Quality against time: the time that the next decibel would take, and times as text."""
 
 from __future__ import annotations
 
@@ -9,144 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Quality = Literal["preview", "standard", "best"]
+from recon.assess.plans import CURVES, Curve
 
 _REACH = 10.0  # times the time covered: no extrapolation goes further
 _POINTS = 24  # groups of a record: neighbouring values share a running mean, so more groups are not more information
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Quality against steps of one kind of fit, measured by tests/bench/test_quality_curves.py.
-
-    Attributes:
-        binning: detector pixels joined a side.
-        share: Gaussians at the start, relative to the default number for the volume.
-        pace: CPU time of a step, relative to a step with binning 1 and share 1.
-        points: (steps, dB above the FBP of the unbinned views), steps rising.
-    """
-
-    binning: int
-    share: float
-    pace: float
-    points: tuple[tuple[int, float], ...]
-
-    def gain(self, steps: float) -> float:
-        """dB above FBP after so many steps, interpolated in their logarithm; -inf below the first point."""
-        if steps < self.points[0][0]:
-            return -math.inf
-        at, gains = zip(*self.points, strict=True)
-        return float(np.interp(math.log(steps), np.log(at), gains))
-
-
-# Means of two scans: a slab of a measured walnut (40 rows of 256 pixels, 60 views) and a simulated battery (48 rows of
-# 160 pixels, 90 views, 5000 photons a pixel). Binning helps only where FBP of all pixels takes too long.
-CURVES: tuple[Curve, ...] = (
-    Curve(1, 0.25, 0.5, ((30, -6.34), (60, -3.79), (125, -1.39), (250, 0.89), (500, 2.64), (1000, 3.34))),
-    Curve(1, 0.5, 0.71, ((30, -6.55), (60, -3.49), (125, -0.33), (250, 1.83), (500, 3.47), (1000, 3.93))),
-    Curve(1, 1.0, 1.0, ((30, -6.94), (60, -3.41), (125, 0.43), (250, 2.45), (500, 3.94), (1000, 4.16))),
-    Curve(1, 2.0, 1.63, ((30, -7.51), (60, -3.45), (125, 0.96), (250, 2.84), (500, 4.16), (1000, 4.16))),
-    Curve(2, 0.25, 0.4, ((30, -7.32), (60, -4.9), (125, -2.5), (250, -0.74), (500, 0.73), (1000, 1.89))),
-)
-
-
-@dataclass(frozen=True)
-class Preset:
-    """Settings of a fit for one of the quality levels.
-
-    Attributes:
-        steps: number of steps of the fit.
-        share: Gaussians at the start, relative to the default number for the volume.
-    """
-
-    steps: int
-    share: float
-
-
-PRESETS: dict[Quality, Preset] = {
-    "preview": Preset(125, 0.5),
-    "standard": Preset(500, 1.0),
-    "best": Preset(1500, 2.0),
-}
-
-
-@dataclass(frozen=True)
-class Speeds:
-    """Times measured on this machine for this scan, in s, without binning and with the default number of Gaussians.
-
-    Attributes:
-        fbp: FBP of the whole volume.
-        start: placing the Gaussians, without FBP.
-        step: one step of the fit.
-        fill: computing the final volume from the Gaussians.
-    """
-
-    fbp: float
-    start: float
-    step: float
-    fill: float
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Settings chosen for a time budget.
-
-    Attributes:
-        binning: detector pixels joined a side, on top of the selection's.
-        share: Gaussians at the start, relative to the default number for the unbinned volume; 0 for FBP.
-        steps: number of steps for which the time suffices; 0 for FBP.
-        gain: expected dB above the FBP of the unbinned views, from the measured curve.
-    """
-
-    binning: int
-    share: float
-    steps: int
-    gain: float
-
-    @property
-    def fits(self) -> bool:
-        """The choice is a fit; else FBP."""
-        return self.share > 0
-
-
-def choose(budget: float, speeds: Speeds, largest_binning: int) -> Choice:
-    """The settings with the best expected quality within `budget` seconds.
-
-    Each measured curve gives the quality of a kind of fit after the steps for which the time suffices; FBP counts as
-    0 dB. If the time does not suffice even for FBP of binned views, the coarsest FBP is chosen and takes longer.
-
-    Args:
-        budget: s for everything: FBP, placing, fitting and filling the volume.
-        speeds: times of this machine and scan.
-        largest_binning: largest binning that the detector allows.
-
-    Raises:
-        ValueError: for a budget that is not positive.
-    """
-    if not (math.isfinite(budget) and budget > 0):
-        raise ValueError(f"a budget is a positive time in s, got {budget}")
-    candidates: list[Choice] = []
-    for binning in (n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)):
-        # Binning above 2 was not measured: each further factor of 2 is assumed to cost 3 dB, about as much as the
-        # first one.
-        loss = 3.0 * math.log2(binning)
-        fbp = speeds.fbp / binning**3
-        if fbp <= budget:
-            candidates.append(Choice(binning, 0.0, 0, -loss))
-        for curve in CURVES:
-            if curve.binning != min(binning, 2):
-                continue
-            further = binning // curve.binning
-            share, fixed = curve.share / further**3, fbp + speeds.start * curve.share / further**3
-            left = budget - fixed - speeds.fill * curve.share / further**3
-            steps = left / (speeds.step * curve.pace / further**2)
-            gain = curve.gain(steps) - 3.0 * math.log2(further)
-            if math.isfinite(gain):
-                candidates.append(Choice(binning, share, int(steps), gain))
-    if not candidates:
-        return Choice(max(n for n in (1, 2, 4, 8) if n <= max(1, largest_binning)), 0.0, 0, -math.inf)
-    # With equal gains the finer volume, then fewer Gaussians.
-    return max(candidates, key=lambda c: (c.gain, -c.binning, -c.share))
 
 
 @dataclass(frozen=True)
@@ -208,15 +74,15 @@ def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
     """Additional time for a fit to gain a dB, from the quality of fits of other lengths (`CURVES`).
 
     A fit's own record is no basis: much of its gain towards the end comes from the falling learning rates, a gain that
-    a longer fit has only once, too. The curves are means over two scans; `low` and `high` are the best and the worst of
-    the curves for different numbers of Gaussians. Beyond its last point a curve is extrapolated with its last slope, to
-    at most four times its steps.
+    a longer fit has only once, too. The curves are means over three scans; `low` and `high` are the best and the worst
+    of the curves for different numbers of Gaussians. Beyond its last point a curve is extrapolated with its last slope,
+    to at most four times its steps.
 
     Args:
         seconds: time that the fit took.
         steps: number of its steps, over which the learning rates fell.
     """
-    found = sorted(_further(curve, steps) for curve in CURVES if curve.binning == 1)
+    found = sorted(_further(curve, steps) for curve in CURVES if curve.binning == 1 and curve.share > 0)
     low, middle, high = (seconds * (factor - 1) for factor in (found[0], found[len(found) // 2], found[-1]))
     return NextDecibel(middle, low, high, "volume")
 

@@ -128,7 +128,8 @@ class Traits:
         device: it computes on any device, not on the CPU alone.
         held_out: views can be held out.
         checkpoints: its state can be saved and continued.
-        presets: a quality preset or a time budget chooses its settings.
+        presets: a quality preset chooses its settings.
+        budget: a time budget chooses its settings, see `recon.assess.plans`.
         any_grid: its model has no voxels, so that views of joined pixels still fill the full grid.
     """
 
@@ -137,6 +138,7 @@ class Traits:
     held_out: bool = False
     checkpoints: bool = False
     presets: bool = False
+    budget: bool = False
     any_grid: bool = False
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self, get_args
 
-from recon.assess.time_model import PRESETS, Quality
+from recon.assess.plans import PRESETS, Quality
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import PRECISION, Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
@@ -50,7 +50,9 @@ class R2:
     name: ClassVar[str] = "r2"
     label: ClassVar[str] = "R²-Gaussian"
     colour: ClassVar[str] = "tab:blue"
-    traits: ClassVar[Traits] = Traits(device=True, held_out=True, checkpoints=True, presets=True, any_grid=True)
+    traits: ClassVar[Traits] = Traits(
+        device=True, held_out=True, checkpoints=True, presets=True, budget=True, any_grid=True
+    )
 
     steps: int | None = None
     seconds: float | None = None

@@ -35,7 +35,7 @@ class FistaTv:
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
     colour: ClassVar[str] = "tab:red"
-    traits: ClassVar[Traits] = Traits()
+    traits: ClassVar[Traits] = Traits(budget=True)
 
     iterations: int = 20
     tv_weight: float | None = None

@@ -35,7 +35,7 @@ class OsSirtTv:
     name: ClassVar[str] = "os-sirt-tv"
     label: ClassVar[str] = "OS-SIRT-TV"
     colour: ClassVar[str] = "tab:orange"
-    traits: ClassVar[Traits] = Traits()
+    traits: ClassVar[Traits] = Traits(budget=True)
 
     iterations: int = 40
     subsets: int = 9

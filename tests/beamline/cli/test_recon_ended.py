@@ -15,7 +15,7 @@ import pytest
 from beamline.reconstruct import budget
 from beamline.reconstruct import finished as offline
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.assess.time_model import Speeds
+from recon.assess.plans import Speeds
 from recon.base.method import Progress
 from recon.splatting import optimise as fit
 from recon.voxels import direct
@@ -109,7 +109,7 @@ def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
         return fbp(*arguments)
 
     monkeypatch.setattr(direct, "fbp", interrupted)
-    monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1))
+    monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1, 1e6))
     result = beamline("recon", "scan.h5", *options, "-o", "out.h5", "--no-report")
     assert result.exit_code == 0, result.output
     assert "as soon as there is a volume" in result.stderr and "stopped early" not in result.output

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,15 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from recon.assess.metrics import psnr
-from recon.assess.time_model import PRESETS, Choice, Speeds
+from recon.assess.plans import CURVES, PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid
+from recon.base.method import Method, MethodResult, ReconProblem, RunControl
+from recon.base.volume import Grid, Volume
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
+from recon.voxels.direct import Fbp
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -54,9 +59,19 @@ def prepared(tmp_path: Path) -> PreparedProjections:
         return prepare_projections(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
 
 
-def _spend(prepared: PreparedProjections, budget: float, now: Ticking, warned: list[str] | None = None) -> Budgeted:
+def _spend(
+    prepared: PreparedProjections,
+    budget: float,
+    now: Ticking,
+    warned: list[str] | None = None,
+    methods: Sequence[Method] = (R2(), Fbp()),
+) -> Budgeted:
     said = [] if warned is None else warned
-    return within(budget, prepared, 0, "hann", now, lambda p: None, lambda: False, said.append)
+    return within(budget, prepared, methods, 0, RunControl(now=now), said.append)
+
+
+def _as_fast_as(monkeypatch: pytest.MonkeyPatch, *speeds: float) -> None:
+    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(*speeds))
 
 
 @pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
@@ -64,7 +79,7 @@ def test_the_time_is_used_and_not_exceeded(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
+    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr(module, "finish_within", lambda *_: (0, 0.0))  # its seconds are not ticks
     done = _spend(prepared, budget, Ticking(0.01))
     assert done.choice.fits
@@ -86,7 +101,7 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for(prepared: Prepare
 def test_a_slow_machine_takes_fbp_of_joined_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     done = _spend(prepared, 5.0, Ticking(0.01))
     assert not done.choice.fits and done.choice.binning == 2
     assert done.result.volume.grid.shape == (3, 20, 20)
@@ -100,7 +115,7 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
 
     def slow(*_: object) -> Speeds:
         clock.time += 7.0
-        return Speeds(432.0, 50.0, 3.0, 10.0)
+        return Speeds(432.0, 50.0, 3.0, 10.0, 9.0)
 
     monkeypatch.setattr(module, "calibrate", slow)
     warned: list[str] = []
@@ -119,10 +134,90 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
 def test_the_shortest_fit_is_said_to_be_late_too(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     warned: list[str] = []
     _spend(_cone(prepared, 3.6), 0.001, Ticking(0.01), warned)
     assert len(warned) == 1 and "the cheapest choice, r2, pixels joined" in warned[0]
+
+
+@pytest.fixture
+def high(prepared: PreparedProjections) -> PreparedProjections:
+    """The same views, 64 rows high."""
+    views = Geometry.parallel(prepared.geometry.angles, (64, 40), prepared.geometry.pixel_pitch, SCAN.axis_col)
+    data = np.repeat(prepared.projections.data[:, 2:3], 64, axis=1)
+    noise = np.random.default_rng(0).normal(0, 0.02, data.shape).astype(np.float32)
+    return replace(
+        prepared, projections=replace(prepared.projections, data=data + noise), geometry=views, held_out=None
+    )
+
+
+PACE = next(c.pace for c in CURVES if c.method == OsSirtTv.name and c.binning == 1)
+
+
+@dataclass(frozen=True)
+class Costly(OsSirtTv):
+    """OS-SIRT-TV that takes its curve's pace an iteration on 64 rows; its volume is too large by a factor."""
+
+    clock: Ticking = field(default_factory=lambda: Ticking(0.0))
+    factor: float = 1.0
+    ran: list[tuple[int, int]] = field(default_factory=list)
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        rows = problem.geometry.detector_shape[0]
+        self.ran.append((rows, self.iterations))
+        found = OsSirtTv(iterations=5).run(problem, RunControl())
+        self.clock.time += self.iterations * PACE * rows / 64
+        return replace(found, volume=replace(found.volume, data=found.volume.data * np.float32(self.factor)))
+
+
+def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_rest_of_the_time(
+    high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Ticking(0.0)
+    _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)
+    for factor, expected in ((1.0, "os-sirt-tv"), (3.0, "fbp")):
+        costly = Costly(clock=clock, factor=factor)
+        begin = clock.time
+        done = _spend(high, 20.0, clock, methods=(costly, Fbp()))
+        assert done.result.method == expected
+        assert done.because.startswith("residual of views held out, rows ") and "os-sirt-tv " in done.because
+        assert done.because in done.summary(20.0) and done.settings(20.0)["chosen_because"] == done.because
+        (rows, tried), *final = costly.ran
+        assert rows == 32
+        assert clock.time - begin == pytest.approx(done.seconds) and done.seconds <= 20.0
+        # The method that was chosen gets the time that is left, which the trial's was a part of.
+        assert [r for r, _ in final] == ([64] if expected == costly.name else [])
+        assert all(n >= tried for _, n in final)
+
+
+def test_a_scan_of_few_rows_and_a_trial_that_takes_too_long_leave_what_other_scans_say(
+    prepared: PreparedProjections, high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)
+    few = _spend(prepared, 20.0, Ticking(0.0), methods=(OsSirtTv(), Fbp()))
+    assert few.result.method == "os-sirt-tv"
+    assert few.because.endswith("nothing was tried: the scan has too few rows for a trial in this time")
+    assert few.because.startswith("expected by other scans, dB above FBP: os-sirt-tv ")
+    clock = Ticking(0.0)
+    slow = Costly(clock=clock)
+    monkeypatch.setattr(Costly, "run", lambda self, problem, control: _wait(clock, 12.0, problem))
+    late = _spend(high, 20.0, clock, methods=(slow, Fbp()))
+    assert late.because.endswith("too little time") and late.seconds > 12.0
+
+
+def _wait(clock: Ticking, seconds: float, problem: ReconProblem) -> MethodResult:
+    clock.time += seconds
+    return MethodResult(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
+
+
+def test_a_method_on_voxels_ends_in_time_with_what_it_has(
+    high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _as_fast_as(monkeypatch, 0.1, 1e6, 1.0, 1e6, 0.1)
+    done = _spend(high, 3.0, Ticking(0.1), methods=(FistaTv(),))
+    last = done.result.history[-1]
+    assert 1 < last.step < last.steps and done.seconds <= 3.5 and done.because == ""
+    assert done.summary(3.0).startswith(f"fista-tv, {last.step} iterations: ")
 
 
 def _cone(
@@ -157,15 +252,16 @@ def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections)
 def test_a_cone_is_placed_as_its_parallel_likeness_is(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
-    counts = [_spend(views, 3.0, Ticking(0.01)).placed for views in (prepared, _cone(prepared, 2 * np.pi))]
-    assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) > 500
+    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
+    both = (prepared, _cone(prepared, 2 * np.pi))
+    counts = [_spend(views, 3.0, Ticking(0.01)).result.settings["gaussians_at_start"] for views in both]
+    assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) >= 500
 
 
 def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     done = _spend(_cone(prepared, 2 * np.pi), 5.0, Ticking(0.01))
     assert done.summary(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
 
@@ -175,10 +271,10 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, turn: float, tilt: float
 ) -> None:
     """A cone's short scan, and views that lean, are for neither FBP nor FDK."""
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(20.0, 50.0, 3.0, 10.0))
+    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     done = _spend(_cone(prepared, turn, tilt=tilt), 5.0, Ticking(0.01))
-    assert done.choice.fits and done.result.method == "r2" and done.choice.binning == 2
-    assert done.result.history[-1].step > 0 and 0 < done.placed < 100
+    assert done.choice.fits and done.result.method == "r2" and done.choice.binning == 4
+    assert done.result.history[-1].step > 0 and 0 < done.result.settings["gaussians_at_start"] < 100
     assert done.result.volume.data.max() > 0
 
 
@@ -193,8 +289,8 @@ def test_joined_views_keep_their_scale_and_place(prepared: PreparedProjections) 
 
 def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
-    monkeypatch.setattr(module, "calibrate", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1))
-    monkeypatch.setattr(module, "choose", lambda *_: Choice(2, 1.0, 100, 1.0))
+    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
+    monkeypatch.setattr(module, "plans", lambda *_: [Choice("r2", "steps", 2, 1.0, 100, 1.0, 0.5)])
     with SourceOptions(tmp_path / "scan.h5").open() as source:
         grid = Grid.matching(prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
     np.save(tmp_path / "truth.npy", SCAN.truth(grid))
@@ -242,7 +338,7 @@ def test_a_real_budget_on_a_real_clock(prepared: PreparedProjections) -> None:
     """Four seconds, and a tenth of grace; a machine busy with other work may stop this process for a while."""
     warm_up()
     begin = time.perf_counter()
-    done = within(4.0, prepared, 0, "hann", time.perf_counter, lambda p: None, lambda: False, lambda w: None)
+    done = within(4.0, prepared, [R2()], 0, RunControl(now=time.perf_counter), lambda w: None)
     took = time.perf_counter() - begin
     assert done.choice.fits
     assert 3.0 < took < 4.4

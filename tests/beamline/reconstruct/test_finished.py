@@ -363,7 +363,7 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
 def test_an_option_that_the_method_would_ignore_is_refused(
     tmp_path: Path, changes: dict[str, object], said: str
 ) -> None:
-    with pytest.raises(ConfigError, match=f"fbp does not take {said}: they are for r2"):
+    with pytest.raises(ConfigError, match=rf"fbp does not take {said} \(of r2"):
         reconstruct_file(_options(tmp_path, **changes), lambda e: None, SystemClock())
     assert _names(tmp_path) == {"scan.h5"}
 

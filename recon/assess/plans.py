@@ -1,0 +1,211 @@
+"""plans: method and settings for a time budget, by curves of quality against time; and the presets of a fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+Quality = Literal["preview", "standard", "best"]
+
+_MOST_BINNED = 2  # of the measured curves
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Quality against steps of one kind of reconstruction, measured by tests/bench/test_quality_curves.py.
+
+    Attributes:
+        method: its name in `recon.methods`.
+        counted: the setting of the method that its steps are; empty for one without steps.
+        binning: detector pixels joined a side.
+        share: Gaussians at the start, relative to the default number for the volume; 0 for a method on voxels.
+        pace: CPU time of a step. Of a fit relative to a step with binning 1 and share 1, of a method on voxels to a
+            sweep of FISTA-TV over the same views and voxels.
+        sweeps: what it takes beside its steps, such as a fit's finish, in such sweeps.
+        points: (steps, dB above the FBP of the unbinned views), steps rising.
+    """
+
+    method: str
+    counted: str
+    binning: int
+    share: float
+    pace: float
+    sweeps: float
+    points: tuple[tuple[int, float], ...]
+
+    def gain(self, steps: float) -> float:
+        """dB above FBP after so many steps, interpolated in their logarithm; -inf below the first point."""
+        if steps < self.points[0][0]:
+            return -math.inf
+        at, gains = zip(*self.points, strict=True)
+        return float(np.interp(math.log(steps), np.log(at), gains))
+
+    def fixed(self, speeds: Speeds, further: int = 1) -> float:
+        """Seconds that it takes beside its steps, pixels joined further than its own by a factor."""
+        placed = (speeds.start + speeds.fill) * self.share / further**3
+        finished = self.share == 0 or math.isfinite(speeds.sweep)
+        sweeps = self.sweeps * speeds.sweep if self.sweeps > 0 and finished else 0.0
+        return (speeds.fbp + sweeps) / (self.binning * further) ** 3 + placed
+
+    def step(self, speeds: Speeds, further: int = 1) -> float:
+        """Seconds of a step."""
+        if self.share > 0:
+            return speeds.step * self.pace / further**2
+        return speeds.sweep * self.pace / (self.binning * further) ** 3 if self.pace > 0 else 0.0
+
+
+# Means of three scans: a slab of a measured walnut (40 rows of 256 pixels, 60 views), a simulated battery (48 rows of
+# 160 pixels, 90 views, 5000 photons a pixel), and simulated spheres (48 rows of 96 pixels, 60 views, 10 000 photons).
+# Fits with their finish of 8 sweeps. Binning helps only where FBP of all pixels takes too long.
+CURVES: tuple[Curve, ...] = (
+    Curve("fbp", "", 1, 0.0, 0.0, 0.0, ((1, 0.0),)),
+    Curve("fbp", "", 2, 0.0, 0.0, 0.0, ((1, -4.06),)),
+    Curve("r2", "steps", 1, 1.0, 1.0, 9.1, ((125, 6.05), (250, 6.18), (500, 6.21), (1000, 6.15))),
+    Curve("r2", "steps", 1, 0.5, 0.74, 10.6, ((125, 6.02), (250, 6.15), (500, 6.2), (1000, 6.14))),
+    Curve("r2", "steps", 1, 0.25, 0.56, 9.0, ((125, 5.9), (250, 6.13), (500, 6.18), (1000, 6.14))),
+    Curve("r2", "steps", 1, 2.0, 1.59, 10.9, ((125, 6.01), (250, 6.18), (500, 6.21), (1000, 6.17))),
+    Curve("r2", "steps", 2, 0.25, 0.53, 12.6, ((125, -2.31), (250, -2.26), (500, -2.24), (1000, -2.24))),
+    Curve("fista-tv", "iterations", 1, 0.0, 1.03, 1.7, ((5, 4.48), (10, 5.81), (20, 5.95), (40, 5.71))),
+    Curve("fista-tv", "iterations", 2, 0.0, 1.16, 1.9, ((5, -2.43), (10, -2.4), (20, -2.37), (40, -2.46))),
+    Curve("os-sirt-tv", "iterations", 1, 0.0, 0.63, 0.7, ((5, -1.55), (10, 2.68), (20, 5.49), (40, 6.27))),
+    Curve("os-sirt-tv", "iterations", 2, 0.0, 0.75, 0.9, ((5, -4.19), (10, -2.65), (20, -2.21), (40, -2.24))),
+)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of a fit for one of the quality levels.
+
+    Attributes:
+        steps: number of steps of the fit.
+        share: Gaussians at the start, relative to the default number for the volume.
+    """
+
+    steps: int
+    share: float
+
+
+PRESETS: dict[Quality, Preset] = {
+    "preview": Preset(125, 0.5),
+    "standard": Preset(500, 1.0),
+    "best": Preset(1500, 2.0),
+}
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Times measured on this machine for this scan, in s, without binning and with the default number of Gaussians.
+
+    Attributes:
+        fbp: FBP of the whole volume.
+        start: placing the Gaussians, without FBP.
+        step: one step of the fit.
+        fill: computing the final volume from the Gaussians.
+        sweep: a sweep of FISTA-TV over all views; infinite where voxels do not take them.
+    """
+
+    fbp: float
+    start: float
+    step: float
+    fill: float
+    sweep: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Method and settings chosen for a time budget.
+
+    Attributes:
+        method: its name in `recon.methods`.
+        counted: its setting that `steps` are; empty for a method without steps.
+        binning: detector pixels joined a side, on top of the selection's.
+        share: Gaussians at the start, relative to the default number for the unbinned volume; 0 for none.
+        steps: number of steps for which the time suffices.
+        gain: expected dB above the FBP of the unbinned views, from the measured curve.
+        seconds: that it is expected to take.
+    """
+
+    method: str
+    counted: str
+    binning: int
+    share: float
+    steps: int
+    gain: float
+    seconds: float
+
+    @property
+    def fits(self) -> bool:
+        """The choice is a fit of Gaussians."""
+        return self.share > 0
+
+    def settings(self, default_count: int) -> dict[str, int]:
+        """Settings of the method, as `recon.methods.build` takes them.
+
+        Args:
+            default_count: of Gaussians, for the unbinned volume.
+        """
+        found = {self.counted: self.steps} if self.counted else {}
+        return found | ({"gaussians": max(1, round(self.share * default_count))} if self.fits else {})
+
+
+def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collection[str] | None = None) -> list[Choice]:
+    """For each method the settings with the best expected quality within `budget` seconds; the best method first.
+
+    Each measured curve gives the quality of a kind of reconstruction after the steps for which the time suffices. A
+    method for which it does not suffice is left out; if it suffices for none, the one that takes the least time is
+    there alone, with a gain of -inf.
+
+    Args:
+        budget: s for everything: FBP, placing, steps, finish and filling the volume.
+        speeds: times of this machine and scan.
+        largest_binning: largest binning that the detector allows.
+        methods: names of those to consider; None: all that were measured.
+
+    Raises:
+        ValueError: for a budget that is not positive.
+    """
+    if not (math.isfinite(budget) and budget > 0):
+        raise ValueError(f"a budget is a positive time in s, got {budget}")
+    kinds = [
+        (curve, further)
+        for curve in CURVES
+        for further in (1, 2, 4)
+        if curve.binning * further <= max(1, largest_binning) and (methods is None or curve.method in methods)
+        if further == 1 or curve.binning == _MOST_BINNED
+    ]
+    best: dict[str, Choice] = {}
+    for curve, further in kinds:
+        choice = _longest(curve, further, budget, speeds)
+        # With equal gains the finer volume, then fewer Gaussians.
+        if choice is not None and (curve.method not in best or _rank(choice) > _rank(best[curve.method])):
+            best[curve.method] = choice
+    if best:
+        return sorted(best.values(), key=_rank, reverse=True)
+    shortest = [_choice(curve, further, curve.points[0][0], speeds) for curve, further in kinds]
+    return [replace(min(shortest, key=lambda c: c.seconds), gain=-math.inf)]
+
+
+def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choice | None:
+    """The choice of one kind that the time suffices for; None: it does not."""
+    left, step = budget - curve.fixed(speeds, further), curve.step(speeds, further)
+    first, last = curve.points[0][0], max(curve.points, key=lambda point: point[1])[0]
+    if not left >= first * step:
+        return None
+    # More steps than were best follow the noise.
+    return _choice(curve, further, int(min(left / step, last)) if step > 0 else last, speeds)
+
+
+def _choice(curve: Curve, further: int, steps: int, speeds: Speeds) -> Choice:
+    # Binning above 2 was not measured: each further factor of 2 is assumed to cost 3 dB, about as much as the first.
+    gain = curve.gain(steps) - 3.0 * math.log2(further)
+    seconds = curve.fixed(speeds, further) + steps * curve.step(speeds, further)
+    share = curve.share / further**3
+    return Choice(curve.method, curve.counted, curve.binning * further, share, steps, gain, seconds)
+
+
+def _rank(choice: Choice) -> tuple[float, float, float]:
+    return choice.gain, -choice.binning, -choice.share
