@@ -84,8 +84,9 @@ def finish(
         problem: the views that were fitted, without roll and tilt, and the weights of their rays.
         sweeps: 1 or more.
         settings: of the fit; None: the defaults.
-        should_stop: called after each sweep; True ends the iteration. Between the two attempts it keeps the volume as
-            it was.
+        should_stop: called after each sweep; True ends the iteration. Between the two attempts it keeps the first where
+            it explains the views of a parallel beam, which see all matter, better than the fit, else the fit. Of such
+            views it keeps the first during the second, too.
 
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
@@ -100,10 +101,13 @@ def finish(
     data = data - ring_offsets(data - model)
     start = Volume(np.maximum(volume.data, 0), volume.grid)
 
+    def stopped() -> bool:
+        return should_stop is not None and should_stop()
+
     def refined(views: F32, unmodelled: float = 0.0) -> Volume:
         return solve(
             _FromModel(sweeps, unmodelled), projector, views, weight=known, start=start,
-            on_iteration=lambda *_: should_stop is not None and should_stop(), seed=problem.seed,
+            on_iteration=lambda *_: stopped(), seed=problem.seed,
         )  # fmt: skip
 
     fitted = _deviation(data - model, known)
@@ -115,12 +119,16 @@ def finish(
     left = _deviation(data - projector.forward(found.data), known)
     if left <= min(fitted, _EXPLAINED * noise):
         return found
-    if should_stop is not None and should_stop():
-        return volume
+    beyond = leaves_the_field(data, problem.geometry)
+    bent = beyond or problem.geometry.is_cone  # however well voxels explain the views
+    if stopped():
+        return volume if bent or left > fitted else found
     # Matter beyond the field is smooth in the views, and explained by the Gaussians; an error of voxels is at edges.
-    smooth = noise == 0 or leaves_the_field(data, problem.geometry)
+    smooth = noise == 0 or beyond
     data -= model
     other = refined(data, 0.0 if smooth else unlike / noise)
+    if stopped() and not bent:  # cut short
+        return found
     return other if _deviation(data - projector.forward(other.data), known) <= _ALIKE * left else found
 
 

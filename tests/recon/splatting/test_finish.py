@@ -64,6 +64,16 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     assert qualities[-1] > 30
 
 
+def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
+    g, missing = _blob(8.0), _box()
+    data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)  # no noise: voxels explain all but that
+    looks = iter([False, False, False, True])  # three sweeps, then between
+    once = finish(_of(g), g, _problem(data), 3, should_stop=lambda: next(looks))
+    assert next(looks, None) is None
+    truth = _of(g).data + missing
+    assert psnr(truth, once.data) > psnr(truth, _of(g).data) + 3
+
+
 def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
     # A box without the blob: its views must not be spread over what is inside.
     g = _blob(12.0)
