@@ -18,6 +18,7 @@ from beamline.config.load import Config, load
 from beamline.core.errors import AlarmError
 from beamline.core.events import Event, Sink
 from beamline.core.stop import StopRequest
+from beamline.core.text import count
 from beamline.instrument.operator import ask_operator
 from beamline.scan.live_process import LiveCommand, follow_command
 from beamline.scan.preflight import dry_run, refuse_violations
@@ -49,8 +50,8 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
     Exit code: 0 done, 2 wrong configuration or violated limit, 3 device failed, 4 stopped, 5 frames missing or disk
-    error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, 130 aborted, or
-    interrupted before the first frame.
+    error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, or darks or flats a
+    fault, 130 aborted, or interrupted before the first frame.
     """
     with json_events(as_json) as json_sinks:
         config = load(file, overrides)
@@ -66,13 +67,24 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
             )
     if not as_json:
         click.echo(_results(result))
+    if faults := _faults(result):
+        raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def _faults(result: RunResult) -> list[str]:
+    """What is wrong with the frames of a complete scan, and what that means for it."""
+    said = []
     if result.alarmed_frames:
-        again = f", beside {result.retaken} views that were taken again" if result.retaken else ""
-        raise AlarmError(
-            f"The scan is complete, but {result.alarmed_frames} of {result.n_frames} frames have an alarm of the "
-            f"monitor{again}: {counted(result.flags)}. `beamline recon` leaves such views out. Look at "
-            f"{result.path.parent}; repeat the scan where too many are lost."
+        verb = "has" if result.alarmed_frames == 1 else "have"
+        again = f", beside {count(result.retaken, 'view')} that were taken again" if result.retaken else ""
+        said.append(
+            f"{result.alarmed_frames} of {result.n_frames} frames {verb} an alarm of the monitor{again}: "
+            f"{counted(result.flags)}."
         )
+    if result.alarmed_views:
+        views = count(result.alarmed_views, "view")
+        said.append(f"`beamline recon` leaves out {views} among them; repeat the scan where too many are lost.")
+    return [*said, *result.reference_faults]
 
 
 def _dry_run(config: Config, json_sinks: Sequence[Sink]) -> None:

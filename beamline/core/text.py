@@ -1,4 +1,4 @@
-"""Text for people: angles, sizes, index ranges."""
+"""Text for people: angles, sizes, numbers of things, index ranges."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ def size(n_bytes: float) -> str:
             return f"{n_bytes:.3g} {unit}"
         n_bytes /= 1000
     return f"{n_bytes:.3g} TB"
+
+
+def count(n: int, noun: str) -> str:
+    """`1 view`, `2 views`."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def spans(indices: Sequence[int], limit: int = 12) -> str:

@@ -33,7 +33,8 @@ class ReferenceLimits:
 
     saturated: as the alarm of the check `saturation`: a cosmic ray hits a pixel or two, one in a thousand is exposure.
     beam: a flat at the darks' level has no light; three times the noise of a pixel is the least that can be told.
-    lost: as the check `beam`: half of the light does not go by drift, top-up or decay of the ring's current.
+    lost: half of the light does not go by drift, top-up or decay of the ring's current. Against the brightest flats
+        and against the views, which no sample makes brighter.
     uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
     unlit: a beam may be narrower than the detector, but not so that most of it is dark.
     lit: darks that are lit have a share of the flats' level and, since light brings its noise, of their variance;
@@ -79,7 +80,7 @@ class Fault:
     """What is wrong with a group.
 
     Attributes:
-        what: "saturated", "dark", "lost", "uneven", "unlit" or "lit".
+        what: "saturated", "dark", "lost", "outshone", "uneven", "unlit" or "lit".
         score, limit: the figure, and the limit that it breaks.
         message: both in words, and what to do.
     """
@@ -116,11 +117,12 @@ class JudgedGroup:
 Group = Sequence[Reference]
 
 
-def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None) -> tuple[JudgedGroup, ...]:
+def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()) -> tuple[JudgedGroup, ...]:
     """Judge groups of darks and flats, each by itself and beside the others.
 
     Args:
         groups: of one kind each, none empty, in the order of the file.
+        views: some projections, where there are any.
     """
     limits = limits or ReferenceLimits()
     base = min((group for group in groups if group[0].kind is FrameKind.DARK), key=_level, default=None)
@@ -133,6 +135,8 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None) -> tup
             faults = [] if bright is None else [_lit(group, bright, base or group, limits)]
         else:
             faults = [_saturated(group, base, limits), _without_beam(group, base, bright or group, limits)]
+            if not any(faults):
+                faults = [_outshone(group, base, views, limits)]
             if not any(faults):
                 faults = [_uneven(group, base, limits), _unlit(group, base, limits)]
         rows = tuple(reference.row for reference in group)
@@ -175,6 +179,22 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
     where = spans([reference.row for reference in bright])
     said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.lost:.0%}): the beam was lost."
     return Fault("lost", gone, limits.lost, said)
+
+
+def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> Fault | None:
+    """Views that are brighter than flats, where the exposures of both are known: a sample only takes light."""
+    views = [view for view in views if view.saturated <= limits.saturated and np.isfinite(view.blocks).any()]
+    if not views or not all(frame.exposure > 0 for frame in (*flats, *views)):
+        return None
+    there, most = _light(flats, darks), _light(views, darks)
+    if there >= (1 - limits.lost) * most:
+        return None
+    share = there / most
+    said = (
+        f"they have {share:.2%} of the light of the views (limit {1 - limits.lost:.0%}), though a sample only takes "
+        "light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
+    )
+    return Fault("outshone", share, 1 - limits.lost, said)
 
 
 def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:

@@ -71,7 +71,8 @@ def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
             continue
         is_alarm = bool(flags.bits[row] >> entry.alarm_bit & 1)
         alarm = alarm or is_alarm
-        score = "" if flags.scores is None else f" {flags.scores[row, i]:.3g}"
+        known = flags.scores is not None and np.isfinite(flags.scores[row, i])
+        score = f" {flags.scores[row, i]:.3g}" if flags.scores is not None and known else ""
         said.append(f"{entry.name} {Level.ALARM if is_alarm else Level.WARN}{score}")
         if flags.regions is not None and flags.regions[row, i, 0] >= 0:
             top, bottom, left, right = flags.regions[row, i].tolist()

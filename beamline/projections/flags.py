@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import count
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
 from drivers.frame import FrameKind
@@ -54,15 +55,18 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     alarmed = views & flags.alarmed
     warned = views & flags.flagged & ~alarmed
     if not use_flags:
-        n = f"{alarmed.sum()} views with an alarm and {warned.sum()} with a warning"
+        n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         said = f"--flags ignore: {n} are used as they are."
         return UsableViews(rows, said=said, flags=flags)
     parts = []
     if alarmed.any():
-        parts.append(f"{alarmed.sum()} have an alarm and are left out ({counted(flags.of(alarmed).counts())})")
+        verbs = ("has", "is") if alarmed.sum() == 1 else ("have", "are")
+        which = counted(flags.of(alarmed).counts())
+        parts.append(f"{alarmed.sum()} {verbs[0]} an alarm and {verbs[1]} left out ({which})")
     weights = None
     if warned.any():
-        parts.append(f"{warned.sum()} have a warning and weigh half ({counted(flags.of(warned).counts())})")
+        verbs = ("has", "weighs") if warned.sum() == 1 else ("have", "weigh")
+        parts.append(f"{warned.sum()} {verbs[0]} a warning and {verbs[1]} half ({counted(flags.of(warned).counts())})")
         weights = np.where(warned, np.float32(WARNED_WEIGHT), np.float32(1))
     said = f"Of {rows.size} views {', '.join(parts)}. --flags ignore takes all alike."
     return UsableViews(np.flatnonzero(views & ~alarmed), weights, int(alarmed.sum()), said, flags)

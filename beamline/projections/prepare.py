@@ -91,8 +91,7 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
-    usable = flagged_views(source, selection, warn)
-    check(source, selection, warn)
+    usable = checked_views(source, selection, warn)
     scan_frames = usable.frames
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
     correction = ScanCorrection(source, selection, warn)
@@ -114,37 +113,26 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
     return assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
 
 
-def flagged_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
-    """The views that may be used, by the flags of the monitor, and says what that means for this scan.
+def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
+    """The views of a finished scan that may be used, by the flags of the monitor.
+
+    What else its file lacks is told as a warning, also what its flags mean for this scan.
 
     Raises:
-        DataError: too few views are left.
+        DataError: it cannot be reconstructed; with every reason, and what to do about each.
     """
     judged = judged_flags(source) if selection.judge and source.finished else None
+    findings = [*scan_findings(source), *references_usable(source, selection.accept_references)]
     if selection.use_flags:
-        refuse(source, frames_flagged(source, judged))
+        findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
+    refuse(source, findings)
     usable = usable_views(source, selection.use_flags, judged)
     if usable.said:
         warn(usable.said)
-    return usable
-
-
-def check(source: ScanSource, selection: Selection, warn: Warn) -> None:
-    """Refuse a finished scan that cannot be reconstructed; warn of what else its file lacks.
-
-    Raises:
-        DataError: with what to do about it.
-    """
-    findings = scan_findings(source)
-    if selection.accept_references:
-        for finding in references_usable(source):
-            warn(f"--references accept: {finding.message}")
-    else:
-        findings += references_usable(source)
-    refuse(source, findings)
     for finding in findings:
         if finding.severity == "warning":
             warn(finding.message)
+    return usable
 
 
 def assemble(
@@ -189,11 +177,10 @@ def assemble(
 
 
 def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raises DataError for the first error among the findings, with what to do about it."""
-    for finding in findings:
-        if finding.severity != "error":
-            continue
-        raise DataError(f"{source.path} cannot be reconstructed. {finding.message}")
+    """Raises DataError for the errors among the findings, with what to do about each."""
+    reasons = [finding.message for finding in findings if finding.severity == "error"]
+    if reasons:
+        raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
 
 
 def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:

@@ -17,9 +17,8 @@ from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.prepare import (
     PreparedProjections,
     assemble,
-    check,
+    checked_views,
     correction_blockers,
-    flagged_views,
     locate_axis,
     refuse,
     stated_axis,
@@ -218,8 +217,7 @@ class ScanFollower:
         Raises:
             DataError: a scan without two views that can be used, or whose views hold no matter.
         """
-        usable = flagged_views(self.source, self._options.selection, self._warn)
-        check(self.source, self._options.selection, self._warn)
+        usable = checked_views(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
         self._correct_again()
         prepared = self._prepared(self.axis_col, usable)

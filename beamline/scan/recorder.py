@@ -132,11 +132,11 @@ class Recorder:
     @property
     def alarmed_frames(self) -> int:
         """Frames so far with an alarm of any check, without those that were taken again."""
-        return len(self._alarmed - self._replaced)
+        return len(self._alarmed)
 
     @property
     def alarmed_views(self) -> list[Retake]:
-        """Views so far with an alarm of any check, with the trigger that each would be taken again by."""
+        """The views among these, with the trigger that each would be taken again by."""
         return [Retake(row, self._triggers[row]) for row in sorted(self._alarmed & self._triggers.keys())]
 
     @property
@@ -146,7 +146,7 @@ class Recorder:
 
     @property
     def _alarmed(self) -> set[int]:
-        return {row for flag in self._found if flag.level is Level.ALARM for row in flag.rows}
+        return {row for flag in self._found if flag.level is Level.ALARM for row in flag.rows} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Frames beside the timeline's come next; may be called while no frame waits."""

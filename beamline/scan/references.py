@@ -10,6 +10,7 @@ from beamline.plan.plan import Block
 from drivers.frame import Frame, FrameKind
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
+VIEWS = 4  # enough for a median
 
 
 class ReferenceLog:
@@ -22,15 +23,18 @@ class ReferenceLog:
     def __init__(self, preview_bin: int) -> None:
         self._preview_bin = preview_bin
         self._groups: list[list[Reference]] = []
+        self._views: list[Reference] = []
         self._before = FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
-        """Take note of a frame, in the order of the file."""
+        """Take note of a frame, in the order of the file; of the first views, too, whose light the flats must have."""
         if frame.kind in REFERENCES:
             if frame.kind is not self._before:
                 self._groups.append([])
             found = Reference.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin)
             self._groups[-1].append(found)
+        elif frame.kind is FrameKind.PROJECTION and len(self._views) < VIEWS:
+            self._views.append(Reference.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin))
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
@@ -44,4 +48,5 @@ class ReferenceLog:
             for block in planned
             if block.kind in REFERENCES and not any(group[0].kind is block.kind for group in self._groups)
         }
-        return missing | {group.name: group.described() for group in judge(self._groups, limits) if group.faults}
+        judged = judge(self._groups, limits, self._views)
+        return missing | {group.name: group.described() for group in judged if group.faults}

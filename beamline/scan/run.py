@@ -73,7 +73,9 @@ class RunResult:
         missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
         flags: frames that the monitor flagged: their number by check, then by level.
         alarmed_frames: frames with an alarm, without those that were taken again.
+        alarmed_views: views among them.
         retaken: views that were taken again, because they had one.
+        reference_faults: what is wrong with darks and flats, a sentence or more a group.
         seconds: real time of the whole run.
         bytes: size of the scan file.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
@@ -84,7 +86,9 @@ class RunResult:
     missing: tuple[int, ...]
     flags: Mapping[str, Mapping[str, int]]
     alarmed_frames: int
+    alarmed_views: int
     retaken: int
+    reference_faults: tuple[str, ...]
     seconds: float
     bytes: int
     recon: Mapping[str, Any] | None
@@ -198,7 +202,7 @@ class _Run:
         self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
         disk = _failure_of(recorder.finish)
         error = self._worse(error, disk)
-        self._reference_faults(recorder)
+        faults = self._reference_faults(recorder)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
         missing = acquisition.missing
         # A write that does not return holds HDF5's lock: closing the file would wait for it.
@@ -216,7 +220,9 @@ class _Run:
             missing=tuple(missing),
             flags=recorder.flags,
             alarmed_frames=recorder.alarmed_frames,
+            alarmed_views=len(recorder.alarmed_views),
             retaken=recorder.retaken,
+            reference_faults=tuple(faults.values()),
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
             recon=None,
@@ -296,8 +302,9 @@ class _Run:
             return None
         return (
             f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
-            f"The shutter is closed; the {recorder.n_frames} darks and flats are in the file. `beamline tune` looks "
-            "for an exposure; references.on_fault: log takes the scan all the same."
+            f"The shutter is closed; the {recorder.n_frames} darks and flats are in the file. Mend this, look at a few "
+            "frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the scan as "
+            "it is."
         )
 
     def _retakes(self, recorder: Recorder) -> Sequence[Retake]:

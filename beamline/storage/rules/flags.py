@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from beamline.core.text import spans
+from beamline.core.text import count, spans
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.finding import Finding
@@ -32,21 +32,24 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
         return
     message += f" Rows with an alarm: {spans(rows.tolist())}."
     if again.size:
-        message += f" {again.size} views were taken again, the first ones (rows {spans(again.tolist())}) are not used."
+        verb = "was" if again.size == 1 else "were"
+        message += (
+            f" {count(again.size, 'view')} {verb} taken again, and the first (rows {spans(again.tolist())}) not used."
+        )
         rows = np.setdiff1d(rows, again)
         if not rows.size:
-            yield Finding("info", "flags", f"{message} None of those that are has an alarm.")
+            yield Finding("info", "flags", f"{message} No other frame has an alarm.")
             return
-        message += f" Of those that are, {rows.size} have an alarm: {spans(rows.tolist())}."
+        message += f" Rows with an alarm beside these: {spans(rows.tolist())}."
     views = source.image_key == FrameKind.PROJECTION
     left, lost = int((views & ~flags.alarmed).sum()), int((views & flags.alarmed).sum())
     if lost and left < FEWEST_VIEWS:
         message += (
-            f" {left} of {views.sum()} views have none, {FEWEST_VIEWS} are needed: repeat the scan. `beamline recon "
-            "--flags ignore` takes all views all the same."
+            f" {left} of {views.sum()} views have none, {FEWEST_VIEWS} are needed: repeat the scan. "
+            "`beamline recon --flags ignore` takes all views all the same."
         )
         yield Finding("error", "flags", message)
         return
     if lost:
-        message += f" A reconstruction leaves the {lost} views among them out."
+        message += f" A reconstruction leaves {count(lost, 'view')} among them out."
     yield Finding("warning", "flags", message)

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import spans
 from beamline.monitor.digest import digest
 from beamline.monitor.references import JudgedGroup, Reference, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from drivers.frame import FrameKind
 
-SAMPLES = 4  # frames of a group that are looked at
+SAMPLES = 4  # frames of a group, and views, that are looked at
 BLOCK = 4  # pixels a side
 
 Frames = NDArray[np.int64]
@@ -61,30 +62,43 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
     """The groups of references of a scan of counts, judged by a few frames of each."""
     darks, flats = (groups_of(source.image_key, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
     looked_at = [[_reference(source, int(row)) for row in _some(group)] for group in (*darks, *flats)]
-    found = judge(looked_at, limits)
+    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
+    witnesses = [_reference(source, int(row)) for row in _some(views)] if views.size and flats else []
+    found = judge(looked_at, limits, witnesses)
     whole = [JudgedGroup(j.kind, tuple(g.tolist()), j.faults) for j, g in zip(found, (*darks, *flats), strict=True)]
     return ReferenceGroups(darks, flats, tuple(whole))
 
 
-def references_usable(source: ScanSource) -> Iterator[Finding]:
-    """Flats that are lit, whole and even, and darks that are dark; a bad group beside a good one is left out."""
-    if source.quantity == "counts":
-        yield from reference_findings(reference_groups(source))
+def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
+    """Flats that are lit, whole and even, and darks that are dark; a bad group beside a good one is left out.
 
+    An error for groups of a kind of which none is good, a warning for others that have a fault.
 
-def reference_findings(groups: ReferenceGroups) -> Iterator[Finding]:
-    """An error for each group of a kind of which none is good, a warning for others that have a fault."""
+    Args:
+        accepted: all are used as they are, so that a fault is a warning.
+    """
+    if source.quantity != "counts":
+        return
+    groups = reference_groups(source)
     lacking = groups.lacking()
+    alike: dict[tuple[FrameKind, tuple[str, ...], bool], list[int]] = {}
     for group in groups.judged:
-        if group in lacking:
-            message = (
-                f"{group.described()} It must not be reconstructed: take new {group.kind.name.lower()}s, or give "
-                f"others with --{group.kind.name.lower()}s; `beamline recon --references accept` uses these all the "
-                "same."
+        if group.faults:
+            faults = tuple(fault.message for fault in group.faults)
+            alike.setdefault((group.kind, faults, group in lacking), []).extend(group.rows)
+    for (kind, faults, none_good), rows in alike.items():
+        name = f"{kind.name.lower()}s"
+        message = f"The {name} {spans(rows)}: {' '.join(faults)}"
+        if accepted:
+            yield Finding("warning", "bad-references", f"--references accept: {message}")
+        elif none_good:
+            message += (
+                f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
+                "--references accept` uses these all the same."
             )
             yield Finding("error", "bad-references", message)
-        elif group.faults:
-            yield Finding("warning", "bad-references", f"{group.described()} The other ones are used instead.")
+        else:
+            yield Finding("warning", "bad-references", f"{message} The other {name} are used instead.")
 
 
 def _some(group: Frames) -> Frames:

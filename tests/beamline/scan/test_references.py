@@ -66,8 +66,23 @@ def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.Monke
             monkeypatch.setitem(fakes.LEVEL, True, 210)
 
     ran = Ran(tmp_path, FakeInstrument(on_frame=lose_the_beam))
-    assert ran.error is None
+    assert ran.error is None and ran.result is not None
+    assert ran.result.reference_faults == tuple(event.data["message"] for event in ran.of("warning"))
     assert [e.data["message"][:46] for e in ran.of("warning")] == ["The flats 17-18: there is no beam in them: the"]
+
+
+def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(fakes.LEVEL, True, 2000)
+
+    def find_the_beam(number: int) -> None:
+        if number == 5:  # three darks, two flats
+            monkeypatch.setitem(fakes.LEVEL, True, 20000)
+
+    ran = Ran(tmp_path, FakeInstrument(on_frame=find_the_beam), "scan.flats.at=start")
+    assert ran.error is None and ran.result is not None
+    (fault,) = ran.result.reference_faults
+    assert fault.startswith("The flats 3-4: they have 9.09% of the light of the views (limit 50%)")
+    assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
 
 
 def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> None:

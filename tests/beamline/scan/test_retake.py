@@ -73,7 +73,7 @@ def test_file_info_and_validate_count_them(tmp_path: Path) -> None:
     assert (facts["first_angle_deg"], facts["last_angle_deg"]) == (0, pytest.approx(168.75, abs=0.01))
     (found,) = [finding for finding in validate(path) if finding.rule == "flags"]
     assert found.severity == "info"
-    assert "3 views were taken again, the first ones (rows 8-9, 20) are not used. None of those" in found.message
+    assert "3 views were taken again, and the first (rows 8-9, 20) not used." in found.message
     with h5py.File(path) as file:
         assert list(file["entry/frame_log/replaces"][FIRST + N :]) == [8, 9, 20, -1, -1]
         assert list(file["entry/frame_log/trigger"][FIRST + N : FIRST + N + 3]) == [16, 17, 18]
@@ -105,7 +105,7 @@ def test_one_attempt_is_made(tmp_path: Path) -> None:
     assert (ran.result.retaken, ran.result.alarmed_frames) == (2, 1)
     (found,) = [finding for finding in validate(ran.result.path) if finding.rule == "flags"]
     assert found.severity == "warning"
-    assert "Of those that are, 1 have an alarm: 22. A reconstruction leaves the 1 views among them out" in found.message
+    assert "Rows with an alarm beside these: 22. A reconstruction leaves 1 view among them out" in found.message
 
 
 def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Path) -> None:
