@@ -26,7 +26,7 @@ _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 # What a trade-off tries, by depth.
 _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
-_FACTORS = {"quick": (0.5,), "full": (0.5, 2.0)}
+_FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
 
 
