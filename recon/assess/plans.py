@@ -60,8 +60,8 @@ class Curve:
 
 # Means of three scans: a slab of a measured walnut (40 rows of 256 pixels, 60 views), a simulated battery (48 rows of
 # 160 pixels, 90 views, 5000 photons a pixel), and simulated spheres (48 rows of 96 pixels, 60 views, 10 000 photons).
-# Fits with their finish of 8 sweeps. A curve begins where its method is above FBP on all three. Binning helps only where
-# FBP of all pixels takes too long.
+# Fits with their finish of 8 sweeps. A curve begins where its method is above FBP on all three. Binning helps only
+# where FBP of all pixels takes too long.
 CURVES: tuple[Curve, ...] = (
     Curve("fbp", "", 1, 0.0, 0.0, 0.0, ((1, 0.0),)),
     Curve("fbp", "", 2, 0.0, 0.0, 0.0, ((1, -4.06),)),
