@@ -180,13 +180,14 @@ def _run(lines: NDArray[np.intp], inside: int) -> tuple[int, int]:
 
 
 def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
-    """By how much some lines are darker (or brighter) than those on both sides, as a difference of logarithms.
+    """By how much the darkest (or brightest) of some lines differs from those on both sides: difference of logarithms.
 
-    An edge of the sample lies between the two; at the frame's edge there is one.
+    An edge of the sample lies between the two; at the frame's edge there is one. The outer lines of a band may be in it
+    by a part only.
     """
     left, right = lines[max(first - 1, 0) : first], lines[after : after + 1]
     beside = [float(side.mean()) for side in (left, right) if side.size]
-    own = float(lines[first:after].mean())
+    own = float(lines[first:after].min() if darker else lines[first:after].max())
     if not beside:
         return 0.0
     return min(beside) - own if darker else own - max(beside)

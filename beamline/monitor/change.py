@@ -3,8 +3,9 @@
 Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
 stage other than the last ones (turn). For the columns of the fit: d depth = -gain - across d/dx - down d/dy + turn
-velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The second pass
-weights cells by their residuals of the first (Huber 1964), so that a floater or a zinger moves nothing.
+velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The first pass
+weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964), so
+that a floater, a zinger or a band moves nothing.
 """
 
 from __future__ import annotations
@@ -99,18 +100,37 @@ def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers t
 
 
 @numba.njit(nogil=True, cache=True)
+def _weigh(change, usual, weight, share, deviation):  # type: ignore[no-untyped-def]
+    """Fills `share`, the Huber weights of changes about their usual value; `deviation` is scratch."""
+    rows, cols = change.shape
+    n = 0
+    for row in range(rows):
+        for col in range(cols):
+            share[row, col] = abs(change[row, col] - usual) * np.sqrt(weight[row, col])
+            if weight[row, col] > 0 and (row + col) % 5 == 0:
+                deviation[n] = share[row, col]
+                n += 1
+    limit = HUBER * 1.4826 * np.median(deviation[:n]) + 1e-9 if n > 0 else 1.0
+    for row in range(rows):
+        for col in range(cols):
+            share[row, col] = min(1.0, limit / max(share[row, col], 1e-12))
+
+
+@numba.njit(nogil=True, cache=True)
 def _fit(now, one, two, four, weight, steps, residual, found):  # type: ignore[no-untyped-def]
     """Fills `residual` and `found`: minus gain, across and down in cells, turn in velocities, noise."""
     rows, cols = now.shape
     velocity = (one - four) * np.float32(steps / 3)
     change = now - one - velocity
     line = np.empty(cols, np.float32)
-    image, smooth, turning = np.empty_like(now), np.empty_like(now), np.empty_like(now)
+    image, smooth = np.empty_like(now), np.empty_like(now)
+    turning, left_over = np.empty_like(now), np.empty_like(now)
     # Half a step back, as `change` compares now with one: the gradient is that of the middle.
     _smooth((one + two) * np.float32(0.5) + velocity, image, line)
     _smooth(velocity, turning, line)
     _smooth(change, smooth, line)
-    share = np.ones_like(now)
+    share, deviation = np.empty_like(now), np.empty(rows * cols, np.float32)
+    _weigh(smooth, np.median(smooth), weight, share, deviation)
     normal, right, solution = np.zeros((4, 4)), np.zeros(4), np.zeros(4)
     basis = np.zeros(4)
     for robust in range(2):
@@ -137,9 +157,6 @@ def _fit(now, one, two, four, weight, steps, residual, found):  # type: ignore[n
         for i in range(4):
             normal[i, i] += floor + 1e-12
         solution[:] = np.linalg.solve(normal, right)
-        if robust == 0:
-            deviation = np.empty(rows * cols, np.float32)
-            n = 0
         for row in range(rows):
             above, below = max(row - 1, 0), min(row + 1, rows - 1)
             for col in range(cols):
@@ -151,16 +168,9 @@ def _fit(now, one, two, four, weight, steps, residual, found):  # type: ignore[n
                     + solution[3] * turning[row, col]
                 )
                 residual[row, col] = change[row, col] - explained if weight[row, col] > 0 else 0.0
-                if robust == 0 and weight[row, col] > 0 and (row + col) % 5 == 0:
-                    deviation[n] = abs(smooth[row, col] - explained) * np.sqrt(weight[row, col])
-                    n += 1
-                if robust == 0:
-                    share[row, col] = abs(smooth[row, col] - explained) * np.sqrt(weight[row, col])
+                left_over[row, col] = smooth[row, col] - explained
         if robust == 0:
-            limit = HUBER * 1.4826 * np.median(deviation[:n]) + 1e-9 if n > 0 else 1.0
-            for row in range(rows):
-                for col in range(cols):
-                    share[row, col] = min(1.0, limit / max(share[row, col], 1e-12))
+            _weigh(left_over, 0.0, weight, share, deviation)
     n = 0
     for row in range(rows):
         for col in range(cols):

@@ -33,7 +33,7 @@ STRUCTURE, COMMON = 1.0, 0.02**2  # line integrals of about 1; a beam that chang
 WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
 MARGIN = 1.15  # the axis may be off the middle, and the sample a little wider than the field
 FASTER = 1.25  # than the sample's point at the same place: a floater
-RULES = Rules(span=12, least=4, share=0.4, total=25.0, rows=1.0, cols=1.0, slack=0.03)
+RULES = Rules(span=12, least=4, share=0.4, total=30.0, rows=1.0, cols=1.0, slack=0.03)
 SPIKE = 4.0  # standard deviations by which a cell may be brighter than in the views before and after: a zinger
 CROWD = 12  # peaks in one view: the sample jumped, or a band
 MEMORY = 0.1  # weight of the newest view in a place's usual output

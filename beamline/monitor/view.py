@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
 UNLIT = 0.05  # of the flats' bright part: a cell with less has no light worth a name
+HOT = 0.1  # of the flats' bright part: a cell whose dark is higher than the others by more says nothing either
 EDGE = 2  # cells at either edge that say whether the sample ends within the field
 SEEN = 0.02  # transmission from which a place shows whether the beam is there
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
@@ -71,7 +72,8 @@ class View:
     Attributes:
         index: its row in the file.
         angle: radians.
-        depth: float32 [row, col], line integrals; 0 where the cell is not lit.
+        depth: float32 [row, col], line integrals; where a cell is not lit those between its left and right neighbour,
+            or 0 where they are not lit either.
         weight: float32 [row, col], photons relative to the open beam: 0 where unlit, exp(-depth) elsewhere.
         rows, cols: float32 [preview row], [preview col]: mean counts above the dark.
         edges: line integrals at the left and the right edge of the lit cells, medians over rows.
@@ -102,7 +104,8 @@ def grid_of(
     else:
         full = _binned(flat, blocks)[0] - low
         bright = float(np.percentile(full, BRIGHT))
-        lit = (full > UNLIT * max(bright, 0.0)).astype(np.float32)
+        hot = low - np.median(low) > HOT * bright
+        lit = ((full > UNLIT * max(bright, 0.0)) & ~hot).astype(np.float32)
         full = np.where(lit > 0, full, np.float32(1))
     wide = np.flatnonzero(lit.mean(axis=0) > 0.5)
     left, right = (int(wide[0]), int(wide[-1])) if wide.size else (0, lit.shape[1] - 1)
@@ -184,3 +187,6 @@ def _line_integrals(counts, dark, full, lit, scale, darkest, depth, weight):  # 
             else:
                 depth[row, col] = 0.0
                 weight[row, col] = 0.0
+        for col in range(1, counts.shape[1] - 1):
+            if weight[row, col] == 0 and weight[row, col - 1] > 0 and weight[row, col + 1] > 0:
+                depth[row, col] = 0.5 * (depth[row, col - 1] + depth[row, col + 1])

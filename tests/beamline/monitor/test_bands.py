@@ -29,6 +29,14 @@ def test_black_rows_are_flagged_with_their_place(fake: Any, n: int, loss: float)
     assert flags[0].region == (20, 20 + max(n, 4), 0, 96)
 
 
+@pytest.mark.parametrize("first", [20, 21, 22, 23])
+def test_a_band_that_covers_its_outer_blocks_by_a_part_is_one(fake: Any, first: int) -> None:
+    frames = fake.references() + fake.views(20)
+    for view in frames[20:25]:
+        black(view, first, 8)
+    assert [f.view for f in only(fake.flags(frames))] == list(range(20, 25))
+
+
 def test_a_band_in_a_flat(fake: Any) -> None:
     frames = fake.darks() + fake.flats(8)
     black(frames[11], 0, 4)

@@ -36,6 +36,14 @@ def test_a_sample_that_turns_steadily_does_not_change() -> None:
     assert found.turn == pytest.approx(0, abs=0.05)
 
 
+def test_a_black_band_is_no_gain_and_no_shift() -> None:
+    now = view(SPAN)
+    now.depth[10:13] = 6.0
+    found = change_of(now, BEFORE, GRID)
+    assert found is not None and found.gain == pytest.approx(0, abs=0.005)
+    assert (found.across, found.down) == pytest.approx((0, 0), abs=0.3)
+
+
 @pytest.mark.parametrize("gain", [-0.05, 0.01, 0.2])
 def test_light_that_steps_is_gain_and_nothing_else(gain: float) -> None:
     found = change(gain=gain)
