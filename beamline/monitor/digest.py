@@ -1,12 +1,14 @@
 """FrameDigest: statistics of a frame for the monitor, the operator and the file, computed in one pass.
 
-Counts (uint16) are read once: a histogram of grey values holds every statistic but the preview exactly. Other types
-need the range before the histogram, so they are read twice. Pixels that are not finite, or hold the
-no-data value, are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
+Counts (uint16) are read once, line by line: each line is in the processor's cache while its range, sums and histogram
+are taken. Their sums are integers, so that mean and variance are exact. Other types need the range before the
+histogram, so they are read twice. Pixels that are not finite, or hold the no-data value, are counted and otherwise
+ignored: they never spread into a mean or into a neighbour's preview block.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 ENTROPY_BINS = 256
+ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +32,7 @@ class FrameDigest:
         invalid_fraction: pixels that are not finite or hold the no-data value, over all pixels.
         saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
-            (0 for a constant frame, at most 8).
+            (0 for a constant frame, at most 8); for counts, of every k-th row where there are more than 2**20 pixels.
         checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
         preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
             none); blocks at the lower and right edge are smaller where bin does not divide the shape.
@@ -73,8 +76,7 @@ def digest(
     checksum = zlib.crc32(image.data.cast("B"))
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     if image.dtype == np.uint16 and no_data is None:
-        histogram = _count_greys(image, preview_bin, preview)
-        numbers = _from_greys(histogram, saturation)
+        numbers = _of_greys(image, saturation, preview_bin, preview)
     else:
         if image.dtype not in (np.float32, np.float64):
             image = image.astype(np.float64)
@@ -86,18 +88,18 @@ def digest(
 Numbers = tuple[float, float, float, float, float, float, float, float]
 
 
-def _from_greys(histogram: NDArray[np.int64], saturation: float | None) -> Numbers:
+def _of_greys(
+    image: NDArray[np.uint16], saturation: float | None, preview_bin: int, preview: NDArray[np.float32]
+) -> Numbers:
+    full = 65536 if saturation is None else math.ceil(min(max(saturation, 0), 65536))
+    every = max(1, image.size // ENTROPY_PIXELS)
+    low, high, total, squares, saturated, histogram = _count_greys(image, full, every, preview_bin, preview)
+    size, total, squares = image.size, int(total), int(squares)  # of any length: no square overflows
     greys = np.flatnonzero(histogram)
-    n = histogram[greys]
-    size = int(n.sum())
-    total = int((greys * n).sum())  # below 2**63 for any frame under 2**47 pixels
-    low, high = int(greys[0]), int(greys[-1])
-    mean = total / size
-    variance = float((n * (greys - mean) ** 2).sum()) / size
-    saturated = 0 if saturation is None else int(n[greys >= saturation].sum())
     bins = np.minimum((greys - low) * ENTROPY_BINS // max(high - low, 1), ENTROPY_BINS - 1)
-    folded = np.bincount(bins, weights=n, minlength=ENTROPY_BINS)
-    return float(low), float(high), mean, variance, float(total), 0.0, saturated / size, _entropy(folded)
+    folded = np.bincount(bins, weights=histogram[greys], minlength=ENTROPY_BINS)
+    variance = (size * squares - total**2) / size**2
+    return float(low), float(high), total / size, variance, float(total), 0.0, saturated / size, _entropy(folded)
 
 
 def _from_reals(
@@ -119,31 +121,48 @@ def _entropy(histogram: NDArray[Any]) -> float:
 
 
 @numba.njit(nogil=True, cache=True)
-def _count_greys(image, preview_bin, preview):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Histogram of all 65536 grey values; fills the preview on the way."""
+def _count_greys(image, full, every, preview_bin, preview):  # type: ignore[no-untyped-def]  # numba infers the types
+    """(minimum, maximum, sum, sum of squares, pixels from `full` on, histogram of every k-th row); fills the preview.
+
+    Short loops over one line each: the compiler makes vector instructions of all but the histogram's.
+    """
     rows, cols = image.shape
     # Two histograms by turns: neighbours are often equal, and an increment must not wait for the one before it.
     histogram = np.zeros((2, 65536), np.uint32)
     sums = np.empty(cols, np.uint32)
+    low, high = np.uint16(65535), np.uint16(0)
+    total, squares, saturated = np.uint64(0), np.uint64(0), np.int64(0)
     for block in range(preview.shape[0]):
         first, last = block * preview_bin, min((block + 1) * preview_bin, rows)
         sums[:] = 0
         for row in range(first, last):
             line = image[row]
-            for col in range(0, cols - 1, 2):
-                histogram[0, line[col]] += 1
-                histogram[1, line[col + 1]] += 1
-            if cols & 1:
-                histogram[0, line[cols - 1]] += 1
+            least, most = np.uint16(65535), np.uint16(0)
             for col in range(cols):
-                sums[col] += line[col]
+                least, most = min(least, line[col]), max(most, line[col])
+            low, high = min(low, least), max(high, most)
+            for col in range(cols):
+                sums[col] += np.uint32(line[col])
+            for col in range(cols):
+                value = np.uint32(line[col])
+                squares += np.uint64(np.uint32(value * value))
+            if most >= full:
+                for col in range(cols):
+                    saturated += line[col] >= full
+            if row % every == 0:
+                for col in range(0, cols - 1, 2):
+                    histogram[0, line[col]] += np.uint32(1)
+                    histogram[1, line[col + 1]] += np.uint32(1)
+                if cols & 1:
+                    histogram[0, line[cols - 1]] += np.uint32(1)
         for block_col in range(preview.shape[1]):
             left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
-            total = np.uint64(0)
+            part = np.uint64(0)
             for col in range(left, right):
-                total += sums[col]
-            preview[block, block_col] = total / ((right - left) * (last - first))
-    return histogram.sum(0).astype(np.int64)
+                part += np.uint64(sums[col])
+            preview[block, block_col] = part / ((right - left) * (last - first))
+            total += part
+    return int(low), int(high), total, squares, saturated, histogram.sum(0).astype(np.int64)
 
 
 @numba.njit(nogil=True, cache=True)
