@@ -27,6 +27,7 @@ REGISTRY = {  # module in this folder: class of the check
     "motion": "Motion",
     "floater": "Floater",
     "ghost": "Ghost",
+    "pixels": "Pixels",
     "field": "FieldOfView",
 }
 

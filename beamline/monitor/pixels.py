@@ -1,0 +1,105 @@
+"""Pixels: which of the camera's see no light where their neighbours do?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import minimum_filter
+
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.preview import light
+from beamline.monitor.view import BRIGHT, UNLIT
+from drivers.frame import Frame, FrameKind
+
+DEAD = 0.2  # of the light of the darkest of the preview blocks around it
+NAMED = 5  # pixels that are named
+
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelsState:
+    """`dead`: places row * columns + column that were dark in all flats of the latest group, None before any."""
+
+    dead: Places | None = None
+    in_flats: bool = False
+    said: bool = False
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Score: fraction of the pixels that are dead: in all flats of the group at the scan's begin they have less than a
+    fifth of the light around them. It is said at the first view, as a fact where they are few.
+
+    The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
+    """
+
+    name: ClassVar[str] = "pixels"
+    bit: ClassVar[int] = 12
+    unit: ClassVar[str] = "fraction of the pixels"
+    meaning: ClassVar[str] = "many pixels of the camera are dead"
+    policy: ClassVar[Policy] = Policy.LOG
+
+    warn: Annotated[float, Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
+
+    def start(self) -> PixelsState:
+        return PixelsState()
+
+    def look(self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[PixelsState]:
+        if state.said:
+            return Look(state)
+        if frame.kind is FrameKind.FLAT:
+            dead = _dead(frame, digest, context)
+            if state.in_flats and state.dead is not None:
+                dead = np.intersect1d(state.dead, dead, assume_unique=True)
+            return Look(PixelsState(dead, in_flats=True))
+        state = replace(state, in_flats=False)
+        if frame.kind is not FrameKind.PROJECTION or state.dead is None:
+            return Look(state)
+        return Look(replace(state, said=True), self._flag(frame, state.dead) if state.dead.size else None)
+
+    def _flag(self, frame: Frame, dead: Places) -> Flag:
+        rows, cols = np.unravel_index(dead, frame.counts.shape)
+        score = dead.size / frame.counts.size
+        level = Level.WARN if score > self.warn else Level.INFO
+        named = ", ".join(f"({row}, {col})" for row, col in zip(rows[:NAMED], cols[:NAMED], strict=True))
+        advice = (
+            f"Pixels without light in the flats where their neighbours have some: {dead.size}, at (row, column) {named}"
+            f"{' ...' if dead.size > NAMED else ''}. Each is a ring in its slice; `beamline recon` fills them from "
+            "their neighbours."
+        )
+        region = int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1
+        return Flag(self.name, level, frame.index, score, self.warn, advice, region)
+
+
+def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> Places:
+    """Places of the pixels of a flat that are dark within a lit block."""
+    above = light(digest.preview, context)
+    block = math.ceil(frame.counts.shape[1] / above.shape[1])
+    dark = digest.preview - above
+    around = minimum_filter(above, 3)  # at the edge of a shadow a dark pixel is none that is dead
+    limit = np.where(around > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * around, -np.inf)
+    places = np.empty(frame.counts.size // 2, np.int64)
+    return places[: _darker(frame.counts, limit.astype(np.float32), block, places)].copy()
+
+
+@numba.njit(nogil=True, cache=True)
+def _darker(counts, limit, block, places):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Fills `places` with the pixels below the limit of their block, until it is full: their number."""
+    n = 0
+    for row in range(counts.shape[0]):
+        line = limit[min(row // block, limit.shape[0] - 1)]
+        for col in range(counts.shape[1]):
+            if counts[row, col] < line[min(col // block, line.size - 1)]:
+                if n == places.size:
+                    return n
+                places[n] = row * counts.shape[1] + col
+                n += 1
+    return n
