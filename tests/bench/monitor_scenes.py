@@ -226,13 +226,13 @@ def _views(rng: np.random.Generator, views: int, least: int = CALIBRATION, spare
     return int(rng.integers(min(least, views // 4), views - spare))
 
 
-def floater(radius: float, depth: float, motion: str = "turning") -> Make:
+def floater(radius: float, depth: float, motion: str = "turning", away: tuple[float, float] = (1.5, 3.75)) -> Make:
     """A cloud of the standard deviation of a ball of `radius` px (radius / 2 along each axis), `depth` through its
-    middle. Turning: 1.5 to 3.75 times as far from the axis as the frame's edge; loose: 2 to 20 px a view."""
+    middle. Turning: `away` times as far from the axis as the frame's edge; loose: 2 to 20 px a view."""
 
     def make(rng: np.random.Generator, views: int) -> Floaters:
         seed, half = int(rng.integers(2**31)), WIDTH / 2
-        distance, size = (1.5 * half, 3.75 * half), radius / 2 * PITCH * 1e-3
+        distance, size = (away[0] * half, away[1] * half), radius / 2 * PITCH * 1e-3
         share = fixed_rng("floaters", seed).uniform(0.5, 1.0, 4)[3]  # the fourth draw, as in Floaters.crumbs
         speed, first = float(rng.uniform(2, 20)) * PITCH * 1e-3, _views(rng, views)
         span = int(2 * WIDTH / speed) + 1
