@@ -15,6 +15,8 @@ from drivers.frame import FrameKind
 WARNED_WEIGHT = 0.5
 """Weight of a view with a warning: as if its noise had twice the variance. A warning says that the view differs by more
 than noise, not that it is wrong; views are too few to do without."""
+WIDE = 2.5
+"""Times the widest gap between the views taken, from which a gap between those left is told: two neighbours went."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,5 +70,15 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
         verbs = ("has", "weighs") if warned.sum() == 1 else ("have", "weigh")
         parts.append(f"{warned.sum()} {verbs[0]} a warning and {verbs[1]} half ({counted(flags.of(warned).counts())})")
         weights = np.where(warned, np.float32(WARNED_WEIGHT), np.float32(1))
-    said = f"Of {rows.size} views {', '.join(parts)}. --flags ignore takes all alike."
-    return UsableViews(np.flatnonzero(views & ~alarmed), weights, int(alarmed.sum()), said, flags)
+    good = np.flatnonzero(views & ~alarmed)
+    period = np.pi if source.cone is None else 2 * np.pi
+    before, after = (_widest_gap(source.angles[some], period) for some in (rows, good))
+    gap = f" They leave {np.degrees(after):.3g}° without a view." if after >= WIDE * before else ""
+    said = f"Of {rows.size} views {', '.join(parts)}.{gap} --flags ignore takes all alike."
+    return UsableViews(good, weights, int(alarmed.sum()), said, flags)
+
+
+def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
+    """Radians between neighbouring views that are furthest apart; views a `period` apart see the same."""
+    known = np.sort(np.mod(angles[np.isfinite(angles)], period))
+    return period if known.size == 0 else float(np.diff(known, append=known[0] + period).max())

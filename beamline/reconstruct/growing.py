@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch
+from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.prepare import (
@@ -156,18 +157,29 @@ class ScanFollower:
             fit.add_views(part.data, self.source.angles[part.view_ids])
         return fit
 
-    def _correct_again(self) -> None:
-        """Line integrals by all references and air columns, in place of those that the model has learnt from."""
+    def _correct_again(self, axis_col: float, usable: UsableViews) -> None:
+        """Line integrals by all references and air columns, in place of those that the model has learnt from.
+
+        Where views of these are not usable any longer, the fit begins anew without them: a check found them bad when it
+        had seen later ones, or they were taken again.
+        """
         assert self._correction is not None and self._fit is not None
-        if not self._correction.outdated:
+        fed = np.concatenate([part.view_ids for part in self._parts])
+        frames = fed[np.isin(fed, usable.frames)]
+        gone = fed.size - frames.size
+        if not (gone or self._correction.outdated):
             return
         message = "Flats or darks came after views, or air columns changed: all views are corrected again"
+        if gone:
+            message = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it begins anew"
         self._sink(Event("state", self._clock.now(), {"state": "correcting", "message": message}))
         self._correction = self._correction.renewed()
-        frames = np.concatenate([part.view_ids for part in self._parts])
         self._parts = []
         self._parts = [self._correction.at_once(frames)]
-        self._fit.replace_views(self._parts[0].data)
+        if gone:
+            self._fit = self._new_fit(axis_col)
+        else:
+            self._fit.replace_views(self._parts[0].data)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False where there is nothing to fit yet."""
@@ -219,7 +231,7 @@ class ScanFollower:
         """
         usable = checked_views(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
-        self._correct_again()
+        self._correct_again(self.axis_col, usable)
         prepared = self._prepared(self.axis_col, usable)
         self._sink(
             Event(

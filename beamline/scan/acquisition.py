@@ -186,9 +186,9 @@ class Acquisition:
         shutter.close()
         self._emit("state", {"state": "held", "message": f"Held with a closed shutter: {reason}"})
         try:
-            self._supervision.ask(f"The scan is held: {reason}. Let it go on?")
+            self._supervision.ask(f"The scan is held: {reason}. Mend what can be mended.")
         except DeviceError as error:
-            self._stop.stop(f"{reason}; the scan was held, and nobody let it go on ({error})")
+            self._stop.stop(f"{reason}; the scan was held, and nobody let it go on: {error.problem}")
         if not self._stop.stopping:
             shutter.open()
             self._emit("state", {"state": "acquiring", "message": "The scan goes on"})

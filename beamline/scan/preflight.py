@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,11 @@ import numpy as np
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, plan_of, resolved_yaml
-from beamline.config.monitor import configured_checks
+from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect
 from beamline.instrument.connect import Instrument, camera_settings
-from beamline.monitor.check import ScanContext
+from beamline.monitor.check import Policy, ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.watch import Monitor
 from beamline.monitor.watch import start as start_monitor
@@ -85,7 +85,20 @@ def dry_run(settings: Config) -> DryRun:
         preview_bin=settings.storage.preview_bin,
         free_bytes=free,
     )
-    return DryRun(plan, worked, stage, camera, free)
+    return DryRun(plan, with_remarks(worked, settings), stage, camera, free)
+
+
+def with_remarks(worked: Timeline, config: Config) -> Timeline:
+    """The timeline with what the operator should know of policies that it cannot carry out."""
+    pausing = [check for check, policy in policies(config.monitor).items() if policy is Policy.PAUSE]
+    if not pausing or len(worked.views.trains) != 1:
+        return worked
+    before = "before views are taken again" if config.monitor.retake else "not at all"
+    remark = (
+        f"monitor.policy {', '.join(pausing)}: a fly scan is held between its passes; this has one, so that it is held "
+        f"{before}; use scan.mode: step, or abort"
+    )
+    return replace(worked, remarks=(*worked.remarks, remark))
 
 
 def refuse_violations(worked: Timeline) -> None:
@@ -159,6 +172,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
         free_bytes=free,
     )
     refuse_violations(timeline)
+    timeline = with_remarks(timeline, config)
     monitor = start_monitor(_context(plan, timeline, timing), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
     digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, preview_bin)

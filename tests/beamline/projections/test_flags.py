@@ -54,6 +54,7 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
     assert rays is not None and rays.shape == (27, 2, 40) and (rays[24:] == 1).all()
     (line,) = told
     assert line.startswith("Of 30 views 6 have an alarm and are left out (beam 6 alarm), 2 have a warning")
+    assert "(beam 2 warn). They leave 42° without a view. --flags" in line  # six of them side by side, 6° apart
     assert (found.left_out, found.n_projections) == (6, 30)
 
 
@@ -67,6 +68,11 @@ def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path
     assert kept.view_weights is not None
     expected = [LEVELS.get(row) is Level.WARN for row in kept.projections.view_ids.tolist()]
     np.testing.assert_array_equal(kept.view_weights == WARNED_WEIGHT, expected)
+
+
+def test_a_view_alone_leaves_no_gap_worth_a_word(tmp_path: Path) -> None:
+    _, (line,) = prepared(scan(tmp_path, {FIRST + 9: Level.ALARM}))
+    assert line == ("Of 30 views 1 has an alarm and is left out (beam 1 alarm). --flags ignore takes all alike.")
 
 
 def test_flags_may_be_ignored(tmp_path: Path) -> None:

@@ -176,6 +176,23 @@ def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: b
     assert sum("with an alarm" in str(event.data) or "have an alarm" in str(event.data) for event in events) == 1
 
 
+@pytest.mark.parametrize("use_flags", [True, False])
+def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags: bool) -> None:
+    """Also where its alarm was ignored, so that the model has learnt from it."""
+    clock, events = ScanClock(), list[Event]()
+    frames = frames_of(INTERLACED)
+    frames.append(replace(frames[12], index=34, replaces=12, time=frames[33].time + 1))
+    frames[12] = replace(frames[12], counts=frames[12].counts // 40)
+    _schedule(clock, tmp_path / "scan.h5", frames, alarms={12})
+    selection = Selection(axis_col=SCAN.axis_col, use_flags=use_flags)
+    metrics = follow(_options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    record = read_reconstruction(tmp_path / "recon.h5")
+    assert set(record.parameters["view_frames"]) == set(range(4, 35)) - {12}  # type: ignore[arg-type]
+    assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20 and metrics["residual"] < 0.1
+    anew = [event for event in events if "1 view turned out bad or taken again" in str(event.data.get("message"))]
+    assert len(anew) == (not use_flags)
+
+
 @pytest.mark.parametrize("late", [FrameKind.FLAT, FrameKind.DARK])
 def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, late: FrameKind) -> None:
     clock, events = ScanClock(), list[Event]()
