@@ -52,4 +52,6 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     if not as_json:
         click.echo("\n".join(found.lines()))
     if found.faults:
+        if math.isnan(found.advised):
+            raise QualityError("These references would stop a scan, and no exposure mends that: look at the FAULT.")
         raise QualityError(f"These references would stop a scan; {found.advised:.4g} s is the exposure to take.")

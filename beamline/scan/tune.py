@@ -53,7 +53,8 @@ class Tuning:
         saturated: fraction of its pixels that are saturated at the configured exposure.
         gain: counts of a photon; NaN where the frames have no noise.
         transmission: of the view, at its darkest hundredth and in the median.
-        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow.
+        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow; NaN
+            where darks have light or flats none.
         noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median.
         longest: exposure that the period and the camera allow.
         angle: of the view, rad.
@@ -106,6 +107,8 @@ class Tuning:
                 f"and camera allow up to {self.longest:.4g})",
             ),
         ]
+        if math.isnan(self.advised):
+            words[3:] = [("exposure", "not known until the fault is mended")]
         return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]
 
 
@@ -162,15 +165,17 @@ def evaluate(
     transmission = float(np.percentile(through, DARKEST)), float(np.median(through))
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
-    advised = _rounded(min(used * room, longest))
-    n = max(plan.flats.count, 1)
-    longer = typical * advised / used
-    noise = tuple(_noise(share, longer, gain, of_darks, n) for share in transmission)
     references = [
         Reference.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
         for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
     ]
     judged = judge([references[: len(darks)], references[len(darks) :]], limits)
+    faults = [fault for group in judged for fault in group.faults]
+    known = not any(fault.what in ("lit", "dark") for fault in faults)
+    advised = _rounded(min(used * room, longest)) if known else math.nan
+    n = max(plan.flats.count, 1)
+    longer = typical * advised / used
+    noise = tuple(_noise(share, longer, gain, of_darks, n) for share in transmission)
     return Tuning(
         configured=plan.exposure,
         exposure=used,
@@ -186,7 +191,7 @@ def evaluate(
         noise=(noise[0], noise[1]),
         longest=longest,
         angle=view.angle,
-        faults=tuple(fault.message for group in judged for fault in group.faults),
+        faults=tuple(fault.message for fault in faults),
     )
 
 

@@ -77,6 +77,18 @@ def test_a_saturated_exposure_gives_way_to_a_shorter_one() -> None:
     assert lines[-1].startswith("FAULT") and f"scan.exposure_s={found.advised:.4g}" in lines[-2]
 
 
+@pytest.mark.parametrize(
+    ("dark", "flat", "said"), [(1.0, 1.0, "no beam"), (0.8, 1.0, "there is light"), (0, 0, "no beam")]
+)
+def test_no_exposure_is_advised_where_the_shutter_is_at_fault(dark: float, flat: float, said: str) -> None:
+    rng = np.random.default_rng(5)
+    share = {FrameKind.DARK: dark, FrameKind.FLAT: flat, FrameKind.PROJECTION: 0.3 * flat}
+    shots = [replace(frame, counts=counts(share[frame.kind] * 8e3, rng)) for frame in frames(1.0, 0.3, (0.1,))]
+    found = evaluate(shots, PLAN, FULL, longest=10.0, limits=ReferenceLimits())
+    assert np.isnan(found.advised) and said in found.faults[0]
+    assert [line.split()[0] for line in found.lines()] == ["dark", "flat", "saturated", "exposure", "FAULT"]
+
+
 def test_the_period_bounds_the_exposure() -> None:
     found = evaluate(frames(3e3, 0.3), PLAN, FULL, longest=0.2, limits=ReferenceLimits())
     assert found.advised == 0.2
