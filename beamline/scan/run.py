@@ -302,9 +302,9 @@ class _Run:
             return None
         return (
             f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
-            f"The shutter was told to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look at "
-            "a few frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the scan "
-            "as it is."
+            f"The shutter was told to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look "
+            "at a few frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the "
+            "scan as it is."
         )
 
     def _retakes(self, recorder: Recorder) -> Sequence[Retake]:
