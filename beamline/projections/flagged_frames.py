@@ -11,7 +11,7 @@ from beamline.core.text import spans
 from beamline.monitor.check import Level
 from beamline.report.contact_sheet import FlaggedFrame
 from beamline.storage.flag_legend import FlagBit, FrameFlags
-from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.readers.base import ScanSource
 from drivers.frame import FrameKind
 from recon.base.binning import bin_views
 
@@ -64,7 +64,9 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
 
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
     angle = float(np.degrees(source.angles[row]))
-    kind = "taken again" if row in rows_replaced(source) else FrameKind(int(source.image_key[row])).name.lower()
+    kind, replaces = FrameKind(int(source.image_key[row])).name.lower(), source.replaces
+    if replaces is not None and (new := np.flatnonzero(replaces == row)).size:
+        kind = f"replaced by {new[0]}"
     said, regions, alarm = [], [], False
     for i, entry in enumerate(flags.legend):
         if not flags.bits[row] >> entry.bit & 1:
