@@ -1,0 +1,79 @@
+"""Real scans: no alarm on clean ones, what is odd about them is said, and anomalies put into them are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from beamline.monitor.check import Flag, Level
+from beamline.projections.replay import replay
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import open_scan
+from drivers.frame import FrameKind
+
+DIAMOND = "diamond_24737_parallel_91x135x160.h5"
+TOOTH = "aps2bm_tooth_181x2x640.h5"
+
+Share = Callable[[int, NDArray[np.float64], NDArray[np.float64]], Any]
+"""Light over that of the scan, of view, row and column in pixels."""
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A scan whose views have more or less light by place."""
+
+    source: ScanSource
+    share: Share
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+    def read(self, rows: Sequence[int]) -> NDArray[np.float32]:
+        row, col = np.mgrid[: self.source.shape[0], : self.source.shape[1]].astype(float)
+        images = self.source.read(rows).astype(np.float32)
+        for image, at in zip(images, rows, strict=True):
+            if self.source.image_key[at] == FrameKind.PROJECTION:
+                image *= self.share(int((self.source.image_key[:at] == FrameKind.PROJECTION).sum()), row, col)
+        return images
+
+
+def flags(path: Path, share: Share | None = None) -> list[Flag]:
+    with open_scan(path) as source:
+        seen = source if share is None else Changed(source, share)
+        return [flag for judged in replay(seen) for flag in judged.flags]  # type: ignore[arg-type]
+
+
+def test_a_clean_scan_has_facts_only(shared_data: Path) -> None:
+    assert flags(shared_data / TOOTH) == []
+    found = {flag.check: flag for flag in flags(shared_data / DIAMOND)}
+    assert {flag.level for flag in found.values()} == {Level.INFO}
+    assert found.keys() == {"beam", "pixels", "field"}
+    assert 0.28 <= found["beam"].score <= 0.34  # the flat is brighter than the open beam: transmission 0.67 to 0.71
+    assert "(0, 0)" in found["pixels"].advice and found["pixels"].region == (0, 1, 0, 1)
+
+
+def crumb(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
+    at = 8.0 * (view - 40)
+    return 1 - 0.1 * np.exp(-0.5 * ((row - 60) ** 2 + (col - at) ** 2) / 3.0**2)
+
+
+def fog(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
+    away = (col - 24.0 * (view - 40)) / 40
+    return 1 + 0.1 * np.cos(0.5 * np.pi * np.clip(away, -1, 1)) ** 2
+
+
+def band(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
+    return np.where((row >= 50) & (row < 54) & (40 <= view < 45), 0.0, 1.0)
+
+
+@pytest.mark.parametrize(("share", "check"), [(crumb, "floater"), (fog, "ghost"), (band, "bands")])
+def test_what_is_put_into_a_real_scan_is_found(shared_data: Path, share: Share, check: str) -> None:
+    found = [flag for flag in flags(shared_data / DIAMOND, share) if flag.level is not Level.INFO]
+    assert check in {flag.check for flag in found}
+    assert all(42 <= flag.view <= 42 + 35 for flag in found)
