@@ -33,7 +33,7 @@ from recon.voxels.ordered_fista import subsets_of
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
 _RESERVE = 0.02  # of the budget, for what no part has measured
 _SLAB = 16  # slices
-_FINISH_SHARE = 0.5  # of what is left after placing, at most
+_FINISH_SHARE = 0.8  # of what is left after placing, at most: it adds more than most of the steps before it
 # What goes before the sweeps of a finish, in sweeps: the largest eigenvalue of a subset, projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)

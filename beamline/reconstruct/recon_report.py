@@ -105,7 +105,7 @@ class ReconOutcome:
             return f"none {'in' if by_others else 'measurable in'} {of_what}"
         high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
         span = f"{parts_of(found.low)} {high}"
-        source = "as longer fits gained on three other scans"
+        source = "as longer fits gained on four other scans"
         if not by_others:
             source = f"from the residual of {judged.views} as it fell"
         return f"about {parts_of(found.seconds)} more ({span}), {source}"
