@@ -48,7 +48,7 @@ class _FromModel:
     """The refinement as an iterative method of `recon.voxels.iterative.solve`."""
 
     iterations: int
-    unmodelled: float = 0.0
+    unmodelled: float | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = NoiseBalance.of(problem, x, modelled=True, unmodelled=self.unmodelled)
@@ -104,7 +104,7 @@ def finish(
     def stopped() -> bool:
         return should_stop is not None and should_stop()
 
-    def refined(views: F32, unmodelled: float = 0.0) -> Volume:
+    def refined(views: F32, unmodelled: float | None = None) -> Volume:
         return solve(
             _FromModel(sweeps, unmodelled), projector, views, weight=known, start=start,
             on_iteration=lambda *_: stopped(), seed=problem.seed,

@@ -28,6 +28,10 @@ _POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
 _MANY_VIEWS, _HALF = 0.3, 0.45
 # +0.1 to +2.8 dB against no such factor on seven of eight cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
 _UNMODELLED = 2.5
+# Above this residual over the noise no volume explains it; what it adds to the weight, and the largest factor, were
+# chosen by eye: a tooth with rings gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 9.
+_EXPLAINED, _SETTLED = 1.05, 3  # after so many sweeps
+_UNEXPLAINED, _MOST_UNEXPLAINED = 1.75, 16.0
 _TOO_NOISY = 1.5  # times what a model leaves: such noise is none
 
 
@@ -38,32 +42,37 @@ class NoiseBalance:
     It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered back-projection, N its voxels of matter and σ the noise
     of a ray: as if each voxel's change were drawn from a Laplace distribution of the mean change. After each sweep it
     is the first weight times (σ / s)³, at most four times it, s being the noise-like part of the residual: it rises
-    where the residual has less noise than the data, since then the volume has taken it up. It never falls below the
-    first: what no volume explains, as errors of the detector or of the geometry, makes s large and says nothing.
+    where the residual has less noise than the data, since then the volume has taken it up. What no volume explains, as
+    rings, errors of the geometry or of the air, makes s large, and bends the volume as noise does: from the third sweep
+    on the weight is 1 + 1.75² ((s / σ)² - 1.05²) times the first, s being the least so far, so that it only falls.
 
     Attributes:
         first: the weight to begin with.
         noise: of a ray, that the residual is compared with: `noise_level` of the data, up to 1.3 times that where views
             are so many (π / 2 times the columns determine a slice) that little of the noise fits into a volume.
+        explained: the first weight counts already what no volume explains.
         value: the weight now.
     """
 
     first: float
     noise: float
+    explained: bool = False
     value: float = field(init=False)
+    _sweeps: int = field(default=0, init=False)
+    _least: float = field(default=math.inf, init=False)
 
     def __post_init__(self) -> None:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, unmodelled: float = 0.0) -> NoiseBalance:
+    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, unmodelled: float | None = None) -> NoiseBalance:
         """For a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
             modelled: the start is a model of the sample. Then what it leaves of the data bounds the noise, which fine
                 structure, or a scan of few rows, makes too large.
-            unmodelled: standard deviation of what no voxels explain of the views, in units of the noise. It is large
-                at few rays, so that the first weight rises with its square.
+            unmodelled: standard deviation of what no voxels explain of the views, in units of the noise, where it is
+                known. It is large at few rays, so that the first weight rises with its square.
         """
         data = whitened(problem.data, problem.weight)
         noise = noise_level(data)
@@ -75,13 +84,21 @@ class NoiseBalance:
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
-        return cls(share * (1 + (_UNMODELLED * unmodelled) ** 2), noise * _by_views(problem.projector.geometry))
+        first_weight = share * (1 + (_UNMODELLED * (unmodelled or 0.0)) ** 2)
+        return cls(first_weight, noise * _by_views(problem.projector.geometry), unmodelled is not None)
 
     def after_sweep(self, residual: F32) -> None:
         """Adapt the weight to the residual (some views [view, col, row], whitened)."""
+        self._sweeps += 1
         deviation = median_deviation(residual)
-        if deviation > 0:
-            self.value = self.first * float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
+        if not (deviation > 0 and self.noise > 0):
+            return
+        self._least = min(self._least, deviation / self.noise)
+        factor = float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
+        if self._sweeps >= _SETTLED and not self.explained and self._least > _EXPLAINED:
+            unexplained = self._least**2 - _EXPLAINED**2
+            factor = min(1 + _UNEXPLAINED**2 * unexplained, _MOST_UNEXPLAINED)
+        self.value = self.first * factor
 
 
 def _by_views(geometry: Geometry) -> float:
