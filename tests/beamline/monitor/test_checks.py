@@ -65,3 +65,9 @@ def test_a_look_changes_neither_the_check_nor_the_state_it_was_given(fake: Any, 
         first, again = check.look(state, frame, found, context), check.look(state, frame, found, context)
         assert first.flag == again.flag
         state = first.state
+
+
+@check_of_each_name
+def test_every_check_has_its_row_on_the_monitors_page(check: Check) -> None:
+    page = (REPOSITORY / "docs" / "monitor.md").read_text(encoding="utf-8")
+    assert page.count(f"\n| {check.name} | ") == 1

@@ -59,6 +59,20 @@ def test_entropy_is_numpys_histogram_and_scipys_sum(rng: np.random.Generator) ->
     assert digest(reals).entropy == pytest.approx(scipy_entropy(histogram, base=2), abs=1e-9)
 
 
+def test_of_a_large_frame_the_entropy_is_that_of_every_kth_row_and_all_else_of_all_pixels(
+    rng: np.random.Generator,
+) -> None:
+    image = rng.poisson(3000, (2048, 2049)).astype(np.uint16)
+    found = digest(image, saturation=3150)
+    rows = image[:: image.size // 2**20]
+    low, high = image.min(), image.max()
+    bins = (rows.astype(int) - low) * ENTROPY_BINS // (int(high) - low)
+    assert found.entropy == pytest.approx(scipy_entropy(np.bincount(np.minimum(bins, 255).ravel()), base=2), abs=1e-9)
+    assert (found.minimum, found.maximum, found.mean) == (low, high, pytest.approx(image.mean(), rel=1e-12))
+    assert found.variance == pytest.approx(image.var(), rel=1e-9)
+    assert found.saturated_fraction == pytest.approx((image >= 3150).mean())
+
+
 def test_entropy_of_what_can_be_counted_by_hand() -> None:
     assert digest(np.full((4, 4), 7, np.uint16)).entropy == 0
     assert digest(np.array([[0, 1], [2, 3]], np.uint16)).entropy == 2  # four equally likely greys
