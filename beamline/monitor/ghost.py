@@ -76,7 +76,7 @@ class Ghost:
     policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the fog")] = 0.01
-    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.1
+    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.8
 
     def start(self) -> GhostState:
         return GhostState()

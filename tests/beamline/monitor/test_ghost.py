@@ -45,7 +45,7 @@ def test_faint_fog_is_found_within_ten_views(gain: float, speed: float) -> None:
 
 
 def test_dense_fog_is_an_alarm() -> None:
-    assert Level.ALARM in {flag.level for flag in only(Blobs(80, counts=fog(0.3, 8.0)))}
+    assert Level.ALARM in {flag.level for flag in only(Blobs(80, counts=fog(1.5, 8.0)))}
 
 
 @pytest.mark.parametrize(
