@@ -30,7 +30,7 @@ _MANY_VIEWS, _HALF = 0.3, 0.45
 _UNMODELLED = 2.5
 # Above this residual over the noise no volume explains it; what it adds to the weight, and the largest factor, were
 # chosen by eye: a tooth with rings gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A
-# battery in a field too narrow, with a black band, gains 0.2 dB at 4 and loses 0.6 at 8 and 2.3 at 16 (OS-SIRT-TV).
+# battery in a field too narrow, with a black band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
 _EXPLAINED, _SETTLED = 1.05, 3  # after so many sweeps
 _UNEXPLAINED, _MOST_UNEXPLAINED = 1.75, 5.0
 _TOO_NOISY = 1.5  # times what a model leaves: such noise is none
