@@ -93,17 +93,21 @@ def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
         if not has_setting(method, name):
             owners = ", ".join(taking(name)) or "no method"
             raise ValueError(f"method {method.name!r} has no setting {name!r} ({owners} has)")
-    return _changed(method(), settings)
+    found: Method = with_settings(method(), settings)
+    return found
 
 
-def _changed(value: Any, settings: Mapping[str, Any]) -> Any:
+def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
+    """A method, or a part of its settings, with these changed, by name as in `taking`."""
     flat = {name: setting for name, setting in settings.items() if "." not in name}
     nested: dict[str, dict[str, Any]] = {}
     for name, setting in settings.items():
         if "." in name:
             outer, inner = name.split(".", 1)
             nested.setdefault(outer, {})[inner] = setting
-    return replace(value, **flat, **{name: _changed(getattr(value, name), inner) for name, inner in nested.items()})
+    return replace(
+        method, **flat, **{name: with_settings(getattr(method, name), inner) for name, inner in nested.items()}
+    )
 
 
 def with_trait(trait: str) -> tuple[str, ...]:

@@ -2,8 +2,8 @@
 
 A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
 column is compared with what the views before let expect (it goes on as it did), and what all have in common is the
-beam's. A band has begun where a few lines jump; it lasts while these lines differ from those beside them as they did
-then.
+beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their neighbours as they did
+at its beginning.
 """
 
 from __future__ import annotations

@@ -43,16 +43,5 @@ def transmission(
 
 def edges(image: NDArray[np.float32]) -> tuple[float, float]:
     """Means of the strips at the left and right edge."""
-    left, right = _strips(image.shape[1])
-    return float(image[:, left].mean()), float(image[:, right].mean())
-
-
-def edge_light(preview: NDArray[np.float32], context: ScanContext) -> tuple[float, float]:
-    """Mean light of the strips at the left and right edge."""
-    left, right = (float(light(preview, context, (slice(None), strip)).mean()) for strip in _strips(preview.shape[1]))
-    return left, right
-
-
-def _strips(cols: int) -> tuple[slice, slice]:
-    width = max(1, cols // EDGE_FRACTION)
-    return slice(None, width), slice(cols - width, None)
+    width = max(1, image.shape[1] // EDGE_FRACTION)
+    return float(image[:, :width].mean()), float(image[:, -width:].mean())

@@ -22,6 +22,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.calibrate import calibrate, sweep_seconds
+from recon.methods import with_settings
 from recon.reconstruction import Reconstruction
 from recon.splatting.finish import SUBSETS, SWEEPS
 from recon.splatting.initialise import default_count, place
@@ -39,7 +40,7 @@ _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 # Of the time a trial may take so much by prediction, and in fact a quarter more.
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
-_LEVEL = 0.3  # dB: by the curves of two scans such methods are level
+_LEVEL = 0.3  # dB: by the curves of four scans such methods are level
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,8 @@ class _Budget:
         return min(level, key=lambda c: order.index(c.method))
 
     def method(self, choice: Choice, default_count: int) -> Method:
-        return replace(self.methods[choice.method], **choice.settings(default_count))  # type: ignore[type-var]
+        found: Method = with_settings(self.methods[choice.method], choice.settings(default_count))
+        return found
 
 
 def within(

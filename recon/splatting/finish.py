@@ -22,7 +22,7 @@ from recon.splatting.initialise import leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.iterative import solve
-from recon.voxels.noise_balance import NoiseBalance
+from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
 from recon.voxels.ordered_fista import ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
@@ -36,9 +36,6 @@ SWEEPS = 8
 SUBSETS, TV_STEPS = 9, 3
 
 _DIFFERENT = 0.6  # of the noise
-# Times the noise. After the sweeps 0.7 to 1.0 on eight scans that voxels explain, crops that fill their box among them,
-# 1.16 to 5.6 on seven cones, 3 to 7 on three regions of interest.
-_EXPLAINED = 1.05
 _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 of the noise, and differs by 2.2 dB
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
@@ -75,7 +72,8 @@ def finish(
 
     Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`. Measured on 26 small scans: 0.5
-    to 7 dB above the fit in 25 of them, 0.9 below it in one of 500 photons a pixel (docs/exploration.md).
+    to 7 dB above the fit in 25 of them, 0.9 below it in one of 500 photons a pixel; level on a measured walnut
+    (docs/exploration.md).
     Memory: 8 volumes and 5 times the projections.
 
     Args:
@@ -117,7 +115,7 @@ def finish(
     if unlike <= _DIFFERENT * noise:
         return found
     left = _deviation(data - projector.forward(found.data), known)
-    if left <= min(fitted, _EXPLAINED * noise):
+    if left <= min(fitted, EXPLAINED * noise):
         return found
     beyond = leaves_the_field(data, problem.geometry)
     bent = beyond or problem.geometry.is_cone  # however well voxels explain the views

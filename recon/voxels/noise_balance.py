@@ -18,6 +18,9 @@ from recon.voxels.voxel_problem import VoxelProblem, density_unit
 F32 = NDArray[np.float32]
 
 MATTER = 0.05  # of the density unit: voxels above it count
+EXPLAINED = 1.05
+"""Residual over the noise up to which a volume explains its views: 0.75 to 1.0 on eight scans that voxels explain,
+1.16 to 5.6 on seven cones of coarse voxels, 3 to 7 on three regions of interest."""
 
 # From 22 scans (battery, walnut, thorax, shell, teapot, a box of tissue; 25 to 400 views, 500 to 100 000 photons a
 # pixel, white noise and noise blurred by half a pixel): within 0.4 dB of the best weight on average.
@@ -26,13 +29,14 @@ _POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
 # Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many: +1.0, +0.7, -0.6 dB
 # on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
 _MANY_VIEWS, _HALF = 0.3, 0.45
-# +0.1 to +2.8 dB against no such factor on seven of eight cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
-_UNMODELLED = 2.5
-# Above this residual over the noise no volume explains it; what it adds to the weight, and the largest factor, were
-# chosen by eye: a tooth with rings gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A
-# battery in a field too narrow, with a black band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
-_EXPLAINED, _SETTLED = 1.05, 3  # after so many sweeps
-_UNEXPLAINED, _MOST_UNEXPLAINED = 1.75, 5.0
+# What no volume explains of the views, where it is known before: +0.1 to +2.8 dB against no such factor on seven of
+# eight cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
+_KNOWN_BEFORE = 2.5
+# Where only the residual shows it: what it adds to the weight and the largest factor, chosen by eye. A tooth with rings
+# gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A battery in a field too narrow, with a black
+# band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
+_SETTLED = 3  # sweeps after which the residual is looked at
+_FOUND, _MOST_BY_FOUND = 1.75, 5.0
 _TOO_NOISY = 1.5  # times what a model leaves: such noise is none
 
 
@@ -52,13 +56,13 @@ class NoiseBalance:
         first: the weight to begin with.
         noise: of a ray, that the residual is compared with: `noise_level` of the data, up to 1.3 times that where views
             are so many (π / 2 times the columns determine a slice) that little of the noise fits into a volume.
-        explained: the first weight counts already what no volume explains.
+        counted: what no volume explains was known before, and is in the first weight.
         value: the weight now.
     """
 
     first: float
     noise: float
-    explained: bool = False
+    counted: bool = False
     value: float = field(init=False)
     _sweeps: int = field(default=0, init=False)
     _least: float = field(default=math.inf, init=False)
@@ -86,7 +90,7 @@ class NoiseBalance:
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
-        first_weight = share * (1 + (_UNMODELLED * (unmodelled or 0.0)) ** 2)
+        first_weight = share * (1 + (_KNOWN_BEFORE * (unmodelled or 0.0)) ** 2)
         return cls(first_weight, noise * _by_views(problem.projector.geometry), unmodelled is not None)
 
     def after_sweep(self, residual: F32) -> None:
@@ -97,9 +101,8 @@ class NoiseBalance:
             return
         self._least = min(self._least, deviation / self.noise)
         factor = float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
-        if self._sweeps >= _SETTLED and not self.explained and self._least > _EXPLAINED:
-            unexplained = self._least**2 - _EXPLAINED**2
-            factor = min(1 + _UNEXPLAINED**2 * unexplained, _MOST_UNEXPLAINED)
+        if self._sweeps >= _SETTLED and not self.counted and self._least > EXPLAINED:
+            factor = min(1 + _FOUND**2 * (self._least**2 - EXPLAINED**2), _MOST_BY_FOUND)
         self.value = self.first * factor
 
 

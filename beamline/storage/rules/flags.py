@@ -46,7 +46,7 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
     if lost and left < FEWEST_VIEWS:
         message += (
             f" {left} of {views.sum()} views have none, {FEWEST_VIEWS} are needed: repeat the scan. "
-            "`beamline recon --flags ignore` takes all views all the same."
+            "`beamline recon --flags ignore` takes all views, flagged ones too."
         )
         yield Finding("error", "flags", message)
         return

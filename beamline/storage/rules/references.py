@@ -94,7 +94,7 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
         elif none_good:
             message += (
                 f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
-                "--references accept` uses these all the same."
+                "--references accept` uses these as they are."
             )
             yield Finding("error", "bad-references", message)
         else:

@@ -26,7 +26,6 @@ __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findin
 
 SAMPLES = 4  # frames of a kind that are looked at
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
-BEAM_SIGMA = 3.0  # a flat must stand this far above the dark, in noise of one dark pixel
 
 
 def validate(scan: SourceOptions | Path | str) -> list[Finding]:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.monitor.check import ScanContext
-from beamline.monitor.preview import ENOUGH, edge_light, edges, light, thinned, transmission
+from beamline.monitor.preview import ENOUGH, edges, thinned, transmission
 
 
 @given(st.integers(1, 1200), st.integers(1, 1200))
@@ -30,7 +30,6 @@ def test_light_and_transmission(rng: np.random.Generator) -> None:
     assert longer is not None
     np.testing.assert_allclose(found, truth, rtol=1e-4)
     np.testing.assert_allclose(longer, truth / 3, rtol=1e-4)
-    assert edge_light(preview, context) == pytest.approx(edges(light(preview, context)))
     assert edges(truth) == pytest.approx((truth[:, :2].mean(), truth[:, -2:].mean()))
     assert transmission(preview, ScanContext(65535, 1000), 0.1) is None
 

@@ -69,7 +69,7 @@ def test_what_no_volume_explains_makes_it_heavier_from_the_third_sweep_on() -> N
 
 
 def test_what_no_volume_explains_is_counted_once() -> None:
-    balance = NoiseBalance(first=2.0, noise=1.0, explained=True)
+    balance = NoiseBalance(first=2.0, noise=1.0, counted=True)
     for _ in range(4):
         balance.after_sweep(_residual(2.0))
     assert balance.value == 2.0
