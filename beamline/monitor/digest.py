@@ -9,13 +9,13 @@ ignored: they never spread into a mean or into a neighbour's preview block.
 from __future__ import annotations
 
 import math
-import zlib
 from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from zlib_ng import zlib_ng
 
 ENTROPY_BINS = 256
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
@@ -73,7 +73,7 @@ def digest(
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image).view()
     image.flags.writeable = False  # one compiled kernel for all: numba tells writable arrays from others
-    checksum = zlib.crc32(image.data.cast("B"))
+    checksum = zlib_ng.crc32(image.data.cast("B"))
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     if image.dtype == np.uint16 and no_data is None:
         numbers = _of_greys(image, saturation, preview_bin, preview)
