@@ -122,7 +122,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy
 @dataclass(frozen=True)
 class Dummy:
     name: ClassVar[str] = "dummy"
-    bit: ClassVar[int] = 15
+    bit: ClassVar[int] = 47
     unit: ClassVar[str] = "frames"
     meaning: ClassVar[str] = "the frame is one of a pair"
     policy: ClassVar[Policy] = Policy.LOG
@@ -161,12 +161,12 @@ with h5py.File(result.path) as file:
     row = list(legend["name"].asstr()[()]).index("dummy")
     said = [int(legend[name][row]) for name in ("bit", "alarm_bit")]
     said += [legend[name].asstr()[row] for name in ("unit", "meaning")]
-    bits = [int(b) & (1 << 15 | 1 << 31) for b in file["entry/frame_log/flags"][()]]
+    bits = [int(b) & (1 << 47 | 1 << 63) for b in file["entry/frame_log/flags"][()]]
 info = describe(result.path)["flags"]
 assert "monitor.dummy.every is 1; expected a whole number >= 2" in refused
 assert result.flags["dummy"] == {"alarm": 5} and "dummy" in flags
-assert said == [15, 31, "frames", "the frame is one of a pair"]
-assert bits == [0, 1 << 15 | 1 << 31] * 5
+assert said == [47, 63, "frames", "the frame is one of a pair"]
+assert bits == [0, 1 << 47 | 1 << 63] * 5
 assert info["dummy"] == {"alarm": 5}
 """,
 )

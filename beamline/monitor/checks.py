@@ -12,6 +12,8 @@ from importlib import import_module
 from beamline.monitor.check import Check, Flag, Level
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
+BITS = (*range(16), *range(32, 48))  # that a check may have, in the order in which they are given away
+ALARMS = sum(1 << bit + ALARM_SHIFT for bit in BITS)  # a frame with any of these bits has an alarm
 
 
 REGISTRY = {  # module in this folder: class of the check
@@ -35,9 +37,9 @@ REGISTRY = {  # module in this folder: class of the check
 def _distinct(*checks: Check) -> tuple[Check, ...]:
     """The checks; ValueError where two share a name or a bit, or a bit is outside the mask."""
     names, bits = {check.name for check in checks}, {check.bit for check in checks}
-    if min(len(names), len(bits)) < len(checks) or not bits <= set(range(ALARM_SHIFT)):
+    if min(len(names), len(bits)) < len(checks) or not bits <= set(BITS):
         taken = ", ".join(f"{check.name} {check.bit}" for check in checks)
-        raise ValueError(f"every check needs a name and a bit (0 ... {ALARM_SHIFT - 1}) of its own, got {taken}")
+        raise ValueError(f"every check needs a name and a bit (0 ... 15, 32 ... 47) of its own, got {taken}")
     return checks
 
 
@@ -61,7 +63,7 @@ def flagged_rows(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
 
 
 def bitmask(flags: Iterable[Flag]) -> int:
-    """The flags of a frame as 32 bits; see ALARM_SHIFT. An INFO has no bit: nothing is wrong with the frame."""
+    """The flags of a frame as 64 bits; see ALARM_SHIFT. An INFO has no bit: nothing is wrong with the frame."""
     bits = 0
     for flag in flags:
         if flag.level is Level.INFO:

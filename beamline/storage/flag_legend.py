@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
+from beamline.monitor.checks import ALARM_SHIFT, ALARMS, CHECKS, bitmask
 from beamline.storage import hdf5
 
 FLAGS = "/entry/frame_log/flags"
@@ -58,7 +58,7 @@ class Mark:
     @property
     def valid(self) -> bool:
         """No check raised an alarm."""
-        return self.bits >> ALARM_SHIFT == 0
+        return self.bits & ALARMS == 0
 
 
 def mark_of(flags: Iterable[Flag]) -> Mark:
@@ -81,13 +81,13 @@ class FrameFlags:
     """The monitor's flags of the frames of a scan.
 
     Attributes:
-        bits: [frame] as `beamline.monitor.checks.bitmask` makes them.
+        bits: uint64 [frame] as `beamline.monitor.checks.bitmask` makes them.
         legend: the checks behind the bits.
         scores: [frame, check] as in `Mark`; None where the file holds none.
         regions: [frame, check, 4], likewise.
     """
 
-    bits: NDArray[np.integer]
+    bits: NDArray[np.uint64]
     legend: tuple[FlagBit, ...]
     scores: NDArray[np.float32] | None = None
     regions: NDArray[np.int32] | None = None
@@ -96,7 +96,7 @@ class FrameFlags:
     def of_marks(cls, marks: Sequence[Mark]) -> FrameFlags:
         """The flags of frames as today's checks found them."""
         return cls(
-            np.array([mark.bits for mark in marks], np.uint32),
+            np.array([mark.bits for mark in marks], np.uint64),
             TODAY,
             np.array([mark.scores for mark in marks], np.float32).reshape(-1, len(CHECKS)),
             np.array([mark.regions for mark in marks], np.int32).reshape(-1, len(CHECKS), 4),
@@ -108,7 +108,7 @@ class FrameFlags:
         flags = cls.of_marks([mark_of(each) for each in found])
         for flag in chain.from_iterable(found):
             rows = flag.rows
-            flags.bits[rows.start : rows.stop] |= np.uint32(bitmask([flag]))
+            flags.bits[rows.start : rows.stop] |= np.uint64(bitmask([flag]))
         return flags
 
     def mark(self, frame: int) -> Mark:
@@ -132,7 +132,7 @@ class FrameFlags:
     def alarmed(self) -> NDArray[np.bool_]:
         """[frame]: for some check it was an alarm."""
         mask = sum(1 << entry.alarm_bit for entry in self.legend)
-        return np.asarray((self.bits & np.array(mask, self.bits.dtype)) != 0)
+        return np.asarray((self.bits & np.uint64(mask)) != 0)
 
     def of(self, frames: NDArray[np.integer] | NDArray[np.bool_]) -> FrameFlags:
         """The flags of some of the frames."""
@@ -209,7 +209,7 @@ def read_flags(file: h5py.File, n: int) -> FrameFlags:
     legend, scores, regions = read_legend(file), None, None
     if SCORES in file and REGIONS in file:
         scores, regions = _read(file, SCORES, n), _read(file, REGIONS, n)
-    return FrameFlags(_read(file, FLAGS, n), legend, scores, regions)
+    return FrameFlags(_read(file, FLAGS, n).astype(np.uint64), legend, scores, regions)
 
 
 def _read(file: h5py.File, path: str, n: int) -> NDArray[Any]:

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.version import version
-from beamline.monitor.checks import ALARM_SHIFT, CHECKS
+from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
@@ -71,7 +71,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "/entry/frame_log/framestamp": ("<i8", ""),
         "/entry/frame_log/time": ("<f8", "s"),
         REPLACES: ("<i8", ""),
-        FLAGS: ("<u4", ""),
+        FLAGS: ("<u8", ""),
         "/entry/digest/minimum": ("<f8", ""),
         "/entry/digest/maximum": ("<f8", ""),
         "/entry/digest/mean": ("<f8", ""),
@@ -272,10 +272,10 @@ class Rows:
     def add_flags(self, rows: range, bits: int) -> None:
         """Mark rows that exist: a check that has seen later frames found something in them."""
         flags = self._columns["flags"][rows.start : rows.stop]
-        marked = flags | np.uint32(bits)
+        marked = flags | np.uint64(bits)
         if (marked != flags).any():
             self._columns["flags"][rows.start : rows.stop] = marked
-            self._columns["frame_valid"][rows.start : rows.stop] = marked >> ALARM_SHIFT == 0
+            self._columns["frame_valid"][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
 
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:

@@ -34,14 +34,14 @@ def test_every_set_of_flags_has_its_own_bits(found: list[tuple[str, Level]]) -> 
     assert bits == sum(1 << BITS[name] for name, level in found if level is not Level.INFO) + sum(
         1 << 16 + BITS[name] for name, level in found if level is Level.ALARM
     )
-    assert 0 <= bits < 2**32
+    assert 0 <= bits < 2**64
 
 
-@pytest.mark.parametrize("change", [{"bit": 3}, {"name": "bands"}, {"bit": 16}, {"bit": -1}])
+@pytest.mark.parametrize("change", [{"bit": 3}, {"name": "bands"}, {"bit": 16}, {"bit": 48}, {"bit": -1}])
 def test_a_check_with_a_bit_or_a_name_that_is_taken_is_refused(change: dict[str, Any]) -> None:
     bands = next(check for check in CHECKS if check.name == "bands")
-    other = type("Other", (type(bands),), {"name": "other", "bit": 15} | change)()
-    with pytest.raises(ValueError, match=r"a bit \(0 \.\.\. 15\) of its own, got .*bands 3"):
+    other = type("Other", (type(bands),), {"name": "other", "bit": 47} | change)()
+    with pytest.raises(ValueError, match=r"a bit \(0 \.\.\. 15, 32 \.\.\. 47\) of its own, got .*bands 3"):
         _distinct(*CHECKS, other)
 
 
