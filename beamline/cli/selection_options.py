@@ -6,13 +6,14 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
-from beamline.projections.selection import Selection
+from beamline.projections.read import FEW_PHOTONS
+from beamline.projections.selection import Noise, Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.prep.correct import CorrectionSettings
 
@@ -64,7 +65,7 @@ def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str |
 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --views, --rows, --bin, --axis, --pixel-size-um, --cone, --air, --flags and what `scan_options` adds."""
+    """Adds the options of `Selection`, from --views to --gain, and what `scan_options` adds."""
     for option in reversed(_AFTER):
         command = option(command)
     command = scan_options(command)
@@ -89,7 +90,11 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         use_flags=rest["flags"] != "ignore",
         judge=rest.pop("flags") == "judge",
         accept_references=rest.pop("references") == "accept",
+        noise=rest.pop("noise"),
+        gain=rest.pop("gain"),
     )
+    if selection.gain is not None and selection.noise == "log":
+        raise click.UsageError("--gain is for counted photons; it does not go with --noise log.")
     return SourceOptions(file, **rest), selection
 
 
@@ -159,5 +164,17 @@ _AFTER = (
         show_default=True,
         help="check: groups of darks and flats that are saturated, dark, uneven or lit are left out, and refused where "
         "no other is left; accept: all are used as they are.",
+    ),
+    click.option(
+        "--noise",
+        type=click.Choice(get_args(Noise)),
+        default="auto",
+        show_default=True,
+        help="log: line integrals are logarithms of counts; counts: they carry the likelihood of the photons counted, "
+        f"with weights, which few photons need; auto: counts where a pixel of the open beam has fewer than "
+        f"{FEW_PHOTONS}.",
+    ),
+    click.option(
+        "--gain", type=POSITIVE, metavar="COUNTS", help="Counts a photon, for --noise. Default: as the flats vary."
     ),
 )

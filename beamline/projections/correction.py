@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from beamline.core.errors import DataError
-from beamline.projections.read import read_binned, read_references
+from beamline.core.errors import ConfigError, DataError
+from beamline.projections.read import open_beam, photons_of, read_binned, read_references
 from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from drivers.frame import FrameKind
 from recon.prep.correct import Correction, Projections, References
+from recon.prep.counts import Photons
 
 Warn = Callable[[str], None]
 """Takes a sentence about something that is wrong though work goes on."""
@@ -33,17 +34,22 @@ class ScanCorrection:
         """Read the reference frames that the scan has; groups with a fault only where no other is left.
 
         Raises:
-            ConfigError: rows or binning that do not fit the detector.
+            ConfigError: rows or binning that do not fit the detector; counted photons of a scan without counts, or
+                without the counts of a photon.
             DataError: references that cannot be used.
         """
         self._source, self._selection, self._warn = source, selection, warn
         self.rows, self.binning = rows_of(source, selection), selection.binning
         self._n_references = _count_references(source)
         self._references: References | None = None
+        self.photons: Photons | None = None
+        if selection.noise == "counts" and source.quantity != "counts":
+            raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
         if source.quantity == "counts":
             groups = reference_groups(source)
             used = groups if selection.accept_references else groups.good()
             self._references = read_references(source, used, self.rows, self.binning)
+            self.photons = photons_of(source, used, self._references, self.rows, selection)
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 
@@ -88,6 +94,17 @@ class ScanCorrection:
         return part
 
     @property
+    def noise(self) -> str:
+        """How counts become line integrals, in words; empty where they are logarithms."""
+        if self.photons is None or self._references is None:
+            return ""
+        light, readout = open_beam(self._references, self.photons), self.photons.variance**0.5
+        return (
+            f"Photons are counted: {light:.3g} a pixel in the open beam, {self.photons.gain:.3g} counts each, readout "
+            f"noise {readout:.3g} counts"
+        )
+
+    @property
     def outdated(self) -> bool:
         """Views that were fed would be corrected otherwise now: by references that came later, or other air columns."""
         if self._references is None or self._stream is None:
@@ -116,7 +133,7 @@ class ScanCorrection:
         assert self._references is not None
         references = self._references if rows is None else _narrowed(self._references, rows)
         try:
-            return Correction(references, self._selection.correction)
+            return Correction(references, self._selection.correction, photons=self.photons)
         except ValueError as error:
             raise self._refusal(error) from error
 

@@ -45,12 +45,17 @@ def hold_out(prepared: PreparedProjections, share: int, *, most: int | None = No
     if n - count < 2:
         raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
     # Neither the first nor the last: they have a neighbour on one side only.
+    counted = projections.weights
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     used = np.setdiff1d(np.arange(n), held)
     return replace(
         prepared,
         projections=replace(
-            projections, data=projections.data[used], view_ids=projections.view_ids[used], air=projections.air[used]
+            projections,
+            data=projections.data[used],
+            view_ids=projections.view_ids[used],
+            air=projections.air[used],
+            weights=None if counted is None else counted[used],
         ),
         geometry=geometry.select(used),
         view_weights=None if prepared.view_weights is None else prepared.view_weights[used],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ class PreparedProjections:
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
         left_out: views with an alarm of the monitor, which are not among those that the selection chose from.
         flags: of all frames of the scan; None where there are none.
+        noise: how photons were counted, in words; empty: the line integrals are logarithms.
     """
 
     projections: Projections
@@ -66,17 +67,29 @@ class PreparedProjections:
     view_weights: NDArray[np.float32] | None = None
     left_out: int = 0
     flags: FrameFlags | None = None
+    noise: str = ""
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
         """Weights [view, row, col], read-only; None: one for all rays.
 
         Args:
-            others: views after these, which weigh 1.
+            others: views after these, which weigh 1, as a usual ray of these does.
         """
-        if self.view_weights is None:
+        n, (rows, cols), counted = (
+            self.geometry.n_views + others,
+            self.geometry.detector_shape,
+            self.projections.weights,
+        )
+        if self.view_weights is None and counted is None:
             return None
-        weights = np.concatenate((self.view_weights, np.ones(others, np.float32)))
-        return np.broadcast_to(weights[:, None, None], (weights.size, *self.geometry.detector_shape))
+        views = np.ones(n, np.float32)
+        if self.view_weights is not None:
+            views[: n - others] = self.view_weights
+        if counted is None:
+            return np.broadcast_to(views[:, None, None], (n, rows, cols))
+        weights = np.ones((n, rows, cols), np.float32)
+        np.divide(counted, counted.mean(where=counted > 0), out=weights[: n - others])
+        return weights * views[:, None, None]
 
 
 def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) -> PreparedProjections:
@@ -110,7 +123,8 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
     if rest.size:
         others = correction.at_once(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
         held_out = others.data, geometry_of(source, selection, axis_col, source.angles[others.view_ids])
-    return assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
+    prepared = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
+    return replace(prepared, noise=correction.noise)
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:

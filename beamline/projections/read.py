@@ -7,12 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.errors import ConfigError
+from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups
 from drivers.frame import FrameKind
 from recon.prep.correct import References
+from recon.prep.counts import Photons, photon_transfer
 
 _BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
+
+FEW_PHOTONS = 100
+"""In a pixel of the open beam: below, counts are better than their logarithm (docs/exploration.md, "Few photons")."""
+
+_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
 def read_binned(source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int) -> NDArray[Any]:
@@ -86,3 +94,45 @@ def _mean(
         image = read_binned(source, np.array([frame]), rows, binning)[0]
         total += image if weights is None else weights[i] * image
     return total / frames.size
+
+
+def photons_of(
+    source: ScanSource, used: ReferenceGroups, references: References, rows: slice, selection: Selection
+) -> Photons | None:
+    """How the pixels of a scan count photons, as they are read (binned); None: their logarithms are to be taken.
+
+    The gain is that of the selection, or the photon transfer of the largest group of flats, the readout noise that of
+    the largest group of darks.
+
+    Raises:
+        ConfigError: counts are asked for, and the flats do not tell the gain.
+    """
+    if selection.noise == "log":
+        return None
+    binning = selection.binning
+    first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
+    middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
+    flats, darks = (
+        read_binned(source, max(groups, key=len)[:_TRANSFER_FRAMES], middle, binning)
+        for groups in (used.flats, used.darks)
+    )
+    if selection.gain is not None:  # a mean of n pixels has n times as many photons a count
+        variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
+        found = Photons(selection.gain / binning**2, variance)
+    else:
+        try:
+            found = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
+        except ValueError as error:
+            if selection.noise == "auto":
+                return None
+            raise ConfigError(
+                f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
+            ) from error
+    if selection.noise == "auto" and not open_beam(references, found) < FEW_PHOTONS:
+        return None
+    return found
+
+
+def open_beam(references: References, photons: Photons) -> float:
+    """Photons in a pixel of the open beam, the median of the flats."""
+    return float(np.median(references.flats[0][1] - references.dark)) / photons.gain

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
+
+Noise = Literal["auto", "log", "counts"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,9 @@ class Selection:
         use_flags: views with an alarm of the monitor are left out, those with a warning weigh less.
         judge: the monitor looks at the frames of the file now, and its flags count in place of the file's.
         accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
+        noise: "log": line integrals are logarithms of counts; "counts": they and weights carry the likelihood of the
+            counts; "auto": that where the open beam has few photons a pixel.
+        gain: counts a photon, of single pixels; None finds it by the flats.
     """
 
     views: str = "all"
@@ -44,6 +50,8 @@ class Selection:
     use_flags: bool = True
     judge: bool = False
     accept_references: bool = False
+    noise: Noise = "auto"
+    gain: float | None = None
 
 
 def choose_views(

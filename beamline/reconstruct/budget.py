@@ -262,10 +262,15 @@ def joined(prepared: PreparedProjections, factor: int) -> PreparedProjections:
     """The same views with factor x factor pixels joined: means of line integrals."""
     if factor == 1:
         return prepared
-    held = prepared.held_out
+    held, projections, counted = prepared.held_out, prepared.projections, prepared.projections.weights
+    data, weights = bin_views(projections.data, factor), None
+    if counted is not None:  # the mean of the rays that are known, each by what it says
+        weights = bin_views(counted, factor)
+        sums = bin_views(counted * projections.data, factor)
+        data = np.divide(sums, weights, out=data, where=weights > 0)
     return replace(
         prepared,
-        projections=replace(prepared.projections, data=bin_views(prepared.projections.data, factor)),
+        projections=replace(projections, data=data, weights=weights),
         geometry=prepared.geometry.binned(factor),
         held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
     )

@@ -84,7 +84,9 @@ def reconstruct_file(
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
-    """Send the event `recon_started`."""
+    """Send the event `recon_started`; before it, how photons were counted."""
+    if prepared.noise:
+        sink(Event("state", clock.now(), {"state": "noise", "message": prepared.noise}))
     data = {
         "file": options.source.path,
         "method": options.method.name,

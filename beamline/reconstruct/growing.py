@@ -88,6 +88,8 @@ class ScanFollower:
                 return grown
             refuse(self.source, blockers)
             self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
+            if noise := self._correction.noise:
+                self._sink(Event("state", self._clock.now(), {"state": "noise", "message": noise}))
         if not self._axis_settled:
             self._settle_axis(self._correction, views, ended)
         if self.axis_col is None:
@@ -276,7 +278,9 @@ class ScanFollower:
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         projections = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
         self._parts = [projections]
-        return assemble(self.source, self._options.selection, projections, (axis_col, self.axis), usable, self._warn)
+        assert self._correction is not None
+        found = assemble(self.source, self._options.selection, projections, (axis_col, self.axis), usable, self._warn)
+        return replace(found, noise=self._correction.noise)
 
 
 def _quiet(text: str) -> None:

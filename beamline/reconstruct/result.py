@@ -146,6 +146,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
         **(_flat("correction", asdict(selection.correction)) if corrected else {}),
+        **({"noise": prepared.noise or "logarithms of counts"} if corrected else {}),
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),

@@ -1,4 +1,4 @@
-"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and zingers; then -log with a floor."""
+"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and zingers; then -log, or likelihood."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon.base.masks import Image, Mask, fill, plan_fill
 from recon.prep.air import air_columns, air_light, edge_profiles
+from recon.prep.counts import Photons, of_view
 from recon.prep.defects import dead_pixels, zingers
 
 
@@ -67,6 +68,8 @@ class Projections:
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
         replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
+        weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
+            pixels; None: photons were not counted.
     """
 
     data: NDArray[np.float32]
@@ -76,6 +79,7 @@ class Projections:
     masked: Mask
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
+    weights: NDArray[np.float32] | None = None
 
 
 def _flat_at(position: float, groups: list[tuple[float, Image]]) -> Image:
@@ -96,11 +100,13 @@ class Transmission:
         data: float32 [view, row, col], finite; `Correction.line_integrals` takes it over.
         view_ids: int64 [view].
         repaired: int64 [view], live pixels that were not finite; filled from their neighbours.
+        beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
     """
 
     data: NDArray[np.float32]
     view_ids: NDArray[np.int64]
     repaired: NDArray[np.int64]
+    beam: NDArray[np.float32] | None = None
 
 
 class Correction:
@@ -113,7 +119,11 @@ class Correction:
     """
 
     def __init__(
-        self, references: References, settings: CorrectionSettings | None = None, masked: Mask | None = None
+        self,
+        references: References,
+        settings: CorrectionSettings | None = None,
+        masked: Mask | None = None,
+        photons: Photons | None = None,
     ) -> None:
         """Take the references.
 
@@ -121,6 +131,8 @@ class Correction:
             references: darks and flats of the detector area of the views.
             settings: None: the defaults.
             masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
+            photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`;
+                None: the line integrals are logarithms.
 
         Raises:
             ValueError: for shapes that do not fit, no flats, or no beam in the flats.
@@ -133,7 +145,7 @@ class Correction:
         if masked is None:
             masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
         self.masked = masked
-        self._fill = plan_fill(masked)
+        self._fill, self._photons = plan_fill(masked), photons
         with np.errstate(invalid="ignore", over="ignore"):
             self._flats = [
                 (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - self._dark))
@@ -177,10 +189,15 @@ class Correction:
         if ids.shape != counts.shape[:1]:
             raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {ids.shape}")
         data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
+        beam = None if self._photons is None else np.empty(counts.shape, np.float32)
         for v, view in enumerate(data):
+            flat = _flat_at(float(positions[v]), self._flats)
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 np.subtract(counts[v], self._dark, out=view, casting="unsafe")
-                view /= _flat_at(float(positions[v]), self._flats)
+                view /= flat
+            if beam is not None and self._photons is not None:
+                np.divide(flat, np.float32(self._photons.gain), out=beam[v])
+                fill(beam[v], self._fill)
             bad = ~np.isfinite(view) & ~self.masked
             repaired[v] = bad.sum()
             if repaired[v] > view.size / 2:
@@ -188,7 +205,7 @@ class Correction:
                     f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
             fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
-        return Transmission(data, ids, repaired)
+        return Transmission(data, ids, repaired, beam)
 
     def survey(self, views: Transmission) -> None:
         """Let the views take part in finding the air columns."""
@@ -208,7 +225,8 @@ class Correction:
         settings, columns = self._settings, self.air_columns
         if views is None:
             rows, cols = self._dark.shape
-            views = Transmission(np.empty((0, rows, cols), np.float32), np.empty(0, np.int64), np.empty(0, np.int64))
+            none, empty = np.empty((0, rows, cols), np.float32), np.empty(0, np.int64)
+            views = Transmission(none, empty, empty, None if self._photons is None else none)
         light = air_light(views.data, *columns)
         air = light.mean(axis=1)
         unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
@@ -219,19 +237,29 @@ class Correction:
             )
         data, ids, repaired = views.data, views.view_ids, views.repaired
         data /= light[:, None]
+        beam = None if views.beam is None else views.beam * light[:, None]
         if self._waiting is not None:
             first, first_air = self._waiting
             data = np.concatenate((first.data, data))
             ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
             repaired = np.concatenate((first.repaired, repaired))
+            if beam is not None and first.beam is not None:
+                beam = np.concatenate((first.beam, beam))
         n = len(data) if last else max(len(data) - 1, 0)
         replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n)
         self._waiting = None
         if n < len(data):
-            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:]), air[n:]
+            waits = None if beam is None else beam[n:].copy()
+            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits), air[n:]
         if n:
             self._before = data[n - 1].copy()
         data, floored = data[:n], 0
+        if beam is not None:
+            beam = beam[:n]
+            for view, photons in zip(data, beam, strict=True):
+                self._likelihood(view, photons)
+            live = max(int((~self.masked).sum()) * n, 1)
+            return Projections(data, ids[:n], 0.0, air[:n], self.masked, columns, replaced / live, beam)
         for view in data:
             low = view < settings.floor
             floored += int((low & ~self.masked).sum())
@@ -239,6 +267,15 @@ class Correction:
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * n, 1)
         return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live)
+
+    def _likelihood(self, view: Image, beam: Image) -> None:
+        """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
+        assert self._photons is not None
+        light = beam.astype(np.float64)
+        extra = np.full(view.shape, self._photons.variance / self._photons.gain**2)
+        p, w = of_view(np.maximum(view * light, -extra), light, extra)
+        view[...] = np.where(w > 0, p, 0)
+        beam[...] = np.where(self.masked, 0, w)
 
     def _remove_zingers(self, data: NDArray[np.float32], n: int) -> int:
         """Take zingers out of the first `n` views; how many pixels they hit."""
@@ -304,12 +341,14 @@ def joined(parts: list[Projections]) -> Projections:
     weights, last = n / max(n.sum(), 1), parts[-1]
     ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
     floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
+    each = [part.weights for part in parts if part.weights is not None]
+    counted = np.concatenate(each) if each else None
     data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
     while parts:
         part = parts.pop(0).data
         data[at : at + len(part)] = part
         at += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)
 
 
 def _check(references: References, settings: CorrectionSettings) -> None:

@@ -21,6 +21,25 @@ _DETAIL = 1.5  # variance over that of counting beyond which a place has detail
 _FEWEST = 0.25  # photons: the least that a ray is taken to expect
 
 
+@dataclass(frozen=True)
+class Photons:
+    """How a detector counts photons, see `photon_transfer`.
+
+    Attributes:
+        gain: counts a photon.
+        variance: of a pixel of one dark frame, counts².
+    """
+
+    gain: float
+    variance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.gain < np.inf:
+            raise ValueError(f"gain is the counts of one photon, finite and above 0, got {self.gain}")
+        if not 0 <= self.variance < np.inf:
+            raise ValueError(f"variance must be finite and 0 or more, got {self.variance}")
+
+
 @dataclass(frozen=True, eq=False)
 class Counts:
     """What a detector counted, and what it counts without the sample and without the beam.

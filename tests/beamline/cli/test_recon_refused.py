@@ -33,6 +33,8 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "no beam": ({"data_white": np.full((2, 2, 40), DARK, np.uint16)}, [], 5, "no beam"),
     "empty field": ({"data": np.full(_VIEWS, DARK + BEAM, np.uint16)}, [], 5, "scan.h5"),
     "one view chosen": ({}, ["--views", "fixed:1"], 2, "at least 2"),
+    "a gain of logarithms": ({}, ["--noise", "log", "--gain", "2"], 2, "--noise log"),
+    "flats without noise": ({}, ["--noise", "counts"], 2, "--gain COUNTS"),
     "views misspelt": ({}, ["--views", "every:third"], 2, "every:third"),
     "too many views": ({}, ["--views", "fixed:31"], 2, "30"),
     "rows outside": ({}, ["--rows", "1:3"], 2, "0:2"),

@@ -140,6 +140,7 @@ def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
         "pixel_pitch_unit": "mm",
         "quantity": "counts",
         "correction_floor": 1e-4,
+        "noise": "logarithms of counts",
         "correction_air": "auto",
         "filter": "hann",
         "seed": 3,
