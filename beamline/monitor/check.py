@@ -117,7 +117,8 @@ class Check(Protocol):
 
     Attributes:
         name: in the configuration, in events and in the legend of a file.
-        bit: in the bitmask of a frame in a file, 0 ... 15 or 32 ... 47. Never changed and never used again: old files hold it.
+        bit: in the bitmask of a frame in a file, 0 ... 15 or 32 ... 47. Never changed and never used again: old files
+            hold it.
         unit: of the score and, unless a limit says otherwise, of the limits.
         meaning: what the flag says of a frame, one sentence for the legend of a file.
         policy: what its alarms do to a scan, unless the configuration says otherwise.

@@ -31,6 +31,7 @@ REGISTRY = {  # module in this folder: class of the check
     "ghost": "Ghost",
     "pixels": "Pixels",
     "field": "FieldOfView",
+    "blur": "Blur",
 }
 
 

@@ -119,8 +119,9 @@ class Ghost:
         old = state.peaks[state.peaks[:, 0] >= now - RULES.span]
         usual = usual + np.float32(MEMORY) * (np.minimum(spread, OUTLIER * usual) - usual)
         state = replace(state, usual=usual, peaks=old)
-        as_high = np.percentile(parts[signal, :, col] / outputs[signal, col], MOST_PARTS) > ALIKE
-        if abs(score) <= PEAK or abs(depth) <= self.warn or not as_high:
+        if abs(score) <= PEAK or abs(depth) <= self.warn:
+            return Look(state)
+        if np.percentile(parts[signal, :, col] / outputs[signal, col], MOST_PARTS) <= ALIKE:
             return Look(state)
         new = np.array([[now, 0.0, col, score]])
         state = replace(state, peaks=np.concatenate([old, new]))

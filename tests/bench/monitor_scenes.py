@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
 
 from beamline.monitor.digest import FrameDigest, digest
 from drivers.frame import Frame, FrameKind
@@ -192,6 +193,28 @@ class Steps:
 
 
 @dataclass(frozen=True)
+class Blurred:
+    """The light is blurred by a Gaussian of (down, across) pixels in a range of views."""
+
+    sigma: tuple[float, float]
+    views: tuple[int, int]
+
+    name: ClassVar[str] = "blurred"
+    domain: ClassVar[Domain] = Domain.PHOTONS
+    final: ClassVar[bool] = False
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        if shot.sample and self.views[0] <= shot.view < self.views[1]:
+            image[:] = gaussian_filter(image, self.sigma, mode="nearest")
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        rows, cols = shot.detector.shape
+        shown = shot.sample and self.views[0] <= shot.view < self.views[1]
+        return [Label("blur", (0, rows, 0, cols))] if shown else []
+
+
+@dataclass(frozen=True)
 class DarkLines:
     """Rows, or columns, without light in a range of views; the offset and its noise stay."""
 
@@ -282,6 +305,14 @@ def lost(share: float) -> Make:
     def make(rng: np.random.Generator, views: int) -> LostBeam:
         first = _views(rng, views)
         return LostBeam((first, first + int(rng.integers(1, 20))), share=share)
+
+    return make
+
+
+def blur(down: float, across: float) -> Make:
+    def make(rng: np.random.Generator, views: int) -> Blurred:
+        first = _views(rng, views)
+        return Blurred((down, across), (first, first + int(rng.integers(1, 20))))
 
     return make
 

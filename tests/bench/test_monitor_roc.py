@@ -27,6 +27,7 @@ from tests.bench.monitor_scenes import (
     Make,
     band,
     base_scene,
+    blur,
     floater,
     gain,
     ghost,
@@ -68,6 +69,12 @@ STRENGTHS: dict[str, tuple[str, Make]] = {  # row of the table: the check that h
     "gain step 1 %": ("gain", gain(0.01)),
     "gain step 2 %": ("gain", gain(0.02)),
     "gain step 5 %": ("gain", gain(0.05)),
+    "blur 0.7 px": ("blur", blur(0.7, 0.7)),
+    "blur 1 px": ("blur", blur(1, 1)),
+    "blur 2 px": ("blur", blur(2, 2)),
+    "blur 3 px": ("blur", blur(3, 3)),
+    "blur across, 1 px": ("blur", blur(0, 1)),
+    "blur down, 1 px": ("blur", blur(1, 0)),
     "beam lost, 2 % left": ("lost", lost(0.02)),
 }
 
