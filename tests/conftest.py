@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,22 @@ settings.register_profile("explore", deadline=None, print_blob=True)
 settings.register_profile("ci", deadline=None, max_examples=500, print_blob=True)
 settings.register_profile("thorough", deadline=None, max_examples=10_000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Before workers run the whole suite: kernels are compiled once, not by each of them (see compile_kernels)."""
+    config = session.config
+    if getattr(config.option, "numprocesses", None) and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        halves = [
+            subprocess.Popen(
+                [sys.executable, "-m", "tests.compile_kernels", half], cwd=config.rootpath, stdout=subprocess.DEVNULL
+            )
+            for half in ("fits", "rest")
+        ]
+        codes = [half.wait() for half in halves]
+        if any(codes):
+            pytest.exit("a kernel cannot be compiled, or the simulated instrument cannot scan: see above", 1)
+
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 

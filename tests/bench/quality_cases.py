@@ -17,6 +17,8 @@ import h5py
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -63,6 +65,22 @@ def walnut(folder: Path, views: int) -> Case:
     return Case("walnut slab", data, geometry, Grid.matching(geometry), truth, float(truth.max()))
 
 
+def slab(folder: Path, name: str, views: int, photons: float = 5000) -> Case:
+    """40 x 128² voxels of one of SLABS, by a parallel beam, from data of twice the resolution."""
+    fine = SLABS[name](folder)
+    angles = np.linspace(0, np.pi, views, endpoint=False)
+    rows, side = fine.shape[0] // 2, fine.shape[2] // 2
+    clean = Projector(Geometry.parallel(angles, (2 * rows, 2 * side), 0.5), Grid(fine.shape, 0.5)).forward(fine)
+    scale = 2 / float(clean.max())  # the longest path lets an eighth through
+    counts = photons * np.exp(-scale * clean).reshape(views, rows, 2, side, 2).mean(axis=(2, 4))
+    data = -np.log(np.maximum(np.random.default_rng(0).poisson(counts), 1) / photons)
+    truth = scale * fine.reshape(rows, 2, side, 2, side, 2).mean(axis=(1, 3, 5))
+    geometry = Geometry.parallel(angles, (rows, side), 1.0)
+    return Case(
+        f"{name} slab", data.astype(np.float32), geometry, Grid.matching(geometry), truth, float(truth.max())
+    )  # fmt: skip
+
+
 def dense_battery(views: int, side: int = 256, photons: float = 2e4, particles: int = 300) -> Case:
     """A can full of particles: piecewise constant, the home ground of total variation. Four rays a pixel."""
     pitch = 1.0 / side
@@ -104,6 +122,41 @@ OBJECTS: dict[str, Callable[[Path], F32]] = {
         tifffile.imread(folder / "qim3d_shell_225x128x128.tif")
     ),
     "thorax": _thorax,
+}  # fmt: skip
+
+
+def _grains(folder: Path) -> F32:
+    """Random polyhedra of five densities, a sixth of them empty, as in a cement."""
+    rng = np.random.default_rng(3)
+    z, y, x = np.indices(_FINE, np.float32)
+    seeds = rng.uniform(0, 1, (900, 3)) * _FINE
+    _, nearest = cKDTree(seeds).query(np.stack([z, y, x], -1).reshape(-1, 3), workers=-1)
+    density = rng.choice([0, 0.3, 0.55, 0.6, 1.0], 900, p=[0.15, 0.25, 0.25, 0.2, 0.15])
+    return np.where(_in_the_field(y, x), density[nearest].reshape(_FINE), 0).astype(np.float32)
+
+
+def _foam(folder: Path) -> F32:
+    """Branching struts with a fine texture of a ninth of their density, as in a bone."""
+    rng = np.random.default_rng(4)
+    struts, texture = (gaussian_filter(rng.normal(size=_FINE), s) for s in (3, 1.2))
+    _, y, x = np.indices(_FINE, np.float32)
+    solid = (struts > 0.3 * struts.std()) & _in_the_field(y, x)
+    return np.where(solid, np.maximum(0.7 + 0.08 * texture / texture.std(), 0), 0).astype(np.float32)
+
+
+def _in_the_field(y: F32, x: F32) -> NDArray[np.bool_]:
+    return np.asarray(np.hypot(y - 127.5, x - 127.5) < 118)
+
+
+_FINE = (80, 256, 256)
+_MIDDLE = slice(88, 168)
+SLABS: dict[str, Callable[[Path], F32]] = {
+    "teapot": lambda folder: _padded(OBJECTS["teapot"](folder), 256)[_MIDDLE],
+    "shell": lambda folder: _padded(OBJECTS["shell"](folder), 256)[_MIDDLE],
+    "thorax": lambda folder: _padded(OBJECTS["thorax"](folder), 256)[_MIDDLE],
+    "kernel": lambda folder: np.maximum(_first(folder / "walnut_fdk_256.npz"), 0)[_MIDDLE, 60:188, 60:188],
+    "grains": _grains,
+    "foam": _foam,
 }  # fmt: skip
 
 
