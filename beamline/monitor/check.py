@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.change import Change
 from beamline.monitor.digest import FrameDigest
+from beamline.monitor.spots import NO_SPOTS, Spots
 from beamline.monitor.view import Grid, Region, View
 from drivers.frame import Frame
 
@@ -80,6 +81,7 @@ class ScanContext:
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
+        spots: bright pixels that the frame before had not, of views and flats.
         light_left: of the view before, see beamline.monitor.view.light_left; 1 where it is no projection.
         view: the frame on this grid; None where it is no projection, or has no light.
         truncated: the sample is wider than the field, in this view or those before; or there are no flats to tell.
@@ -95,6 +97,7 @@ class ScanContext:
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan
     grid: Grid | None = None
+    spots: Spots = NO_SPOTS
     light_left: float = 1.0
     view: View | None = None
     truncated: bool = False

@@ -32,6 +32,7 @@ REGISTRY = {  # module in this folder: class of the check
     "pixels": "Pixels",
     "field": "FieldOfView",
     "blur": "Blur",
+    "zingers": "Zingers",
 }
 
 

@@ -36,6 +36,7 @@ class FrameDigest:
         checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
         preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
             none); blocks at the lower and right edge are smaller where bin does not divide the shape.
+        peaks: float32, largest valid pixel of each of these blocks (NaN where there is none).
     """
 
     minimum: float
@@ -48,6 +49,7 @@ class FrameDigest:
     entropy: float
     checksum: int
     preview: NDArray[np.float32]
+    peaks: NDArray[np.float32]
 
 
 def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
@@ -75,25 +77,30 @@ def digest(
     image.flags.writeable = False  # one compiled kernel for all: numba tells writable arrays from others
     checksum = zlib_ng.crc32(image.data.cast("B"))
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
+    peaks = np.empty_like(preview)
     if image.dtype == np.uint16 and no_data is None:
-        numbers = _of_greys(image, saturation, preview_bin, preview)
+        numbers = _of_greys(image, saturation, preview_bin, preview, peaks)
     else:
         if image.dtype not in (np.float32, np.float64):
             image = image.astype(np.float64)
             image.flags.writeable = False
-        numbers = _from_reals(image, saturation, preview_bin, no_data, preview)
-    return FrameDigest(*numbers, checksum, preview)
+        numbers = _from_reals(image, saturation, preview_bin, no_data, preview, peaks)
+    return FrameDigest(*numbers, checksum, preview, peaks)
 
 
 Numbers = tuple[float, float, float, float, float, float, float, float]
 
 
 def _of_greys(
-    image: NDArray[np.uint16], saturation: float | None, preview_bin: int, preview: NDArray[np.float32]
+    image: NDArray[np.uint16],
+    saturation: float | None,
+    preview_bin: int,
+    preview: NDArray[np.float32],
+    peaks: NDArray[np.float32],
 ) -> Numbers:
     full = 65536 if saturation is None else math.ceil(min(max(saturation, 0), 65536))
     every = max(1, image.size // ENTROPY_PIXELS)
-    low, high, total, squares, saturated, histogram = _count_greys(image, full, every, preview_bin, preview)
+    low, high, total, squares, saturated, histogram = _count_greys(image, full, every, preview_bin, preview, peaks)
     size, total, squares = image.size, int(total), int(squares)  # of any length: no square overflows
     greys = np.flatnonzero(histogram)
     bins = np.minimum((greys - low) * ENTROPY_BINS // max(high - low, 1), ENTROPY_BINS - 1)
@@ -103,11 +110,16 @@ def _of_greys(
 
 
 def _from_reals(
-    image: NDArray[Any], saturation: float | None, preview_bin: int, no_data: float | None, preview: NDArray[np.float32]
+    image: NDArray[Any],
+    saturation: float | None,
+    preview_bin: int,
+    no_data: float | None,
+    preview: NDArray[np.float32],
+    peaks: NDArray[np.float32],
 ) -> Numbers:
     marker = np.nan if no_data is None else image.dtype.type(no_data)
     threshold = np.inf if saturation is None else saturation
-    n, low, high, mean, squares, sum_abs, saturated = _sum_reals(image, threshold, preview_bin, marker, preview)
+    n, low, high, mean, squares, sum_abs, saturated = _sum_reals(image, threshold, preview_bin, marker, preview, peaks)
     invalid = (image.size - n) / image.size
     if n == 0:
         return np.nan, np.nan, np.nan, np.nan, np.nan, invalid, 0.0, np.nan
@@ -121,34 +133,31 @@ def _entropy(histogram: NDArray[Any]) -> float:
 
 
 @numba.njit(nogil=True, cache=True)
-def _count_greys(image, full, every, preview_bin, preview):  # type: ignore[no-untyped-def]  # numba infers the types
-    """(minimum, maximum, sum, sum of squares, pixels from `full` on, histogram of every k-th row); fills the preview.
+def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: ignore[no-untyped-def]  # numba infers the types
+    """(minimum, maximum, sum, sum of squares, pixels from `full` on, histogram of every k-th row).
 
-    Short loops over one line each: the compiler makes vector instructions of all but the histogram's.
+    Fills preview and peaks. Short loops over one line each: the compiler makes vector instructions of all but the
+    histogram's.
     """
     rows, cols = image.shape
     # Two histograms by turns: neighbours are often equal, and an increment must not wait for the one before it.
     histogram = np.zeros((2, 65536), np.uint32)
-    sums = np.empty(cols, np.uint32)
-    low, high = np.uint16(65535), np.uint16(0)
+    sums, tops = np.empty(cols, np.uint32), np.empty(cols, np.uint16)
+    least = np.full(cols, 65535, np.uint16)
+    high = np.uint16(0)
     total, squares, saturated = np.uint64(0), np.uint64(0), np.int64(0)
     for block in range(preview.shape[0]):
         first, last = block * preview_bin, min((block + 1) * preview_bin, rows)
-        sums[:] = 0
+        sums[:], tops[:] = 0, 0
         for row in range(first, last):
             line = image[row]
-            least, most = np.uint16(65535), np.uint16(0)
             for col in range(cols):
-                least, most = min(least, line[col]), max(most, line[col])
-            low, high = min(low, least), max(high, most)
+                tops[col], least[col] = max(tops[col], line[col]), min(least[col], line[col])
             for col in range(cols):
                 sums[col] += np.uint32(line[col])
             for col in range(cols):
                 value = np.uint32(line[col])
                 squares += np.uint64(np.uint32(value * value))
-            if most >= full:
-                for col in range(cols):
-                    saturated += line[col] >= full
             if row % every == 0:
                 for col in range(0, cols - 1, 2):
                     histogram[0, line[col]] += np.uint32(1)
@@ -157,17 +166,23 @@ def _count_greys(image, full, every, preview_bin, preview):  # type: ignore[no-u
                     histogram[0, line[cols - 1]] += np.uint32(1)
         for block_col in range(preview.shape[1]):
             left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
-            part = np.uint64(0)
+            part, most = np.uint64(0), np.uint16(0)
             for col in range(left, right):
                 part += np.uint64(sums[col])
+                most = max(most, tops[col])
+            high, peaks[block, block_col] = max(high, most), most
+            if most >= full:
+                for row in range(first, last):
+                    for col in range(left, right):
+                        saturated += image[row, col] >= full
             preview[block, block_col] = part / ((right - left) * (last - first))
             total += part
-    return int(low), int(high), total, squares, saturated, histogram.sum(0).astype(np.int64)
+    return int(least.min()), int(high), total, squares, saturated, histogram.sum(0).astype(np.int64)
 
 
 @numba.njit(nogil=True, cache=True)
-def _sum_reals(image, saturation, preview_bin, no_data, preview):  # type: ignore[no-untyped-def]
-    """Range and moments of the valid pixels, block by block (Chan, Golub & LeVeque 1983), and the preview."""
+def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):  # type: ignore[no-untyped-def]
+    """Range and moments of the valid pixels, block by block (Chan, Golub & LeVeque 1983), and preview and peaks."""
     rows, cols = image.shape
     n, saturated = 0, 0
     low, high, mean, squares, sum_abs = np.inf, -np.inf, 0.0, 0.0, 0.0
@@ -175,7 +190,7 @@ def _sum_reals(image, saturation, preview_bin, no_data, preview):  # type: ignor
         first, last = block * preview_bin, min((block + 1) * preview_bin, rows)
         for block_col in range(preview.shape[1]):
             left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
-            n_block, sum_block = 0, 0.0
+            n_block, sum_block, most = 0, 0.0, -np.inf
             for row in range(first, last):
                 for col in range(left, right):
                     value = image[row, col]
@@ -184,12 +199,13 @@ def _sum_reals(image, saturation, preview_bin, no_data, preview):  # type: ignor
                         sum_block += value
                         sum_abs += abs(value)
                         low = min(low, value)
-                        high = max(high, value)
+                        most = max(most, value)
                         if value >= saturation:
                             saturated += 1
             if n_block == 0:
-                preview[block, block_col] = np.nan
+                preview[block, block_col] = peaks[block, block_col] = np.nan
                 continue
+            high, peaks[block, block_col] = max(high, most), most
             mean_block = sum_block / n_block
             preview[block, block_col] = mean_block
             for row in range(first, last):

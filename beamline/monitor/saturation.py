@@ -1,4 +1,4 @@
-"""Saturation: pixels at the end of their range, whose true count is unknown."""
+"""Saturation: pixels at the end of their range, whose true count is unknown; but for zingers, which have a check."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.frame import Frame, FrameKind
 
-FEW_PIXELS = 2  # a cosmic ray saturates a pixel or two; that is no exposure too long
+FEW_PIXELS = 2  # a hot pixel or two that the darks did not show; that is no exposure too long
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Saturation:
     ) -> Look[SaturationState]:
         if frame.kind is FrameKind.DARK:
             return Look(SaturationState(max(state.hot, digest.saturated_fraction)))
-        score = digest.saturated_fraction - state.hot
+        score = digest.saturated_fraction - state.hot - context.spots.saturated / context.pixels
         if score <= max(self.warn, FEW_PIXELS / context.pixels):
             return Look(state)
         level, limit = (Level.ALARM, self.alarm) if score > self.alarm else (Level.WARN, self.warn)

@@ -15,6 +15,7 @@ from beamline.monitor.check import Check, Flag, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import more_light
+from beamline.monitor.spots import spots_of
 from beamline.monitor.view import View, grid_of, light_left, view_of
 from drivers.frame import Frame, FrameKind
 
@@ -32,6 +33,7 @@ class Monitor:
         checks: with their limits.
         states: of the checks, in their order.
         kind, counted: of the latest group of frames: their kind, and how many there are.
+        before: digest of the frame before; None before any.
         recent: the last projections with light, oldest first.
         cut: usual line integral at the worse edge of the field, over the views so far.
     """
@@ -41,6 +43,7 @@ class Monitor:
     states: tuple[Any, ...]
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
+    before: FrameDigest | None = None
     recent: tuple[View, ...] = ()
     cut: float = 0.0
 
@@ -57,7 +60,7 @@ def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, 
         check.look(state, frame, digest, monitor.context)
         for check, state in zip(monitor.checks, monitor.states, strict=True)
     ]
-    after = replace(_with_reference(monitor, frame, digest), states=tuple(look.state for look in looks))
+    after = replace(_with_reference(monitor, frame, digest), before=digest, states=tuple(look.state for look in looks))
     unbroken = frame.index - after.counted + 1
     return after, tuple(_from(look.flag, unbroken) for look in looks if look.flag is not None)
 
@@ -69,7 +72,9 @@ def _from(flag: Flag, row: int) -> Flag:
 
 def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     """The monitor with what all checks need of a projection."""
-    context = replace(monitor.context, view=None, change=None, light_left=1.0)
+    context = monitor.context
+    spots = spots_of(frame, digest, monitor.before, context.dark, context.saturation)
+    context = replace(context, view=None, change=None, light_left=1.0, spots=spots)
     if frame.kind is not FrameKind.PROJECTION:
         return replace(monitor, context=context)
     grid = context.grid

@@ -65,7 +65,7 @@ class Blobs:
         counts = np.broadcast_to(np.uint16(0), (ROWS * BLOCK, COLS * BLOCK))
         frame = Frame(counts, kind, row, max(row - 10, 0), row, angle, row * 0.1, 0.05)
         mean = float(preview.mean())
-        return frame, FrameDigest(0.0, 65535.0, mean, 1.0, mean, 0.0, 0.0, 1.0, row, preview)
+        return frame, FrameDigest(0.0, 65535.0, mean, 1.0, mean, 0.0, 0.0, 1.0, row, preview, preview)
 
     def flags(self, checks: Sequence[Check] = CHECKS) -> list[Flag]:
         monitor = watch.start(ScanContext(65535, ROWS * COLS * BLOCK**2, 0.1), checks)

@@ -28,6 +28,14 @@ def naive_preview(image: np.ndarray, valid: np.ndarray, bin_: int) -> np.ndarray
     return out
 
 
+def naive_peaks(image: np.ndarray, valid: np.ndarray, bin_: int) -> np.ndarray:
+    """The largest of the means of blocks of one pixel."""
+    ones = np.pad(naive_preview(image, valid, 1), [(0, -n % bin_) for n in image.shape], constant_values=np.nan)
+    blocks = ones.reshape(ones.shape[0] // bin_, bin_, -1, bin_)
+    low = np.where(np.isnan(blocks), -np.inf, blocks).max(axis=(1, 3))
+    return np.where(np.isinf(low), np.nan, low)
+
+
 def naive_entropy(values: np.ndarray) -> float:
     low, high = values.min(), values.max()
     if low == high:
@@ -47,7 +55,9 @@ def test_counts_agree_with_numpy(image: np.ndarray, bin_: int, saturation: int) 
     assert found.saturated_fraction == (image >= saturation).mean()
     assert found.invalid_fraction == 0
     assert found.checksum == zlib.crc32(image.tobytes())
-    np.testing.assert_allclose(found.preview, naive_preview(image, np.ones(image.shape, bool), bin_), rtol=1e-6)
+    everywhere = np.ones(image.shape, bool)
+    np.testing.assert_allclose(found.preview, naive_preview(image, everywhere, bin_), rtol=1e-6)
+    np.testing.assert_array_equal(found.peaks, naive_peaks(image, everywhere, bin_))
 
 
 def test_entropy_is_numpys_histogram_and_scipys_sum(rng: np.random.Generator) -> None:
@@ -102,6 +112,7 @@ def test_invalid_pixels_are_counted_and_never_spread(image: np.ndarray, bin_: in
     valid = np.isfinite(image) & (image != -1)
     assert found.invalid_fraction == pytest.approx((~valid).mean(), abs=1e-12)
     np.testing.assert_allclose(found.preview, naive_preview(image, valid, bin_), rtol=1e-5, atol=1e-3)
+    np.testing.assert_array_equal(found.peaks, naive_peaks(image, valid, bin_))
     values = image[valid].astype(np.float64)
     if values.size == 0:
         assert np.isnan([found.minimum, found.maximum, found.mean, found.variance, found.entropy]).all()

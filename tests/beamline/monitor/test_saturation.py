@@ -13,7 +13,9 @@ SATURATION, PIXELS = 65535, 64 * 96
 
 
 def burn(frames: list[Frame], n: int) -> list[Frame]:
+    """n pixels at the end of their range, in bright surroundings."""
     for frame in frames:
+        frame.counts[:4] = SATURATION - 5000
         frame.counts.ravel()[:n] = SATURATION
     return frames
 
@@ -31,8 +33,15 @@ def test_saturated_pixels_are_flagged(fake: Any, n: int, level: Level) -> None:
     assert "exposure" in flags[0].advice
 
 
-def test_a_pixel_or_two_are_a_cosmic_ray(fake: Any) -> None:
+def test_a_pixel_or_two_are_no_exposure_too_long(fake: Any) -> None:
     assert only(fake.flags(fake.references() + burn(fake.views(2), 2))) == []
+
+
+def test_zingers_that_saturate_are_no_exposure_too_long(fake: Any) -> None:
+    frames = fake.references() + fake.views(3)
+    for at in (7, 30, 55, 80):
+        frames[-2].counts[20:22, at] = SATURATION
+    assert only(fake.flags(frames)) == []
 
 
 def test_pixels_that_are_hot_without_light_do_not_count(fake: Any) -> None:
