@@ -68,6 +68,7 @@ def follow(
         growing = ScanFollower(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
         with stop_scope() as stopped:
+            growing.catch_up(stopped)
             made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
@@ -101,9 +102,7 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming) -> None:
         if growing.take_new_frames(ended):
             last_frame = clock.now()
         if ended:
-            if growing.waiting == 0:
-                return
-            continue
+            return
         if clock.now() - last_frame > rhythm.patience:
             raise DataError(
                 f"{growing.source.path} has not grown for {rhythm.patience:.0f} s and is not finished: the scan died. "

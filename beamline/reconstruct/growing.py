@@ -40,6 +40,7 @@ from recon.splatting.stream import StreamingFit
 
 _FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
 _BATCH = 32  # views corrected before the fit goes on
+_LEAST_VIEWS = 16  # of a volume after a stop
 _AXIS_MOVES = 0.3  # px by which a better axis makes the fit begin anew
 
 
@@ -67,11 +68,6 @@ class ScanFollower:
     @property
     def n_views(self) -> int:
         return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
-
-    @property
-    def waiting(self) -> int:
-        """Frames that are there and not taken yet."""
-        return self._frames - self._taken
 
     def take_new_frames(self, ended: bool) -> bool:
         """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
@@ -104,6 +100,15 @@ class ScanFollower:
             self._fit.add_views(part.data, self.source.angles[part.view_ids])
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
+
+    def catch_up(self, stopped: Callable[[], bool]) -> None:
+        """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
+        while self._taken < self._frames:
+            corrected = sum(part.view_ids.size for part in self._parts)
+            if corrected >= _LEAST_VIEWS and stopped():
+                self._warn(f"Stopped: the volume is of the first {corrected} of {self.n_views} views.")
+                return
+            self.take_new_frames(ended=True)
 
     def _wait_for_references(self) -> None:
         """Darks or flats that come after the views: all of them are there when the scan has ended, not before."""

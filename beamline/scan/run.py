@@ -56,6 +56,9 @@ MESSAGES: Mapping[State, str] = {
 }
 
 
+LAST_ROUND = 5.0
+"""Real s that a live reconstruction has after a scan that was stopped, before it is asked for the volume it has."""
+
 UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
     "the last frames are being written"
@@ -245,10 +248,15 @@ class _Run:
                 recorder.put(frame)
 
     def _give_up(self, useless: bool) -> Callable[[], bool]:
-        """The live reconstruction ends early after an abort, a stop that came after the scan, or with a file that is
-        broken or has no projections."""
-        stopped = self.stop.stopping
-        return lambda: useless or self.stop.aborting or (self.stop.stopping and not stopped)
+        """The live reconstruction ends early, with the volume that it has, after an abort, a stop that came after the
+        scan, LAST_ROUND after a scan that was stopped, or with a file that is broken or has no projections."""
+        stopped, last = self.stop.stopping, time.monotonic() + LAST_ROUND
+
+        def ends() -> bool:
+            enough = time.monotonic() >= last if stopped else self.stop.stopping
+            return useless or self.stop.aborting or enough
+
+        return ends
 
     def _worse(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
         """The error that the run ends with; a stop or lost frames yield to any other. The other becomes a warning."""

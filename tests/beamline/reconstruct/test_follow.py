@@ -290,6 +290,26 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
     assert parameters["ended_early"] and parameters["n_views"] == 30
 
 
+def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    _close(clock)
+    monkeypatch.setattr(module, "_BATCH", 8)
+
+    @contextmanager
+    def at_once() -> Iterator[Callable[[], bool]]:
+        yield lambda: True
+
+    follow(_options(tmp_path), events.append, clock, RHYTHM, at_once)
+    assert events[-1].event == "done"
+    n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])
+    assert 16 <= n_views < 30
+    told = [event.data["message"] for event in events if event.event == "warning"]
+    assert f"Stopped: the volume is of the first {n_views} of 30 views." in told
+
+
 def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:
     clock = ScanClock()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.process import ChildProcess
 from beamline.core.stop import ScanAborted, StopRequest
@@ -144,6 +145,16 @@ def test_a_live_reconstruction_that_is_ended_may_deliver_what_it_has(tmp_path: P
     assert done is not None
     assert done["output"] == str(tmp_path / "recon.h5")
     assert "warning" not in live.said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
+def test_after_a_stopped_scan_the_volume_comes_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LAST_ROUND", 0.5)
+    stop = StopRequest()
+    instrument = FakeInstrument(on_frame=lambda number: stop.stop() if number == 10 else None)
+    ran = Ran(tmp_path, instrument, stop=stop, live=script(DELIVERS))
+    assert type(ran.error) is ScanStopped
+    assert [event.data["output"] for event in ran.of("recon_done")] == [str(ran.folder / "recon.h5")]  # type: ignore[operator]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
