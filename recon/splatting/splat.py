@@ -37,9 +37,13 @@ class _Project(torch.autograd.Function):
         active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit, kernel)
         images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
         shared, views = Scratch.of(len(active.densities), geometry.detector_shape), []
-        for view, image in enumerate(images):  # each needs its own table until its backward pass
-            scratch = replace(shared, table=footprint_table(len(active.densities)))
-            views.append(render_view(active, geometry, view, faint, cut, model, image=image, scratch=scratch))
+        differentiable = any(ctx.needs_input_grad)
+        for view, image in enumerate(images):
+            # Each view needs its own table until its backward pass, where there will be one.
+            scratch = replace(shared, table=footprint_table(len(active.densities))) if differentiable else shared
+            rendered = render_view(active, geometry, view, faint, cut, model, image=image, scratch=scratch)
+            if differentiable:
+                views.append(rendered)
         ctx.state = (_array(quaternions), _array(raw), unit, views)
         return torch.from_numpy(images)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -187,6 +188,18 @@ def test_views_that_share_memory_give_what_views_of_their_own_give(
             found.append((seen.image, into.means, into.log_scales, into.rotations, into.densities, centres))
         for shared, own in zip(*found, strict=True):
             np.testing.assert_array_equal(shared, own)
+
+
+def test_without_gradients_the_memory_is_that_of_the_images_however_many_views(random_gaussians: Make) -> None:
+    gaussians, peaks = random_gaussians(2000), []
+    for n_views in (4, 64):
+        geometry = Geometry.parallel(np.linspace(0, np.pi, n_views), (8, 8), 0.5)
+        tracemalloc.start()
+        project(gaussians, geometry)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    images = 60 * 8 * 8 * 4
+    assert peaks[1] - peaks[0] < 4 * images  # a table of the Gaussians would be 2000 x 32 bytes a view
 
 
 def test_a_sub_volume_is_the_cut_out_of_the_volume(random_gaussians: Make) -> None:
