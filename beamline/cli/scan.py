@@ -14,13 +14,15 @@ import click
 from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
 from beamline.cli.terminal import Terminal
-from beamline.config.load import Config, load
+from beamline.config.load import Config, load, plan_of
 from beamline.core.errors import AlarmError
 from beamline.core.events import Event, Sink
+from beamline.core.machine import free_memory
 from beamline.core.stop import StopRequest
 from beamline.core.text import count
+from beamline.instrument.connect import describe
 from beamline.instrument.operator import ask_operator
-from beamline.scan.live_process import LiveCommand, follow_command
+from beamline.scan.live_process import LiveCommand, follow_command, live_plan
 from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
@@ -105,7 +107,8 @@ def _live(config: Config, no_live: bool) -> LiveCommand | None:
             err=True,
         )
         return None
-    return follow_command(config)
+    _, camera, _ = describe(config)
+    return follow_command(config, live_plan(camera.shape, plan_of(config).angles.size, free_memory()))
 
 
 @contextmanager

@@ -104,7 +104,7 @@ _BEFORE = (
         default="all",
         show_default=True,
         metavar="SPEC",
-        help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N",
+        help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N | every:K",
     ),
     click.option(
         "--rows",

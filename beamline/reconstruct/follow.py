@@ -14,6 +14,7 @@ from beamline.reconstruct.recon_report import ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from drivers.clock import Clock
+from recon.base.views import parse_views
 from recon.warm_up import warm_up
 
 DEFAULT_SECONDS = 20.0  # of the last round
@@ -54,10 +55,16 @@ def follow(
     """
     rhythm = rhythm or FollowTiming()
     method = options.streaming
-    if options.selection.views != "all" or method.steps is not None:
+    views = options.selection.views
+    if not (views == "all" or views.startswith("every:")) or method.steps is not None:
         raise ConfigError(
-            "--follow takes every view as it comes, for --seconds after the end: leave out --views and --steps."
+            "--follow takes views as they come, and fits for --seconds after the end: leave out --views, but for "
+            "every:K, and --steps."
         )
+    try:
+        parse_views(views, [0.0])
+    except ValueError as error:
+        raise ConfigError(f"{error}. Nothing was written.") from error
     options.target.refuse_existing()
     wanted = None if options.truth is None else read_truth(options.truth)
     started = clock.now()

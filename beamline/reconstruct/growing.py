@@ -33,6 +33,7 @@ from beamline.storage.writers.recon_file import ReconRecord, write_reconstructio
 from drivers.clock import Clock
 from drivers.frame import FrameKind
 from recon.base.method import DataUse, Progress, ReconProblem
+from recon.base.views import parse_views
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections, joined
 from recon.splatting.finish import finish
@@ -73,7 +74,7 @@ class ScanFollower:
         """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
         n = self.source.refresh()
         grown, self._frames = n > self._frames, n
-        views = usable_views(self.source, self._options.selection.use_flags).frames
+        views = self._chosen(usable_views(self.source, self._options.selection.use_flags).frames)
         if views.size == 0:
             self._taken = n
             return grown
@@ -100,6 +101,12 @@ class ScanFollower:
             self._fit.add_views(part.data, self.source.angles[part.view_ids])
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
+
+    def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of the selection, by their place among all views that were taken, which later frames do not change."""
+        taken = np.flatnonzero(np.isin(self.source.image_key, (FrameKind.PROJECTION, FrameKind.INVALID)))
+        wanted = parse_views(self._options.selection.views, np.zeros(taken.size))
+        return frames[np.isin(frames, taken[wanted])]
 
     def catch_up(self, stopped: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +20,68 @@ _SILENCE = 300.0  # real s without output, after which the process is ended
 _GRACE = 30.0  # real s in which it may still write the volume that it has
 
 
-def follow_command(config: Config) -> LiveCommand:
+# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
+_A_RAY, _A_VOXEL = 40, 50
+_WIDEST = 512  # columns: a wider volume does not grow as fast as views come, on any processor
+_FEWEST = 90  # views
+_SHARE = 0.5  # of the free memory
+
+
+@dataclass(frozen=True)
+class LivePlan:
+    """What of a scan the live volume is made of.
+
+    Attributes:
+        binning: pixels joined along rows and columns.
+        every: one of so many views, in the order taken.
+        bytes: of memory, about.
+    """
+
+    binning: int = 1
+    every: int = 1
+    bytes: int = 0
+
+    @property
+    def whole(self) -> bool:
+        return self.binning == self.every == 1
+
+
+def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
+    """Pixels joined and views left out so that the live volume has at most 512 columns and half of the free memory.
+
+    Views are left out as long as 90 are used, then more pixels are joined.
+
+    Args:
+        shape: rows and columns of a frame.
+        free: bytes of memory.
+    """
+    binning = 1
+    while shape[1] > _WIDEST * binning:
+        binning *= 2
+    while True:
+        rows, cols = (max(1, n // binning) for n in shape)
+        volume = _A_VOXEL * rows * cols * cols
+        view, room = _A_RAY * rows * cols, _SHARE * free - volume
+        most = max(1, int(room // view)) if room > 0 else 1
+        every = math.ceil(n_views / most)
+        used = math.ceil(n_views / every)
+        if used >= min(n_views, _FEWEST) or cols < 32:
+            return LivePlan(binning, every, volume + used * view)
+        binning *= 2
+
+
+def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
     """The command `beamline recon SCAN --follow` with the options of the configuration."""
-    recon, axis = config.recon, config.recon.axis
+    recon, axis, plan = config.recon, config.recon.axis, plan or LivePlan()
     if axis == "auto" and config.optics.axis_col is not None:
         axis = config.optics.axis_col
 
     def command(scan: Path, output: Path) -> Sequence[str]:
-        options = {"--axis": axis, "--seconds": recon.seconds, "--seed": recon.seed, "-o": output}
+        options: dict[str, object] = {"--axis": axis, "--seconds": recon.seconds, "--seed": recon.seed, "-o": output}
+        if plan.binning > 1:
+            options["--bin"] = plan.binning
+        if plan.every > 1:
+            options["--views"] = f"every:{plan.every}"
         words = [word for name, value in options.items() for word in (name, str(value))]
         return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), "--follow", "--json", *words]
 

@@ -16,6 +16,8 @@ from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, plan_of, resolved_yaml
 from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
+from beamline.core.machine import free_memory
+from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import Instrument, camera_settings
 from beamline.monitor.check import Policy, ScanContext
@@ -25,6 +27,7 @@ from beamline.monitor.watch import start as start_monitor
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import work_out
+from beamline.scan.live_process import live_plan
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 
@@ -85,20 +88,31 @@ def dry_run(settings: Config) -> DryRun:
         preview_bin=settings.storage.preview_bin,
         free_bytes=free,
     )
-    return DryRun(plan, with_remarks(worked, settings), stage, camera, free)
+    return DryRun(plan, with_remarks(worked, settings, camera.shape), stage, camera, free)
 
 
-def with_remarks(worked: Timeline, config: Config) -> Timeline:
-    """The timeline with what the operator should know of policies that it cannot carry out."""
+def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Timeline:
+    """The timeline with what the operator should know of policies that it cannot carry out, and of the live volume."""
+    remarks = [*worked.remarks, *_held_late(worked, config)]
+    plan = live_plan(shape, worked.views.n, free_memory())
+    if config.recon.live and not plan.whole:
+        rows, cols = (n // plan.binning for n in shape)
+        remarks.append(
+            f"the live volume has {cols} columns and {rows} rows (pixels joined {plan.binning} x {plan.binning}) from "
+            f"one view of {plan.every}, in about {size(plan.bytes)} of memory; `beamline recon` makes the full one"
+        )
+    return replace(worked, remarks=tuple(remarks))
+
+
+def _held_late(worked: Timeline, config: Config) -> list[str]:
     pausing = [check for check, policy in policies(config.monitor).items() if policy is Policy.PAUSE]
     if not pausing or len(worked.views.trains) != 1:
-        return worked
+        return []
     before = "before views are taken again" if config.monitor.retake else "not at all"
-    remark = (
+    return [
         f"monitor.policy {', '.join(pausing)}: a fly scan is held between its passes; this has one, so that it is held "
         f"{before}; use scan.mode: step, or abort"
-    )
-    return replace(worked, remarks=(*worked.remarks, remark))
+    ]
 
 
 def refuse_violations(worked: Timeline) -> None:
@@ -172,7 +186,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
         free_bytes=free,
     )
     refuse_violations(timeline)
-    timeline = with_remarks(timeline, config)
+    timeline = with_remarks(timeline, config, timing.shape)
     monitor = start_monitor(_context(plan, timeline, timing), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
     digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, preview_bin)

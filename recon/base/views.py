@@ -1,4 +1,4 @@
-"""parse_views: a selection of views from its short form: all, fixed:90, sector:30-150:60, random:45:7, first:20."""
+"""parse_views: a selection of views from its short form, such as all, fixed:90, sector:30-150:60 or every:4."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FORMS = "all, fixed:N, sector:A-B[:N] (degrees), random:N[:seed], first:N"
+FORMS = "all, fixed:N, sector:A-B[:N] (degrees), random:N[:seed], first:N, every:K"
 
 _NUMBER = r"[+-]?\d+(?:\.\d*)?"
 _SECTOR = re.compile(rf"({_NUMBER})-({_NUMBER})(?::(\d+))?")
@@ -24,6 +24,7 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
     - `sector:A-B[:N]`: views with A <= angle <= B degrees (modulo 360); of these, N spread evenly.
     - `random:N[:seed]`: N views drawn without replacement.
     - `first:N`: the N views taken first.
+    - `every:K`: one of K views, in the order taken.
 
     Args:
         spec: the selection.
@@ -48,6 +49,8 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
     if name in ("fixed", "first") and _COUNT.fullmatch(rest):
         n = _enough(int(rest), theta.size, spec)
         return views[:n] if name == "first" else _even(views, theta, n, period)
+    if name == "every" and _COUNT.fullmatch(rest) and int(rest) > 0:
+        return views[:: int(rest)]
     if name == "random" and (match := _RANDOM.fullmatch(rest)):
         n = _enough(int(match[1]), theta.size, spec)
         rng = np.random.default_rng(seed if match[2] is None else int(match[2]))

@@ -310,6 +310,14 @@ def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
     assert f"Stopped: the volume is of the first {n_views} of 30 views." in told
 
 
+def test_one_of_so_many_views_feeds_the_volume(tmp_path: Path) -> None:
+    clock = ScanClock()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms={12})
+    follow(_options(tmp_path, selection=Selection("every:2", axis_col=SCAN.axis_col)), [].append, clock, RHYTHM)
+    n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])
+    assert n_views in (14, 15)  # of 30, one of them or of the others with an alarm
+
+
 def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:
     clock = ScanClock()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))

@@ -14,10 +14,34 @@ from beamline.core.events import Event
 from beamline.core.process import ChildProcess
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import run as module
-from beamline.scan.live_process import LiveReconstruction
+from beamline.scan.live_process import LivePlan, LiveReconstruction, follow_command, live_plan
 from beamline.scan.run import run_scan
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
+
+
+@pytest.mark.parametrize(
+    ("shape", "n_views", "free", "planned"),
+    [
+        ((256, 256), 180, 8e9, (1, 1)),
+        ((2048, 2048), 1800, 64e9, (4, 1)),
+        ((2304, 4096), 3600, 24e9, (8, 3)),
+        ((2048, 2048), 1800, 3e9, (8, 8)),
+        ((2048, 2048), 60, 24e9, (4, 1)),
+    ],
+)
+def test_the_live_volume_fits_into_half_of_the_memory(
+    shape: tuple[int, int], n_views: int, free: float, planned: tuple[int, int]
+) -> None:
+    plan = live_plan(shape, n_views, int(free))
+    assert (plan.binning, plan.every) == planned
+    assert plan.bytes <= free / 2
+
+
+def test_what_it_leaves_out_is_told_to_the_follower() -> None:
+    words = follow_command(small(), LivePlan(4, 2, 10**9))(Path("scan.h5"), Path("recon.h5"))
+    assert words[words.index("--bin") + 1] == "4" and words[words.index("--views") + 1] == "every:2"
+    assert "--bin" not in follow_command(small())(Path("scan.h5"), Path("recon.h5"))
 
 
 def script(code: str) -> Callable[[Path, Path], Sequence[str]]:

@@ -24,6 +24,10 @@ def test_all_and_first() -> None:
     assert parse_views("all", HALF).dtype == np.int64
 
 
+def test_every_takes_one_of_so_many_in_the_order_taken() -> None:
+    np.testing.assert_array_equal(parse_views("every:50", HALF), [0, 50, 100, 150])
+
+
 @pytest.mark.parametrize("n", [1, 2, 45, 60, 90, 180])
 def test_fixed_takes_equal_steps_from_the_first_view(n: int) -> None:
     assert picked_deg(f"fixed:{n}", HALF) == list(np.arange(n) * 180 / n)
