@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -43,6 +45,15 @@ SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 def rng() -> np.random.Generator:
     """A generator with a fixed seed: a failing test fails again."""
     return np.random.default_rng(20261120)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Tiny fits on one thread: on a busy machine, waiting for a second one takes ten times as long as the work."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    yield
+    numba.set_num_threads(before)
 
 
 @pytest.fixture

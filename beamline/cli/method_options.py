@@ -18,7 +18,7 @@ from recon.base.method import Method
 from recon.methods import build, by_name, has_setting, taking, with_trait
 from recon.splatting.initialise import Start
 from recon.splatting.problem import Loss
-from recon.splatting.r2 import DEFAULT_STEPS
+from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS
 from recon.splatting.settings import FitSettings
 
 SETTINGS = {
@@ -131,7 +131,10 @@ def _option(name: str) -> str:
 
 _OPTIONS = (
     click.option(
-        "--steps", type=click.IntRange(min=1), help=f"Steps of the fit ({_of('steps')}). Default: {DEFAULT_STEPS}."
+        "--steps",
+        type=click.IntRange(min=1),
+        help=f"Steps of the fit ({_of('steps')}). Default: {DEFAULT_STEPS}; "
+        f"{SHORT_STEPS} where the noise of the views hides what more would gain and a finish follows.",
     ),
     click.option(
         "--seconds",

@@ -92,7 +92,7 @@ class Preset:
 
 PRESETS: dict[Quality, Preset] = {
     "preview": Preset(125, 0.5),
-    "standard": Preset(500, 1.0),
+    "standard": Preset(400, 1.0),
     "best": Preset(1500, 2.0),
 }
 

@@ -16,11 +16,11 @@ from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start
+from recon.splatting.schedule import DEFAULT_STEPS
 from recon.splatting.settings import FitSettings
 from recon.splatting.stream import Clock, StreamingFit
 from recon.splatting.train import run_fit
 
-DEFAULT_STEPS = 500
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
 # What a trade-off tries, by depth.
@@ -35,7 +35,8 @@ class R2:
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
-        steps: of the fit; 0 gives the starting point; None takes 500, or as many as fit into `seconds`.
+        steps: of the fit; 0 gives the starting point; None takes 400, or 200 where a finish follows and the noise of
+            the views hides what more would gain (see `schedule.Schedule`), or as many as fit into `seconds`.
         seconds: a time budget for the fit; the rates decay along it.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.

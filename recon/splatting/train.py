@@ -23,6 +23,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, coarser, joined
+from recon.splatting.schedule import Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.voxels.projector import data_residual
 
@@ -115,15 +116,16 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         )  # fmt: skip
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
-    steps, seconds = method.planned_steps, method.seconds
-    planned = steps or 0  # 0 in a history: no number of steps was planned
+    by_content = method.steps is None and method.seconds is None and sweeps > 0
+    schedule = Schedule(method.planned_steps, method.seconds, by_content)
+    schedule = Schedule.resumed(schedule, control.resume or {})
     history: list[Progress] = []
 
     def report(at: float) -> None:
         history.append(
             Progress(
-                state.step, planned, at - begin, float(state.loss), float(state.residual), state.n, seen.n_views,
-                tracker.value,
+                state.step, schedule.steps or 0, at - begin, float(state.loss), float(state.residual), state.n,
+                seen.n_views, tracker.value,
             )
         )  # fmt: skip
         if control.on_progress is not None:
@@ -131,24 +133,25 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
 
     fit_begin = reported = saved = now()
     done = 0
-    while steps is None or state.step < steps:
+    while schedule.steps is None or state.step < schedule.steps:
         spent = now() - fit_begin
-        if seconds is not None and spent >= seconds and done > 0:
+        if schedule.seconds is not None and spent >= schedule.seconds and done > 0:
             break
-        fraction = min(1.0, max(state.step / planned if planned else 0.0, spent / seconds if seconds else 0.0))
+        fraction = schedule.fraction(state.step, spent)
         fit.step(state, rough if fraction < settings.coarse_until else fine, settings, fraction)
         done += 1
+        schedule.look(state, fine)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             tracker.look(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
             reported = now()
             report(reported)
         if control.on_checkpoint is not None and now() - saved >= control.checkpoint_every:
-            control.on_checkpoint(arrays_of(state, backend) | tracker.arrays())
+            control.on_checkpoint(arrays_of(state, backend) | tracker.arrays() | schedule.arrays())
             saved = now()  # the time that saving takes must not crowd out the fit
         if control.should_stop is not None and control.should_stop():
             break
-        if method.early_stop and state.step - tracker.best_step > max(6 * _LOOK, _PATIENCE * planned):
+        if method.early_stop and state.step - tracker.best_step > max(6 * _LOOK, _PATIENCE * (schedule.steps or 0)):
             break
     tracker.look(state, method.early_stop)
     report(now())
@@ -171,7 +174,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         "finish": sweeps, "tv_weight": tv_weight(settings, fine, state.limit),
         "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
-    checkpoint = arrays_of(last, backend) | tracker.arrays()
+    checkpoint = arrays_of(last, backend) | tracker.arrays() | schedule.arrays()
     return MethodResult(volume, record, tuple(history), model, checkpoint)
 
 

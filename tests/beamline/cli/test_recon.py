@@ -13,7 +13,7 @@ from beamline.cli.recon import repeated, report_beside
 from beamline.monitor.check import Level
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr
-from recon.splatting.r2 import DEFAULT_STEPS
+from recon.splatting.schedule import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import frames_of, write_flagged
 
@@ -95,7 +95,7 @@ def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
 
 
 def test_the_default_of_steps_is_told_as_it_is() -> None:
-    assert f"Default: {DEFAULT_STEPS}." in " ".join(beamline("recon", "--help").stdout.split())
+    assert f"Default: {DEFAULT_STEPS};" in " ".join(beamline("recon", "--help").stdout.split())
 
 
 def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:

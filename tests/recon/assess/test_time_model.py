@@ -14,7 +14,8 @@ from recon.assess.plans import CURVES
 from recon.assess.time_model import next_decibel, next_decibel_of_fit, parse_budget, parts_of
 from recon.bench import spheres
 from recon.reconstruction import reconstruct
-from recon.splatting.r2 import DEFAULT_STEPS, R2
+from recon.splatting.r2 import R2
+from recon.splatting.schedule import DEFAULT_STEPS
 
 
 @given(st.floats(0.6, 8), st.floats(0.5, 1e4), st.integers(0, 100))

@@ -1,0 +1,90 @@
+"""How many steps a fit takes: fewer where noise hides what more would gain, else as many as asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import recon
+from recon.base.kernel import Kernel
+from recon.splatting import optimise as fit
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS, Schedule, near_noise, residual_over_noise
+from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 8, endpoint=False), (8, 32))
+GRID = recon.Grid.matching(VIEWS)
+RNG = np.random.default_rng(0)
+BALLS = Gaussians.from_physical(
+    RNG.uniform((-6, -6, -3), (6, 6, 3), (40, 3)), np.full(40, 2.0), np.full(40, 0.05), density_unit=0.05
+)
+CLEAN = project(BALLS, VIEWS).numpy()
+NOISE = RNG.normal(size=CLEAN.shape).astype(np.float32)
+TINY = recon.R2(gaussians=40, fit=FitSettings(ssim_weight=0.0, tv_weight=0.0))
+
+
+def steps_of(noise: float, method: recon.R2 = TINY, **others: Any) -> int:
+    return int(recon.reconstruct(CLEAN + noise * NOISE, VIEWS, method, **others).settings["steps"])
+
+
+def test_noisy_views_are_worth_half_of_the_steps() -> None:
+    assert steps_of(0.3) == SHORT_STEPS
+    assert steps_of(0.001) == DEFAULT_STEPS
+
+
+def test_steps_that_are_asked_for_are_taken() -> None:
+    assert steps_of(0.3, replace(TINY, steps=260)) == 260
+    assert steps_of(0.3, replace(TINY, finish=0)) == DEFAULT_STEPS  # nothing makes up for them
+
+
+def test_a_shortened_fit_goes_on_from_its_rates_to_the_last_ones() -> None:
+    schedule = Schedule(DEFAULT_STEPS, by_content=True)
+    before = [schedule.fraction(step, 0.0) for step in range(101)]
+    problem = fit.problem_of(CLEAN + 0.3 * NOISE, VIEWS, GRID, 0.05, FitSettings())
+    state = fit.init(BALLS, 0)
+    state.step, state.residual = 100, 0.0
+    schedule.look(state, problem)
+    after = [schedule.fraction(step, 0.0) for step in range(100, SHORT_STEPS + 1)]
+    assert schedule.steps == SHORT_STEPS and after[0] == before[-1] and after[-1] == 1.0
+    assert (np.diff(before + after[1:]) > 0).all()
+    assert vars(Schedule.resumed(Schedule(DEFAULT_STEPS, by_content=True), schedule.arrays())) == vars(schedule)
+
+
+def test_a_fit_taken_up_again_is_shortened_as_the_one_that_was_not_left() -> None:
+    data, left = CLEAN + 0.3 * NOISE, []
+    for at in (60, 180):
+        seen: list[int] = []
+
+        def stop(at: int = at, seen: list[int] = seen) -> bool:
+            seen.append(1)
+            return len(seen) >= at
+
+        part = recon.reconstruct(data, VIEWS, TINY, control=recon.RunControl(stop))
+        assert part.settings["steps"] == at
+        left.append(recon.reconstruct(data, VIEWS, TINY, control=recon.RunControl(resume=part.checkpoint)))
+    whole = recon.reconstruct(data, VIEWS, TINY)
+    for resumed in left:
+        np.testing.assert_array_equal(resumed.volume.data, whole.volume.data)
+
+
+def test_the_residual_is_measured_in_the_noise_of_a_pixel() -> None:
+    """By numpy, for a model that explains the views but for their noise."""
+    problem = fit.problem_of(CLEAN + 0.02 * NOISE, VIEWS, GRID, 0.05, FitSettings(kernel=Kernel.GAUSSIAN))
+    state = fit.init(BALLS, 0)
+    state.residual = fit.misfit_of(state, problem, FitSettings())
+    off = 0.02 * NOISE / problem.scale
+    expected = np.sqrt(np.mean(off**2)) / problem.noise
+    assert residual_over_noise(state, problem) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(("views", "limit"), [(8, 1.5), (20, 1.5), (21, 2.3)])
+def test_with_many_views_the_finish_makes_up_for_more(views: int, limit: float) -> None:
+    many = recon.Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), (4, 32))
+    data = np.ones((views, 4, 32), np.float32)
+    assert near_noise(fit.problem_of(data, many, recon.Grid.matching(many), 1.0, FitSettings())) == limit
