@@ -27,8 +27,10 @@ def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) 
     return np.concatenate((projections, data)), together, list(range(geometry.n_views, together.n_views))
 
 
-def hold_out(prepared: PreparedProjections, share: int, *, most: int | None = None, advice: str) -> PreparedProjections:
-    """One of `share` views held out, evenly spread; unchanged where the selection already left some out.
+def hold_out(
+    prepared: PreparedProjections, one_in: int, *, most: int | None = None, advice: str
+) -> PreparedProjections:
+    """One of `one_in` views held out, evenly spread; unchanged where the selection already left some out.
 
     Args:
         most: number of views held out at most.
@@ -40,7 +42,7 @@ def hold_out(prepared: PreparedProjections, share: int, *, most: int | None = No
     if prepared.held_out is not None:
         return prepared
     n, geometry, projections = prepared.geometry.n_views, prepared.geometry, prepared.projections
-    count = max(1, n // share)
+    count = max(1, n // one_in)
     count = count if most is None else min(count, most)
     if n - count < 2:
         raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")

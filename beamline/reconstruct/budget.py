@@ -15,7 +15,7 @@ from beamline.projections.correction import Warn
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
 from recon.assess.plans import Choice, Speeds, plans
-from recon.assess.time_model import parts_of
+from recon.assess.time_model import duration_text
 from recon.auto import ROWS, part_of, predicts_best
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
@@ -85,7 +85,7 @@ class Budgeted:
     def summary(self, budget: float) -> str:
         """The choice and why, in a line."""
         why = f"; {self.because}" if self.because else ""
-        return f"{_named(self.choice, self.result)}: {parts_of(self.seconds)} of {parts_of(budget)}{why}"
+        return f"{_named(self.choice, self.result)}: {duration_text(self.seconds)} of {duration_text(budget)}{why}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +155,8 @@ def within(
     late = spent + choice.seconds - budget
     if late > 0 and math.isfinite(late) and not math.isfinite(choice.gain):
         warn(
-            f"{parts_of(budget)} are too few for this scan: measuring this machine took {parts_of(spent)}, and "
-            f"the cheapest choice, {_named(choice)}, will be about {parts_of(late)} late."
+            f"{duration_text(budget)} are too few for this scan: measuring this machine took {duration_text(spent)}, "
+            f"and the cheapest choice, {_named(choice)}, will be about {duration_text(late)} late."
         )
     if len(found) > 1:
         choice, because = _chosen(plan, found, prepared, seed, control)
@@ -253,7 +253,7 @@ def _named(choice: Choice, result: Reconstruction | None = None) -> str:
     text = choice.method
     if result is not None and result.history:
         text += f", {result.history[-1].step} {choice.counted}"
-    if result is not None and choice.fits:
+    if result is not None and choice.is_gaussian_fit:
         text += f" from {result.settings['gaussians_at_start']} Gaussians"
     return text + (f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else "")
 

@@ -31,7 +31,7 @@ from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
-_HELD_OUT_SHARE = 10  # one of so many views is held out for --early-stop
+_HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
 
 def reconstruct_file(
@@ -64,7 +64,7 @@ def reconstruct_file(
         prepared = prepare_projections(source, options.selection, warn)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
-        prepared = hold_out(prepared, _HELD_OUT_SHARE, advice="leave out --early-stop")
+        prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))

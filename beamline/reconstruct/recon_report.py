@@ -23,7 +23,7 @@ from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.writers.recon_file import Value
 from drivers.frame import FrameKind
-from recon.assess.time_model import NextDecibel, next_decibel, next_decibel_of_fit, parts_of
+from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
 from recon.base.volume import Volume
 from recon.methods import BASELINE, by_name
@@ -103,12 +103,12 @@ class ReconOutcome:
         if not found.measurable:
             of_what = "reach of what was measured" if by_others else f"the residual of {judged.views}"
             return f"none {'in' if by_others else 'measurable in'} {of_what}"
-        high = f"to {parts_of(found.high)}" if math.isfinite(found.high) else "or far more"
-        span = f"{parts_of(found.low)} {high}"
+        high = f"to {duration_text(found.high)}" if math.isfinite(found.high) else "or far more"
+        span = f"{duration_text(found.low)} {high}"
         source = "as longer fits gained on four other scans"
         if not by_others:
             source = f"from the residual of {judged.views} as it fell"
-        return f"about {parts_of(found.seconds)} more ({span}), {source}"
+        return f"about {duration_text(found.seconds)} more ({span}), {source}"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from beamline.report.record import residual_curve
-from recon.assess.time_model import NextDecibel, parts_of, record
+from recon.assess.time_model import NextDecibel, duration_text, record
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
@@ -228,7 +228,7 @@ def _decibels(
     if not further.measurable:
         axes.text(0.97, 0.05, "next dB: none measurable", ha="right", fontsize=8, transform=axes.transAxes)
         return
-    note = f"next dB of the {further.of}: about {parts_of(further.seconds)} more"
+    note = f"next dB of the {further.of}: about {duration_text(further.seconds)} more"
     axes.text(0.97, 0.05, note, ha="right", fontsize=8, transform=axes.transAxes)
     if further.of == "volume":
         return  # this curve is the residual, not the quality of the volume

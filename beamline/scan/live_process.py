@@ -77,7 +77,13 @@ def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
         axis = config.optics.axis_col
 
     def command(scan: Path, output: Path) -> Sequence[str]:
-        options: dict[str, object] = {"--axis": axis, "--seconds": recon.seconds, "--seed": recon.seed, "-o": output}
+        options: dict[str, object] = {
+            "--method": recon.method,
+            "--axis": axis,
+            "--seconds": recon.seconds,
+            "--seed": recon.seed,
+            "-o": output,
+        }
         if plan.binning > 1:
             options["--bin"] = plan.binning
         if plan.every > 1:

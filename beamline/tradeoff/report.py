@@ -21,7 +21,7 @@ from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
 from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
 from beamline.tradeoff.trials import Outcome
-from recon.assess.time_model import parts_of
+from recon.assess.time_model import duration_text
 from recon.base.method import PRECISION
 
 _FIELDS = ("group", "method", "views", "binning")
@@ -82,11 +82,11 @@ def _time(seconds: float) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """A time to three significant digits, in µs, ms, or the units of `parts_of`."""
+    """A time to three significant digits, in µs, ms, or the units of `duration_text`."""
     for unit, name in ((1e-3, "µs"), (1.0, "ms")):
         if 0 < seconds < unit:
             return f"{seconds / unit * 1e3:.3g} {name}"
-    return parts_of(seconds)
+    return duration_text(seconds)
 
 
 def conclusions(table: TrialTable) -> list[str]:

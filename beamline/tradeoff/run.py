@@ -29,7 +29,7 @@ from recon.base.method import Depth
 from recon.base.volume import Grid
 from recon.splatting.initialise import default_count
 
-_HELD_OUT_SHARE = 8  # one of so many views is held out if there is no truth
+_HELD_OUT_ONE_IN = 8  # one of so many views is held out if there is no truth
 _HELD_OUT_VIEWS = 16  # at most
 
 
@@ -133,7 +133,7 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
         ConfigError: too few views to hold some out.
     """
     if truth is None:
-        prepared = hold_out(prepared, _HELD_OUT_SHARE, most=_HELD_OUT_VIEWS, advice="give --truth")
+        prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     return Data(prepared.projections.data, prepared.geometry, prepared.held_out, truth)
 
 

@@ -139,8 +139,7 @@ class Choice:
     seconds: float
 
     @property
-    def fits(self) -> bool:
-        """The choice is a fit of Gaussians."""
+    def is_gaussian_fit(self) -> bool:
         return self.share > 0
 
     def settings(self, default_count: int) -> dict[str, int]:
@@ -150,7 +149,7 @@ class Choice:
             default_count: of Gaussians, for the unbinned volume.
         """
         found = {self.counted: self.steps} if self.counted else {}
-        return found | ({"gaussians": max(1, round(self.share * default_count))} if self.fits else {})
+        return found | ({"gaussians": max(1, round(self.share * default_count))} if self.is_gaussian_fit else {})
 
 
 def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collection[str] | None = None) -> list[Choice]:

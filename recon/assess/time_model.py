@@ -129,7 +129,7 @@ def parse_budget(text: str) -> float:
     return seconds
 
 
-def parts_of(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """A time as text: s, min or h."""
     if seconds < 100:
         return f"{seconds:.3g} s"

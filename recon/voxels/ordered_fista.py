@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.kernels.cpu.vectors import combine, misfit
+from recon.kernels.cpu.vectors import combine, replace_by_residual
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import interleaved, whitened
@@ -57,14 +57,14 @@ def ordered_fista(
         for at, s in enumerate(problem.rng.permutation(count)):
             part = problem.of_views(parts[s]) if count > 1 else problem
             mu = weight.value if isinstance(weight, NoiseBalance) else weight
-            model = projectors[s].forward_lines(x)
-            error += misfit(part.data, model, part.weight)
+            residual = projectors[s].forward_lines(x)
+            error += replace_by_residual(part.data, residual, part.weight)
             if isinstance(weight, NoiseBalance):
-                some = slice(None, None, max(1, count * len(model) // _LOOKED_AT))
-                seen.append(whitened(model[some].copy(), None if part.weight is None else part.weight[some]))
+                some = slice(None, None, max(1, count * len(residual) // _LOOKED_AT))
+                seen.append(whitened(residual[some].copy(), None if part.weight is None else part.weight[some]))
             if part.weight is not None:
-                model *= part.weight
-            projectors[s].adjoint_lines(model, gradient)
+                residual *= part.weight
+            projectors[s].adjoint_lines(residual, gradient)
             combine(1.0, x, step, gradient, x)
             prox(x, mu * step / count)
             if at + 1 < count:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.kernels.cpu.vectors import add_product, misfit
+from recon.kernels.cpu.vectors import add_product, replace_by_residual
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -74,11 +74,11 @@ class Sweeps:
         total, seen = 0.0, []
         for index in order:
             part, data, weight, scale = self._parts[index]
-            model = part.forward_lines(x)
+            residual = part.forward_lines(x)  # the model, until the data are subtracted
             some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
-            seen.append(whitened(data[some] - model[some], None if weight is None else weight[some]))
-            total += misfit(data, model, weight, scale)
-            part.adjoint_lines(model, self._gradient)
+            seen.append(whitened(data[some] - residual[some], None if weight is None else weight[some]))
+            total += replace_by_residual(data, residual, weight, scale)
+            part.adjoint_lines(residual, self._gradient)
             add_product(x, relaxation, self._step, self._gradient, nonnegative)
         self.residual = np.concatenate(seen)
         return total

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.method import TrialSettings
-from recon.kernels.cpu.vectors import combine, dot, misfit
+from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.fbp import Filter
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import Sweeps
@@ -43,7 +43,7 @@ class VoxelProblem:
     @property
     def scale(self) -> float:
         """||p||, rays weighed."""
-        return math.sqrt(misfit(self.data, np.zeros_like(self.data), self.weight))
+        return math.sqrt(replace_by_residual(self.data, np.zeros_like(self.data), self.weight))
 
     def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
         """Data and weights of some views; the projector stays that of all views."""

@@ -61,7 +61,7 @@ def add_product(x: F32, factor: float, a: F32, b: F32, nonnegative: bool) -> Non
 
 
 @njit(**OPTIONS)
-def _misfit(data: F32, model: F32, weight: F32, scale: F32, sums: NDArray[np.float64]) -> None:
+def _replace_by_residual(data: F32, model: F32, weight: F32, scale: F32, sums: NDArray[np.float64]) -> None:
     parts = sums.size
     for part in prange(parts):
         total = np.float64(0)
@@ -77,10 +77,10 @@ def _misfit(data: F32, model: F32, weight: F32, scale: F32, sums: NDArray[np.flo
         sums[part] = total
 
 
-def misfit(data: F32, model: F32, weight: F32 | None = None, scale: F32 | None = None) -> float:
+def replace_by_residual(data: F32, model: F32, weight: F32 | None = None, scale: F32 | None = None) -> float:
     """Replace `model` by scale (data - model); returns Σ weight (data - model)². None: all 1."""
     empty = np.empty(0, np.float32)
     sums = np.empty(get_num_threads())
     weights, scales = (empty if array is None else array.reshape(-1) for array in (weight, scale))
-    _misfit(data.reshape(-1), model.reshape(-1), weights, scales, sums)
+    _replace_by_residual(data.reshape(-1), model.reshape(-1), weights, scales, sums)
     return float(sums.sum())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
 from recon.kernels.cpu import tv as tv_cpu
-from recon.kernels.cpu.vectors import combine, dot, misfit
+from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import difference_weights
@@ -67,7 +67,7 @@ class AsdPocs:
             combine(1.0, x, -1.0, before, before)
             swept = math.sqrt(dot(before, before))
             model = projector.forward_lines(x)
-            error = math.sqrt(misfit(problem.data, model, problem.weight)) / scale
+            error = math.sqrt(replace_by_residual(problem.data, model, problem.weight)) / scale
             if k == 0:
                 step = self.alpha * swept
             if not problem.go_on(k + 1, error) or k + 1 == self.iterations:
@@ -102,4 +102,4 @@ def _baseline(problem: VoxelProblem) -> float:
         nz, ny, nx = projector.grid.shape
         volume = np.zeros((ny, nx, nz), np.float32)
         problem.sweeps(interleaved(projector, 9)).run(volume, 1.0, problem.nonnegative, None)
-    return math.sqrt(misfit(problem.data, projector.forward_lines(volume), problem.weight)) / problem.scale
+    return math.sqrt(replace_by_residual(problem.data, projector.forward_lines(volume), problem.weight)) / problem.scale

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
-from recon.kernels.cpu.vectors import combine, dot, misfit
+from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, iteration_trials
@@ -42,7 +42,7 @@ class Cgls:
         projector = problem.projector
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)
-        misfit(problem.data, residual, None, root)
+        replace_by_residual(problem.data, residual, None, root)
         s = _weighed_adjoint(projector, residual, root)
         direction = s.copy()
         gamma, scale = dot(s, s), problem.scale

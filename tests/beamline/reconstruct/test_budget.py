@@ -82,7 +82,7 @@ def test_the_time_is_used_and_not_exceeded(
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr(module, "finish_within", lambda *_: (0, 0.0))  # its seconds are not ticks
     done = _spend(prepared, budget, Ticking(0.01))
-    assert done.choice.fits
+    assert done.choice.is_gaussian_fit
     assert 0.9 * budget < done.seconds <= budget
     assert done.result.volume.grid == Grid.matching(prepared.geometry)
     assert f"of {budget:.3g} s" in done.summary(budget)
@@ -103,7 +103,7 @@ def test_a_slow_machine_takes_fbp_of_joined_pixels(
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     done = _spend(prepared, 5.0, Ticking(0.01))
-    assert not done.choice.fits and done.choice.binning == 2
+    assert not done.choice.is_gaussian_fit and done.choice.binning == 2
     assert done.result.volume.grid.shape == (3, 20, 20)
     assert "pixels joined 2 x 2" in done.summary(5.0) and done.summary(5.0).startswith("fbp")
 
@@ -121,7 +121,7 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
     warned: list[str] = []
     done = _spend(prepared, 5.0, clock, warned)
     joined_pixels = done.choice.binning
-    assert not done.choice.fits and joined_pixels >= 4  # about as many as six rows allow
+    assert not done.choice.is_gaussian_fit and joined_pixels >= 4  # about as many as six rows allow
     assert done.seconds > 7 and f"of {5.0:.3g} s" in done.summary(5.0)
     assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
     late = 7.01 + 432 / joined_pixels**3 - 5
@@ -242,7 +242,7 @@ def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections)
     cone = _cone(prepared, 2 * np.pi)
     done = _spend(cone, 8.0, Ticking(0.01))
     grid = Grid.matching(cone.geometry)
-    assert done.choice.fits and done.result.volume.grid == grid
+    assert done.choice.is_gaussian_fit and done.result.volume.grid == grid
     truth = SCAN.truth(grid)
     direct = psnr(truth, recon.reconstruct(cone.projections.data, cone.geometry, "fbp", grid=grid).volume.data)
     assert psnr(truth, done.result.volume.data) > direct + 1
@@ -273,7 +273,7 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
     """A cone's short scan, and views that lean, are for neither FBP nor FDK."""
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     done = _spend(_cone(prepared, turn, tilt=tilt), 5.0, Ticking(0.01))
-    assert done.choice.fits and done.result.method == "r2" and done.choice.binning == 4
+    assert done.choice.is_gaussian_fit and done.result.method == "r2" and done.choice.binning == 4
     assert done.result.history[-1].step > 0 and 0 < done.result.settings["gaussians_at_start"] < 100
     assert done.result.volume.data.max() > 0
 
@@ -340,7 +340,7 @@ def test_a_real_budget_on_a_real_clock(prepared: PreparedProjections) -> None:
     begin = time.perf_counter()
     done = within(4.0, prepared, [R2()], 0, RunControl(now=time.perf_counter), lambda w: None)
     took = time.perf_counter() - begin
-    assert done.choice.fits
+    assert done.choice.is_gaussian_fit
     assert 3.0 < took < 4.4
     assert done.seconds == pytest.approx(took, abs=0.2)
     assert done.result.history[-1].residual < 0.2

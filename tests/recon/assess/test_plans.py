@@ -30,7 +30,7 @@ def _cost(choice: Choice, speeds: Speeds) -> float:
     voxels = choice.binning**3
     if choice.method == "fbp":
         return speeds.fbp / voxels
-    if not choice.fits:
+    if not choice.is_gaussian_fit:
         return (speeds.fbp + speeds.sweep * (curve.sweeps + curve.pace * choice.steps)) / voxels
     finish = 0 if speeds.sweep == math.inf else curve.sweeps * speeds.sweep / voxels
     placed = (speeds.start + speeds.fill) * choice.share
@@ -82,7 +82,7 @@ def test_a_choice_is_settings_of_its_method() -> None:
     for choice in plans(60.0, speeds, 1000):
         method = build(by_name(choice.method), choice.settings(1000))
         assert not choice.counted or getattr(method, choice.counted) == choice.steps
-        assert not choice.fits or method.gaussians == round(1000 * choice.share)  # type: ignore[attr-defined]
+        assert not choice.is_gaussian_fit or method.gaussians == round(1000 * choice.share)  # type: ignore[attr-defined]
 
 
 def test_the_curves_are_curves() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES
-from recon.assess.time_model import next_decibel, next_decibel_of_fit, parse_budget, parts_of
+from recon.assess.time_model import duration_text, next_decibel, next_decibel_of_fit, parse_budget
 from recon.bench import spheres
 from recon.reconstruction import reconstruct
 from recon.splatting.r2 import R2
@@ -93,4 +93,4 @@ def test_what_is_no_time(text: str) -> None:
 
 
 def test_times_are_said_in_units_that_fit() -> None:
-    assert [parts_of(t) for t in (0.25, 31.4, 150, 7200)] == ["0.25 s", "31.4 s", "2.5 min", "2 h"]
+    assert [duration_text(t) for t in (0.25, 31.4, 150, 7200)] == ["0.25 s", "31.4 s", "2.5 min", "2 h"]

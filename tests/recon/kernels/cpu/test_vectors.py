@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.kernels.cpu.vectors import add_product, combine, dot, misfit
+from recon.kernels.cpu.vectors import add_product, combine, dot, replace_by_residual
 
 
 @pytest.mark.parametrize("n", [1, 5, 100_001])
@@ -20,7 +20,7 @@ def test_they_are_what_numpy_gives(n: int, rng: np.random.Generator) -> None:
     add_product(x, 0.7, a, w, nonnegative=True)
     np.testing.assert_allclose(x, np.maximum(wide[1] + 0.7 * wide[0] * wide[2], 0), atol=2e-6)
     model = b.copy()
-    total = misfit(a, model, np.abs(w), w)
+    total = replace_by_residual(a, model, np.abs(w), w)
     np.testing.assert_allclose(model, wide[2] * (wide[0] - wide[1]), atol=2e-6)
     assert total == pytest.approx(float((np.abs(wide[2]) * (wide[0] - wide[1]) ** 2).sum()), rel=1e-6)
 
