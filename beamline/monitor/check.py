@@ -78,6 +78,8 @@ class ScanContext:
         pixels: of a frame.
         period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
         pass_starts: triggers at which a new pass of a fly scan begins, after any pause.
+        cone: the beam is one; else it is parallel.
+        axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
@@ -93,6 +95,8 @@ class ScanContext:
     pixels: int
     period: float | None = None
     pass_starts: frozenset[int] = frozenset({0})
+    cone: bool = False
+    axis_col: float | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan

@@ -33,6 +33,7 @@ REGISTRY = {  # module in this folder: class of the check
     "field": "FieldOfView",
     "blur": "Blur",
     "zingers": "Zingers",
+    "opposite": "Opposite",
 }
 
 

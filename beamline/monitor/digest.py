@@ -57,6 +57,11 @@ def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
     return -(-shape[0] // preview_bin), -(-shape[1] // preview_bin)
 
 
+def block_side(shape: tuple[int, ...], preview: tuple[int, ...]) -> int:
+    """Pixels a side of the blocks of a preview of a frame of `shape`, which may be lower or narrower than a block."""
+    return max(round(n / blocks) for n, blocks in zip(shape, preview, strict=True))
+
+
 def digest(
     image: NDArray[Any], saturation: float | None = None, preview_bin: int = 4, no_data: float | None = None
 ) -> FrameDigest:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest, block_side
 from drivers.frame import Frame, FrameKind
 
 NOISES = 4.0  # times what a block's largest pixel usually is above its mean: 8 to 10 standard deviations of a pixel
@@ -49,7 +49,7 @@ def spots_of(
         return NO_SPOTS
     places = np.empty((MOST, 2), np.int64)
     n = _isolated(digest.peaks, digest.preview, before.peaks, np.float32(base), np.float32(NOISES * usual), places)
-    size = round((frame.counts.size / digest.preview.size) ** 0.5)
+    size = block_side(frame.counts.shape, digest.preview.shape)
     saturated = 0
     for row, col in places[: min(n, MOST)]:
         if digest.peaks[row, col] >= saturation:

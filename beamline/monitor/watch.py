@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beamline.monitor.change import SPAN, change_of
 from beamline.monitor.check import Check, Flag, ScanContext
 from beamline.monitor.checks import CHECKS
-from beamline.monitor.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.preview import more_light
 from beamline.monitor.spots import spots_of
 from beamline.monitor.view import View, grid_of, light_left, view_of
@@ -79,7 +79,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
         return replace(monitor, context=context)
     grid = context.grid
     if grid is None:
-        block = round(math.sqrt(frame.counts.size / digest.preview.size))
+        block = block_side(frame.counts.shape, digest.preview.shape)
         grid = grid_of(digest.preview.shape, block, context.dark, context.flat)
     longer = more_light(context, frame.exposure) if grid.flats else 1.0
     view = view_of(digest.preview, grid, frame.index, frame.angle, longer)

@@ -145,7 +145,9 @@ def context_of(source: ScanSource) -> ScanContext:
         if angles.size > 2:
             steps = np.diff(angles)
             starts = frozenset([0, *(np.flatnonzero(steps * np.median(steps) < 0) + 1).tolist()])
-    context = ScanContext(_saturation(source), rows * cols, period, starts)
+    context = ScanContext(
+        _saturation(source), rows * cols, period, starts, cone=source.cone is not None, axis_col=source.axis_col
+    )
     if source.quantity != "line_integrals":
         return context
     preview = digest(np.zeros(source.shape, np.uint16), preview_bin=PREVIEW_BIN).preview

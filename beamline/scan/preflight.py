@@ -187,15 +187,16 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
     )
     refuse_violations(timeline)
     timeline = with_remarks(timeline, config, timing.shape)
-    monitor = start_monitor(_context(plan, timeline, timing), configured_checks(config.monitor))
+    info = _info(config, instrument, plan, timeline)
+    monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
     digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, preview_bin)
     if instrument.simulated is not None:
         instrument.simulated.rehearse()
-    return ReadyScan(plan, timeline, settings, timing, monitor, _info(config, instrument, plan, timeline))
+    return ReadyScan(plan, timeline, settings, timing, monitor, info)
 
 
-def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> ScanContext:
+def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: ScanInfo) -> ScanContext:
     views = timeline.views
     starts = np.cumsum([0, *(train.n for train in views.trains)])[:-1]
     return ScanContext(
@@ -203,6 +204,8 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming) -> ScanCo
         pixels=math.prod(timing.shape),
         period=views.period if plan.mode is Mode.FLY else None,
         pass_starts=frozenset(starts.tolist()),
+        cone=info.source_distance_mm is not None,
+        axis_col=info.axis_col,
     )
 
 

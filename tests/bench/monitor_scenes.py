@@ -351,7 +351,7 @@ def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:
     return replace(base, chain=Chain(tuple(effects)))
 
 
-def seen(scene: Scene, seed: int, preview_bin: int = BIN, views: range | None = None) -> Iterator[Seen]:
+def seen(scene: Scene, seed: int, preview_bin: int = BIN, views: Sequence[int] | None = None) -> Iterator[Seen]:
     """The frames of a scan of the scene, or of some of its `views` after the darks and flats."""
     row, scan = 0, Scan.of(scene, seed)
     for planned in scan:
@@ -360,7 +360,7 @@ def seen(scene: Scene, seed: int, preview_bin: int = BIN, views: range | None = 
             continue
         counts = expose(scene, shot)
         angle = shot.angle if projection else math.nan
-        trigger = shot.view - (views.start if views else 0) if projection else row
+        trigger = shot.view - (views[0] if views else 0) if projection else row
         frame = Frame(counts, planned.kind, row, trigger, row, angle, shot.time, shot.exposure)
         row += 1
         yield Seen(frame, digest(counts, SATURATION, preview_bin), scene.chain.labels(shot))

@@ -17,11 +17,13 @@ import pytest
 from beamline.monitor import watch
 from beamline.monitor.check import Flag, Level, ScanContext
 from drivers.frame import FrameKind
+from simulators.effects.jump import Jump
 from simulators.scenes.scene import Scene
 from simulators.scenes.shots import Scan
 from tests.bench.monitor_scenes import (
     CLEAN,
     COLS,
+    PITCH,
     ROWS,
     SATURATION,
     Make,
@@ -101,7 +103,7 @@ class Event:
 _base = cache(base_scene)
 
 
-def _flags(scene: Scene, seed: int, views: range | None = None) -> tuple[int, tuple[Flag, ...]]:
+def _flags(scene: Scene, seed: int, views: Sequence[int] | None = None) -> tuple[int, tuple[Flag, ...]]:
     """Frames that were played, and warnings and alarms."""
     monitor, flags, n = watch.start(ScanContext(SATURATION, ROWS * COLS, 0.1)), list[Flag](), 0
     for frame in seen(scene, seed, views=views):
@@ -146,6 +148,25 @@ def test_recall_and_latency(name: str, capsys: pytest.CaptureFixture[str]) -> No
     with capsys.disabled():
         recall, others = len(late) / EVENTS, _others(check, events)
         print(f"\n| {name} | {check} | {recall:.2f} | {middle} | {most} | {others} | {dict(early) or '-'} |")
+
+
+@pytest.mark.bench
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("pixels", [0.0, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize("name", ["battery", "sparse", "faces", "interior", "starved"])
+def test_a_sample_that_sank_against_its_view_from_the_other_side(
+    name: str, pixels: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, most, n = 0, 0.0, 4
+    for number in range(n):
+        base = _base(name, UNSEEN + number)
+        views = sum(planned.kind is FrameKind.PROJECTION for planned in Scan.of(base, 0))
+        scene = with_anomalies(base, [Jump(views // 2, (0.0, 0.0, pixels * PITCH))] if pixels else [])
+        _, flags = _flags(scene, 7000 + number, [*range(8), *range(views - 8, views)])
+        scores = [flag.score for flag in flags if flag.check == "opposite"]
+        found, most = found + bool(scores), max([most, *scores])
+    with capsys.disabled():
+        print(f"\n| {name}, down by {pixels:g} px | opposite | {found} of {n} | {most:.2f} px |")
 
 
 @pytest.mark.bench

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +68,9 @@ class Blobs:
         mean = float(preview.mean())
         return frame, FrameDigest(0.0, 65535.0, mean, 1.0, mean, 0.0, 0.0, 1.0, row, preview, preview)
 
-    def flags(self, checks: Sequence[Check] = CHECKS) -> list[Flag]:
-        monitor = watch.start(ScanContext(65535, ROWS * COLS * BLOCK**2, 0.1), checks)
+    def flags(self, checks: Sequence[Check] = CHECKS, **known: Any) -> list[Flag]:
+        """`known`: what else the checks know of the scan, see ScanContext."""
+        monitor = watch.start(ScanContext(65535, ROWS * COLS * BLOCK**2, 0.1, **known), checks)
         found: list[Flag] = []
         for frame, digest in self.frames():
             monitor, flags = watch.look(monitor, frame, digest)

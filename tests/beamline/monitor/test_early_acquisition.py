@@ -37,6 +37,7 @@ def found() -> tuple[list[Flag], dict[str, list[int]]]:
         ("ghost 0", "ghost", 10),
         ("lost_beam 0", "lost", 0),
         ("jump 0", "motion", 0),
+        ("jump 0", "opposite", 99),  # the last view against the first
         ("black_band 0", "field", 0),  # from the first flat on
         ("narrow_field 0", "field", 0),
     ],
@@ -52,7 +53,7 @@ def test_each_fault_is_found_by_its_own_check(
 
 def test_nothing_else_is_flagged_but_a_few_hot_pixels(found: tuple[list[Flag], dict[str, list[int]]]) -> None:
     flags, labels = found
-    assert {flag.check for flag in flags} <= {"floater", "ghost", "lost", "motion", "field", "saturation"}
+    assert {flag.check for flag in flags} <= {"floater", "ghost", "lost", "motion", "field", "opposite"}
     lost = {flag.view for flag in flags if flag.check == "lost"}
     assert lost == set(labels["lost_beam 0"])
     crumbs = set(labels["floaters 0"] + labels["floaters 1"])

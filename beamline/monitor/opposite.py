@@ -1,0 +1,244 @@
+"""Opposite: does the view from the other side, or the same view taken again, show the same sample in the same place?
+
+Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
+degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. Where it fits best gives the axis,
+and a shift since; what is left is stated as the shift of the whole sample that would leave as much.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import gaussian_filter
+from scipy.ndimage import shift as shifted
+
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.view import Cells, Grid, View
+from drivers.frame import Frame
+
+EVERY = math.radians(5)  # between the views that are kept
+MOST = 36  # of them: half a turn
+BESIDE = 1.25  # steps that a view may be beside the angle that is looked for
+REACH = 2.0  # cells that the rim may move within these: the kept view goes on by its velocity
+LATER = 8  # views after the kept one at least
+CELLS = (0.05, 0.5, 0.25)  # of a cell, which the limits of a shift, of a remainder and of the axis are at least
+SIGMAS = 8.0  # of the noise, which a shift must have
+FEWEST = 16  # columns that can be laid on others
+TURNS = 6  # rounds of the fit
+SEARCH = 0.4  # of the field: how far the axis may be from its middle, twice
+NOISY = 2.0  # times the noise that a remainder must have
+SMOOTH = 1.0  # cells: standard deviation by which both are smoothed, so that fractions of a cell shift sharp edges well
+SMOOTHER = 1 / (4 * math.pi * SMOOTH**2)  # variance of the noise after that over before
+LEAST_OVERLAP = 0.3  # of the columns
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """A view for later.
+
+    Attributes:
+        view: itself.
+        after: the next one, which gives the velocity.
+        turned, again: it was compared with the view from the other side, and with the one taken again.
+    """
+
+    view: View
+    after: View | None = None
+    turned: bool = False
+    again: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A view laid on another: its shift across and down, which noise makes uncertain by `sigma`, and the remainder as
+    a shift; all in pixels."""
+
+    across: float
+    down: float
+    remainder: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class OppositeState:
+    """What it remembers: views, the axis in columns of pixels as the first pair gives it, and that it stands aside."""
+
+    kept: tuple[Kept, ...] = ()
+    axis: float | None = None
+    aside: bool = False
+
+
+@dataclass(frozen=True)
+class Opposite:
+    """Score: pixels by which the sample moved, or by which all of it would have to move to change the view as much.
+
+    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution; where it is more, a
+    twentieth of a cell, up to which a shift is known. Flat faces and coarse steps leave a remainder of 0.3 cells.
+    """
+
+    name: ClassVar[str] = "opposite"
+    bit: ClassVar[int] = 15
+    unit: ClassVar[str] = "pixels"
+    meaning: ClassVar[str] = (
+        "the view from the other side, or the same view before, shows the sample elsewhere or changed"
+    )
+    policy: ClassVar[Policy] = Policy.LOG
+
+    warn: Annotated[float, Field(ge=0, description="pixels by which the sample may have moved or changed")] = 0.5
+    changed: Annotated[float, Field(ge=0, description="pixels, as a shift of all, by which parts may differ")] = 1.0
+    axis: Annotated[float, Field(ge=0, description="pixels between the axis and its stated place that are said")] = 1.0
+
+    def start(self) -> OppositeState:
+        return OppositeState()
+
+    def look(
+        self, state: OppositeState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> Look[OppositeState]:
+        view, grid = context.view, context.grid
+        if view is None or grid is None or state.aside or not math.isfinite(view.angle):
+            return Look(state)
+        if context.cone or not grid.flats:
+            why = "the beam is a cone" if context.cone else "there are no flats"
+            advice = f"Views from opposite sides are not compared: {why}, and they differ anyway."
+            return Look(replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice))
+        kept = state.kept
+        if kept and kept[-1].after is None:
+            kept = (*kept[:-1], replace(kept[-1], after=view))
+        elif len(kept) < MOST and all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept):
+            kept = (*kept, Kept(view))
+        state = replace(state, kept=kept)
+        for at, one in enumerate(kept):
+            turn = _folded(view.angle - one.view.angle)
+            if one.after is None or view.index - one.view.index < LATER:
+                continue
+            step = one.after.angle - one.view.angle
+            beside = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1]))
+            other = math.copysign(math.pi, turn)
+            if not one.turned and abs(turn - other) <= beside:
+                state = replace(state, kept=(*kept[:at], replace(one, turned=True), *kept[at + 1 :]))
+                return self._mirrored(state, one, (turn - other) / step, view, context)
+            if not one.again and abs(turn) <= beside:
+                state = replace(state, kept=(*kept[:at], replace(one, again=True), *kept[at + 1 :]))
+                fit = lay_on(one, turn / step, view, grid, mirrored=False)
+                if fit is None:
+                    return Look(state)
+                return Look(state, self._moved(fit, view.index, f"the view of row {one.view.index}, taken again", grid))
+        return Look(state)
+
+    def _mirrored(
+        self, state: OppositeState, one: Kept, steps: float, view: View, context: ScanContext
+    ) -> Look[OppositeState]:
+        assert context.grid is not None
+        fit = lay_on(one, steps, view, context.grid, mirrored=True)
+        if fit is None:
+            return Look(state)
+        cell, cols = context.grid.cell, context.grid.shape[1]
+        axis = (cols * cell - 1 + fit.across) / 2
+        first = state.axis is None
+        usual = axis if state.axis is None else state.axis
+        moved = replace(fit, across=2 * (axis - usual))
+        flag = self._moved(moved, view.index, f"the view of row {one.view.index}, from the other side", context.grid)
+        state = replace(state, axis=usual)
+        stated = context.axis_col
+        if flag is not None or not first or stated is None or abs(axis - stated) <= max(self.axis, CELLS[2] * cell):
+            return Look(state, flag)
+        advice = (
+            f"By the views of rows {one.view.index} and {view.index}, from opposite sides, the axis is at column "
+            f"{axis:.1f}; the scan states {stated:.1f}. The axis is elsewhere, or the sample moved by twice as much."
+        )
+        return Look(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
+
+    def _moved(self, fit: Fit, row: int, other: str, grid: Grid) -> Flag | None:
+        moved = math.hypot(fit.across, fit.down)
+        limits = max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma), max(self.changed, CELLS[1] * grid.cell)
+        if moved <= limits[0] and fit.remainder <= limits[1]:
+            return None
+        score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])
+        change = (
+            f"the sample is {fit.across:+.1f} px across and {fit.down:+.1f} px down"
+            if moved > limits[0]
+            else f"parts of it differ as if all had moved by {fit.remainder:.1f} px: it shrank, bent or lost something"
+        )
+        advice = f"Against {other}, {change}. Look at both; reconstruct views before and after the change apart."
+        return Flag(self.name, Level.WARN, row, score, limit, advice)
+
+
+def _folded(angle: float) -> float:
+    """Between -pi and pi."""
+    return math.remainder(angle, 2 * math.pi)
+
+
+def lay_on(one: Kept, steps: float, view: View, grid: Grid, *, mirrored: bool) -> Fit | None:
+    """Where the kept view, so many steps later, fits the view best; None where it has nothing that tells.
+
+    Least squares over light, shift across and shift down, from the best whole number of cells on.
+    """
+    assert one.after is not None
+    first, last = grid.left, grid.right + 1
+    expected = one.view.depth + np.float32(steps) * (one.after.depth - one.view.depth)
+    if last - first < FEWEST:
+        return None
+    noise = _noise(view.depth[:, first:last], view.weight[:, first:last]) ** 2 * SMOOTHER
+    now, before = (gaussian_filter(depth[:, first:last].astype(np.float64), SMOOTH) for depth in (view.depth, expected))
+    if mirrored:
+        before = before[:, ::-1]
+    weight = np.minimum(view.weight[:, first:last], np.exp(-before)).astype(np.float64)
+    across, down, gain = float(_nearest(before, now)), 0.0, 0.0
+    cols = now.shape[1]
+    for _ in range(TURNS):
+        fitted = shifted(before, (down, across), order=3, mode="nearest")
+        cut = math.ceil(abs(across)) + 1
+        inside = np.s_[:, max(1, cut if across > 0 else 1) : cols - max(1, cut if across < 0 else 1)]
+        rows, columns = np.gradient(fitted) if len(now) > 1 else (np.zeros_like(fitted), np.gradient(fitted, axis=1))
+        basis = np.stack([np.ones_like(fitted), -columns, -rows])[:, *inside].reshape(3, -1)
+        if basis.shape[1] < LEAST_OVERLAP * now.size:
+            return None
+        w = weight[inside].ravel()
+        left = (now - fitted)[inside].ravel()
+        normal = (basis * w) @ basis.T
+        told = np.diag(normal)[1:] > NOISY * noise * len(w)  # a sample that is alike in all rows tells no shift down
+        if not told[0]:
+            return None
+        if not told[1]:
+            basis[2], normal[2], normal[:, 2] = 0.0, 0.0, 0.0
+        normal += np.diag(1e-9 * np.diag(normal) + 1e-12)
+        gain, more_across, more_down = (float(x) for x in np.linalg.solve(normal, (basis * w) @ left))
+        across, down = across + more_across, down + more_down
+    left = left - basis.T @ np.array([gain, more_across, more_down])
+    squares = float((w * left**2).mean())
+    structure = float((w * (basis[1] ** 2 + basis[2] ** 2)).mean()) / 2
+    own = noise * (1 + (1 - steps) ** 2 + steps**2)
+    remainder = math.sqrt(max(squares - own, 0.0) / structure) if squares > NOISY * own else 0.0
+    sigma = math.sqrt(own / SMOOTHER / float(np.diag(normal)[1:][told].min()))
+    # Both views begin at `first`: mirrored about the frame's middle their columns are elsewhere.
+    off = first + last - grid.shape[1] if mirrored else 0
+    return Fit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell)
+
+
+def _nearest(before: Reals, now: Reals) -> int:
+    """Cells across by which `before` fits `now` best: least mean square of what is left in the columns they share."""
+    cols = now.shape[1]
+    reach = int(SEARCH * cols)
+    strips = np.add.reduceat(np.stack([before, now]), np.arange(0, len(now), max(1, len(now) // 16)), axis=1)
+    one, two = strips - strips.mean(axis=(1, 2), keepdims=True)
+    best, least = 0, math.inf
+    for move in range(-reach, reach + 1):
+        a, b = (one[:, : cols - move], two[:, move:]) if move >= 0 else (one[:, -move:], two[:, : cols + move])
+        left = float(np.var(a - b))
+        if left < least:
+            best, least = move, left
+    return best
+
+
+def _noise(depth: Cells, weight: Cells) -> float:
+    """Standard deviation of a cell of weight 1: from third differences along the columns, which edges move little."""
+    third = np.diff(depth, 3, axis=1) * np.sqrt(weight[:, 1:-2])
+    return 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)

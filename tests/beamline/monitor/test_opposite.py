@@ -1,0 +1,84 @@
+"""Views from the other side, and views taken again, tell the axis, shifts and changes of the sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.opposite import Opposite
+from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs
+
+STEP = np.radians(2)
+MIDDLE = (COLS * BLOCK - 1) / 2
+Place = Callable[[int], tuple[float, float]]
+"""Pixels (down, across) by which the sample is shifted in a view."""
+
+
+class Moved(Blobs):
+    """The sample shifted, and larger by a factor about the axis, from view to view."""
+
+    def __init__(self, views: int, place: Place = lambda view: (0, 0), size: Callable[[int], float] = lambda view: 1):
+        self.place, self.size = place, size
+        super().__init__(views, step=STEP)
+
+    def line_integrals(self, view: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+        radius, phase = self.at
+        self.at = radius * self.size(view), phase
+        down, across = self.place(view)
+        found = super().line_integrals(view, (down / BLOCK, across / BLOCK))
+        self.at = radius, phase
+        return found
+
+
+def only(scan: Blobs, **known: object) -> list[Flag]:
+    return scan.flags([Opposite()], **known)
+
+
+@pytest.mark.parametrize("axis", [0.0, 6.8, -31.0])
+def test_the_axis_of_a_sample_that_only_turns_is_found_and_said_where_it_is_stated_elsewhere(axis: float) -> None:
+    scan = Moved(100, lambda view: (0, axis))
+    assert only(scan) == []
+    assert only(Moved(100, lambda view: (0, axis)), axis_col=MIDDLE + axis + 0.5) == []
+    (flag,) = only(Moved(100, lambda view: (0, axis)), axis_col=MIDDLE + axis - 5)
+    assert (flag.level, flag.view) == (Level.INFO, 10 + 90)
+    assert flag.score == pytest.approx(5, abs=0.1)
+
+
+def test_a_sample_that_sank_is_flagged_by_its_view_from_the_other_side() -> None:
+    flags = only(Moved(96, lambda view: (1.2 * (view > 50), 0)))
+    assert [flag.view for flag in flags] == [100, 103]  # 5 degrees are between the views that are kept
+    assert all(flag.level is Level.WARN for flag in flags)
+    assert [flag.score for flag in flags] == pytest.approx([1.2, 1.2], abs=0.15)
+    assert "px down" in flags[0].advice
+
+
+def test_a_shift_across_shows_between_two_pairs() -> None:
+    flags = only(Moved(110, lambda view: (0, 2.0 * (view >= 100))))
+    assert flags and flags[0].view == 10 + 102
+    assert flags[0].score == pytest.approx(2, abs=0.2)
+
+
+def test_a_sample_that_shrank_is_flagged() -> None:
+    flags = only(Moved(96, size=lambda view: 1 - 0.03 * (view > 50)))
+    assert {flag.view for flag in flags} == {100, 103}
+    assert "shrank" in flags[0].advice
+
+
+def test_a_view_taken_again_shows_a_shift() -> None:
+    scan = Moved(190, lambda view: (0, 1.5 * (view > 150)))
+    flags = [flag for flag in only(scan) if flag.view >= 190]
+    assert flags and "taken again" in flags[0].advice and flags[0].view == 10 + 180
+    assert flags[0].score == pytest.approx(1.5, abs=0.2)
+
+
+def test_a_steady_scan_of_a_turn_and_more_raises_no_flag() -> None:
+    assert only(Moved(200, lambda view: (0, 6.8))) == []
+
+
+def test_in_a_cone_it_stands_aside_and_says_so_once() -> None:
+    (flag,) = only(Moved(100), cone=True)
+    assert (flag.level, flag.view) == (Level.INFO, 10) and "cone" in flag.advice
