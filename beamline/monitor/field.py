@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -15,6 +16,8 @@ from beamline.monitor.view import BRIGHT, UNLIT, Grid, View
 from drivers.frame import Frame, FrameKind
 
 LASTS = 5  # views in a row with matter at an edge
+NO_BEAM = 3.0  # times the noise, up to which the bright part of a flat is no light: of noise alone it is 1.3
+NAMED = 4  # shadows that are named
 
 
 @dataclass(frozen=True)
@@ -61,16 +64,21 @@ class FieldOfView:
 
     def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
         bright = float(np.percentile(light[::2, ::2], BRIGHT))
+        rows, cols = frame.counts.shape
+        if bright <= NO_BEAM * _noise(light):
+            advice = "No part of this flat has light that the darks have not: is the beam on, and the shutter open?"
+            return Flag(self.name, Level.WARN, frame.index, 1.0, self.dark, advice, (0, rows, 0, cols))
         unlit = light < UNLIT * bright
         share = float(unlit.mean())
-        if bright <= 0 or share <= self.dark:
+        if share <= self.dark:
             return None
         step = frame.counts.shape[0] / light.shape[0]
         strips = [
             (first, after, axis) for axis in (0, 1) for first, after in _runs(unlit.mean(axis=1 - axis) > 0.5, step)
         ]
-        named = ", ".join(f"{('rows', 'columns')[axis]} {first} ... {after - 1}" for first, after, axis in strips)
-        rows, cols = frame.counts.shape
+        names = [f"{('rows', 'columns')[axis]} {first} ... {after - 1}" for first, after, axis in strips]
+        named = ", ".join(names[:NAMED])
+        named += f", and {len(strips) - NAMED} more" if len(strips) > NAMED else ""
         first, after, axis = max(strips, key=lambda strip: strip[1] - strip[0], default=(0, rows, 0))
         region = (first, min(after, rows), 0, cols) if axis == 0 else (0, rows, first, min(after, cols))
         advice = (
@@ -91,6 +99,13 @@ class FieldOfView:
         first = grid.left if left >= right else max(last - 2, 0)
         region = (0, rows, first * grid.cell, (first + 2) * grid.cell)
         return Flag(self.name, Level.INFO, row, max(left, right), self.edge, advice, region)
+
+
+def _noise(light: NDArray[np.float32]) -> float:
+    """Standard deviation of a block, from the differences of neighbours in a row: the beam's shape is smooth."""
+    return (
+        1.4826 * float(np.median(np.abs(np.diff(light[::2], axis=1)))) / math.sqrt(2.0) if light.shape[1] > 1 else 0.0
+    )
 
 
 def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:

@@ -13,13 +13,11 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import edges, thinned, transmission
-from drivers.frame import Frame, FrameKind
+from drivers.frame import Frame
 
 CALIBRATION = 10  # projections
 SIGMAS = 6.0
 AIR = 0.05  # line integral at the edges up to which the whole sample is in the field
-DARKEST = 1e-3  # transmission below which the logarithm would only show noise
 EMPTY = 1e-3  # mean line integral of a field with nothing in it but noise
 
 
@@ -50,16 +48,13 @@ class Mass:
         return MassState()
 
     def look(self, state: MassState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MassState]:
-        if frame.kind is not FrameKind.PROJECTION:
+        view, grid = context.view, context.grid
+        if view is None or grid is None or not grid.flats:
             return Look(state)
-        through = transmission(digest.preview, context, frame.exposure, thinned(digest.preview))
-        if through is None:
-            return Look(state)
-        integrals = -np.log(np.clip(np.nan_to_num(through, nan=1.0), DARKEST, None))
-        left, right = edges(integrals)
-        if max(left, right) > AIR:
+        if max(view.edges) > AIR:
             return Look(replace(state, running=0))
-        mass = float(integrals.mean()) - (left + right) / 2  # the beam's changes are not the sample's
+        lit = float(grid.lit.mean())
+        mass = float(view.depth.mean()) / lit - sum(view.edges) / 2  # the beam's changes are not the sample's
         if state.usual is None:
             return Look(_calibrate(state, mass))
         if state.usual < EMPTY:

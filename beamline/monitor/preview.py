@@ -1,4 +1,4 @@
-"""Quantities of a frame's preview for the checks: light above dark, transmission, and edges where air should be."""
+"""Quantities of a frame's preview for the checks: light above dark, and light without a sample."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from beamline.monitor.check import ScanContext
 
-EDGE_FRACTION = 16  # an edge strip is a sixteenth of the columns
 ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
 
 Region = tuple[slice, slice]
@@ -29,19 +28,3 @@ def light(preview: NDArray[np.float32], context: ScanContext, region: Region = W
 def more_light(context: ScanContext, exposure: float) -> float:
     """Light without a sample in a frame of `exposure` s, over that of the flats, which may have their own exposure."""
     return exposure / context.flat_exposure
-
-
-def transmission(
-    preview: NDArray[np.float32], context: ScanContext, exposure: float, region: Region = WHOLE
-) -> NDArray[np.float32] | None:
-    """Light over the flats' light, or None before any flat. Blocks where the flat has no light are NaN."""
-    if context.flat is None:
-        return None
-    full = light(context.flat, context, region) * np.float32(more_light(context, exposure))
-    return np.divide(light(preview, context, region), full, out=np.full_like(full, np.nan), where=full > 0)
-
-
-def edges(image: NDArray[np.float32]) -> tuple[float, float]:
-    """Means of the strips at the left and right edge."""
-    width = max(1, image.shape[1] // EDGE_FRACTION)
-    return float(image[:, :width].mean()), float(image[:, -width:].mean())

@@ -37,6 +37,21 @@ def test_a_shadow_in_the_flats_is_said_once_with_its_place(fake: Any, shadow: An
     assert named in flag.advice
 
 
+def test_flats_without_beam_are_said_in_a_sentence_and_not_by_bands(fake: Any) -> None:
+    (flag,) = fake.flags([*fake.darks(), *fake.flats(5, light=0.0)], checks=[FieldOfView()])
+    assert (flag.level, flag.score) == (Level.WARN, 1.0)
+    assert "shutter" in flag.advice and "rows" not in flag.advice
+
+
+def test_of_many_shadows_four_are_named(fake: Any) -> None:
+    light = fake.expected(None)
+    for first in range(0, FAKE_COLS, 16):
+        light[:, first : first + 4] = 0
+    flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
+    (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfView()])
+    assert "columns 48 ... 51, and 2 more" in flag.advice
+
+
 def test_a_profile_and_a_line_in_the_shadow_of_a_slit_are_no_shadow(fake: Any) -> None:
     light = fake.expected(None) * np.linspace(0.3, 1.0, FAKE_COLS)
     light[0] = 0
