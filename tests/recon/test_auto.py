@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.auto import Auto
+from recon.auto import Auto, Score, best_of
 from recon.base.method import MethodResult, ReconProblem, RunControl
 from recon.base.volume import Volume
 from recon.voxels.direct import Fbp
@@ -61,6 +62,43 @@ def test_it_takes_the_method_that_predicts_unseen_views_best_and_says_so(data: F
 def test_a_blurred_volume_is_not_preferred_to_a_sharp_one(data: F32, truth: F32) -> None:
     found = recon.reconstruct(data, VIEWS, Auto((FistaTv(iterations=3, tv_weight=0.05), FistaTv())))
     assert found.settings["tv_weight"] is None
+
+
+def test_a_volume_that_hides_a_thin_crack_is_not_preferred_where_residuals_are_level() -> None:
+    """The one with more total variation has the smaller residual, and 0.7 of the crack's depth instead of 0.9."""
+    views = recon.Geometry.parallel(np.linspace(0, np.pi, 96, endpoint=False), (4, 48))
+    grid = recon.Grid.matching(views)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    disc = (x**2 + y**2 < 20**2) & ~((abs(x - 2) < 0.6) & (abs(y) < 9))
+    noise = np.random.default_rng(0).normal(0, 0.08, (96, 4, 48)).astype(np.float32)
+    data = Projector(views, grid).forward(np.where(disc, np.float32(0.05), np.float32(0))) + noise
+    smooth, sharp = FistaTv(tv_weight=0.01), FistaTv(tv_weight=0.004)
+    found = recon.reconstruct(data, views, Auto((smooth, sharp)))
+    assert found.settings["tv_weight"] == 0.004
+    listed = re.findall(r"fista-tv ([\d.]+)", found.settings["chosen_because"])
+    assert len(listed) == 2 and "hides structure" in found.settings["chosen_because"]
+
+
+@pytest.mark.parametrize(("residuals", "hiding", "best"), [
+    ([1.02, 1.00, 1.01], (), 0),  # level: the first
+    ([1.02, 1.00, 1.01], (0,), 1),
+    ([1.02, 1.00, 1.01], (0, 1), 2),
+    ([1.02, 1.00, 1.01], (0, 1, 2), 1),  # all hide something: the least residual
+    ([1.05, 1.00, 1.30], (), 1),  # beyond 4 %
+    ([1.05, 1.00, 1.30], (1,), 1),
+])  # fmt: skip
+def test_of_level_residuals_the_first_that_hides_nothing(
+    residuals: list[float], hiding: tuple[int, ...], best: int
+) -> None:
+    scatter = np.array([-0.1, 0.1, -0.1, 0.1])  # a standard error of 0.058: two are more than 4 %
+    scores = [Score(i, Fbp(), r + scatter, lambda i=i: i in hiding) for i, r in enumerate(residuals)]  # type: ignore[misc]
+    assert best_of(scores)[0].at == best
+
+
+def test_with_many_views_residuals_are_level_within_two_standard_errors() -> None:
+    scatter = np.tile([-0.02, 0.02], 50)  # a standard error of 0.002
+    for off, best in ((0.003, 0), (0.005, 1)):
+        assert best_of([Score(0, Fbp(), 1 + off + scatter), Score(1, Fbp(), 1 + scatter)])[0].at == best
 
 
 def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
