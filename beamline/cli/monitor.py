@@ -24,6 +24,7 @@ from beamline.core.text import spans
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.projections.flagged_frames import worst_frames
+from beamline.projections.rendered import rendered
 from beamline.projections.replay import Kind, by_kind, counts_of, replay
 from beamline.report.contact_sheet import contact_sheet
 from beamline.storage.flag_legend import FrameFlags, counted
@@ -49,6 +50,11 @@ UNITS = {check.name: check.unit for check in CHECKS}
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write a picture of the worst frames with the regions of their flags to this new PNG file.",
 )
+@click.option(
+    "--volume",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Compare each view with the render of this volume, which `beamline recon` made of all rows of FILE.",
+)
 @scan_options
 @json_option
 def monitor(
@@ -57,6 +63,7 @@ def monitor(
     config: Path | None,
     overrides: tuple[str, ...],
     sheet: Path | None,
+    volume: Path | None,
     as_json: bool,
     **said: Any,
 ) -> None:
@@ -83,7 +90,8 @@ def monitor(
         active: set[tuple[str, Level]] = set()
         n = 0
         with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
-            for judged in replay(source, checks, follow=clock if follow else None, should_stop=stopped):
+            model = None if volume is None else rendered(volume, source)
+            for judged in replay(source, checks, model=model, follow=clock if follow else None, should_stop=stopped):
                 n += 1
                 found.append(judged.flags)
                 if not follow:

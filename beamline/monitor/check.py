@@ -7,6 +7,7 @@ frame after another and carries what it needs to remember as an immutable state,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import Field, dataclass
 from enum import StrEnum
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from beamline.monitor.change import Change
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.spots import NO_SPOTS, Spots
-from beamline.monitor.view import Grid, Region, View
+from beamline.monitor.view import Cells, Grid, Region, View
 from drivers.frame import Frame
 
 State = TypeVar("State")
@@ -80,6 +81,8 @@ class ScanContext:
         pass_starts: triggers at which a new pass of a fly scan begins, after any pause.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
+        model: line integrals that a volume has at an angle in radians, float32 [row, col] means of cells of so many
+            pixels a side; None where no volume is known.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
@@ -97,6 +100,7 @@ class ScanContext:
     pass_starts: frozenset[int] = frozenset({0})
     cone: bool = False
     axis_col: float | None = None
+    model: Callable[[float, int], Cells] | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan

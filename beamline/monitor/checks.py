@@ -34,6 +34,7 @@ REGISTRY = {  # module in this folder: class of the check
     "blur": "Blur",
     "zingers": "Zingers",
     "opposite": "Opposite",
+    "model": "Model",
 }
 
 

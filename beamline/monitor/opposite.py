@@ -19,7 +19,7 @@ from scipy.ndimage import shift as shifted
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import Cells, Grid, View
+from beamline.monitor.view import Grid, View, cell_noise
 from drivers.frame import Frame
 
 EVERY = math.radians(5)  # between the views that are kept
@@ -186,7 +186,7 @@ def lay_on(one: Kept, steps: float, view: View, grid: Grid, *, mirrored: bool) -
     expected = one.view.depth + np.float32(steps) * (one.after.depth - one.view.depth)
     if last - first < FEWEST:
         return None
-    noise = _noise(view.depth[:, first:last], view.weight[:, first:last]) ** 2 * SMOOTHER
+    noise = cell_noise(view.depth[:, first:last], view.weight[:, first:last]) ** 2 * SMOOTHER
     now, before = (gaussian_filter(depth[:, first:last].astype(np.float64), SMOOTH) for depth in (view.depth, expected))
     if mirrored:
         before = before[:, ::-1]
@@ -236,9 +236,3 @@ def _nearest(before: Reals, now: Reals) -> int:
         if left < least:
             best, least = move, left
     return best
-
-
-def _noise(depth: Cells, weight: Cells) -> float:
-    """Standard deviation of a cell of weight 1: from third differences along the columns, which edges move little."""
-    third = np.diff(depth, 3, axis=1) * np.sqrt(weight[:, 1:-2])
-    return 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)

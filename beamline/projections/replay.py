@@ -64,6 +64,7 @@ def replay(
     source: ScanSource,
     checks: Sequence[Check] = CHECKS,
     *,
+    model: Callable[[float, int], NDArray[np.float32]] | None = None,
     follow: Clock | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Judged]:
@@ -73,13 +74,14 @@ def replay(
     equal.
 
     Args:
+        model: what a volume of the scan lets expect, see beamline.projections.rendered.
         follow: the clock to wait by for further frames, until the file is finished; None: the frames that are there.
         should_stop: asked before each frame.
 
     Raises:
         DataError: a followed file that is not finished and grows no more.
     """
-    monitor, done, waited = start(context_of(source), checks), 0, 0.0
+    monitor, done, waited = start(replace(context_of(source), model=model), checks), 0, 0.0
     while True:
         ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
         n = source.refresh()

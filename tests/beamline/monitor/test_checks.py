@@ -18,7 +18,17 @@ from beamline.monitor.digest import digest
 
 REPOSITORY = Path(beamline.__file__).parents[1]
 BITS = {"beam": 0, "saturation": 1, "stuck": 2, "bands": 3, "timing": 4, "mass": 5, "dark": 6, "lost": 7, "gain": 8}
-BITS |= {"motion": 9, "floater": 10, "ghost": 11, "pixels": 12, "field": 13, "blur": 14, "zingers": 32, "opposite": 15}
+BITS |= {
+    "motion": 9,
+    "floater": 10,
+    "ghost": 11,
+    "pixels": 12,
+    "field": 13,
+    "blur": 14,
+    "zingers": 32,
+    "opposite": 15,
+    "model": 33,
+}
 """As files hold them since the first version: a number here is never changed."""
 
 check_of_each_name = pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
