@@ -154,8 +154,9 @@ _AFTER = (
         type=click.Choice(["use", "judge", "ignore"]),
         default="use",
         show_default=True,
-        help="use: views with an alarm of the monitor are left out, with a warning weigh half; judge: by what the "
-        "monitor says of them now, also where the file has no flags; ignore: all are alike.",
+        help="use: views with an alarm of the monitor are left out, with a warning weigh half, after a jump of the "
+        "sample are corrected; judge: by what the monitor says of them now, also where the file has no flags; "
+        "ignore: all are alike.",
     ),
     click.option(
         "--references",

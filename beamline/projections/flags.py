@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import count
+from beamline.monitor.check import Level
+from beamline.monitor.motion import Motion
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
 from drivers.frame import FrameKind
@@ -29,6 +31,7 @@ class UsableViews:
         left_out: views with an alarm, which are not among them.
         said: what was done, in a line; empty where no view is flagged.
         flags: of all frames, which this follows from; None where there are none.
+        jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
     """
 
     frames: NDArray[np.int64]
@@ -36,6 +39,7 @@ class UsableViews:
     left_out: int = 0
     said: str = ""
     flags: FrameFlags | None = None
+    jumps: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """[view] weights of some rows of the file; None where they all weigh the same."""
@@ -47,19 +51,28 @@ class UsableViews:
 def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:
     """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike.
 
+    A view in which the sample jumped is as good as those after it: see `UsableViews.jumps`.
+
     Args:
         judged: flags that count in place of the file's.
     """
     views, flags = source.image_key == FrameKind.PROJECTION, source.flags if judged is None else judged
     rows = np.flatnonzero(views)
-    if flags is None or not flags.flagged[rows].any():
+    if flags is None or not flags.flagged.any():
         return UsableViews(rows, flags=flags)
-    alarmed = views & flags.alarmed
-    warned = views & flags.flagged & ~alarmed
     if not use_flags:
+        if not flags.flagged[rows].any():
+            return UsableViews(rows, flags=flags)
+        alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         said = f"--flags ignore: {n} are used as they are."
         return UsableViews(rows, said=said, flags=flags)
+    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
+    jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
+    all_flags, flags = flags, flags.without(Motion.bit)
+    alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
+    if not flags.flagged[rows].any():
+        return UsableViews(rows, flags=all_flags, jumps=jumped)
     parts = []
     if alarmed.any():
         verbs = ("has", "is") if alarmed.sum() == 1 else ("have", "are")
@@ -75,7 +88,7 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     before, after = (_widest_gap(source.angles[some], period) for some in (rows, good))
     gap = f" They leave {np.degrees(after):.3g}° without a view." if after >= WIDE * before else ""
     said = f"Of {rows.size} views {', '.join(parts)}.{gap} --flags ignore takes all alike."
-    return UsableViews(good, weights, int(alarmed.sum()), said, flags)
+    return UsableViews(good, weights, int(alarmed.sum()), said, all_flags, jumped)
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:

@@ -18,12 +18,12 @@ Views = tuple[F32, Geometry]
 def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
     """Views used and views held out as one set, and the numbers of the views held out in it.
 
-    The two geometries differ in nothing but their angles.
+    The two geometries are of the same set-up.
     """
     if held_out is None:
         return projections, geometry, []
     data, others = held_out
-    together = geometry.at(np.concatenate((geometry.angles, others.angles)))
+    together = geometry.followed_by(others)
     return np.concatenate((projections, data)), together, list(range(geometry.n_views, together.n_views))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.flags import UsableViews, usable_views
+from beamline.projections.jumps import find_jumps, longest_part
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import (
     Selection,
@@ -29,8 +32,11 @@ from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
+from recon.base.masks import areas
+from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate, find_axis
 from recon.prep.correct import Projections
+from recon.voxels.projector import seen_rays
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
@@ -51,9 +57,11 @@ class PreparedProjections:
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
-        left_out: views with an alarm of the monitor, which are not among those that the selection chose from.
+        left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
         flags: of all frames of the scan; None where there are none.
         noise: how photons were counted, in words; empty: the line integrals are logarithms.
+        measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
+        jumps: what was done about jumps of the sample; empty where there was none.
     """
 
     projections: Projections
@@ -68,6 +76,8 @@ class PreparedProjections:
     left_out: int = 0
     flags: FrameFlags | None = None
     noise: str = ""
+    measured: NDArray[np.bool_] | None = None
+    jumps: str = ""
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
         """Weights [view, row, col], read-only; None: one for all rays.
@@ -75,21 +85,20 @@ class PreparedProjections:
         Args:
             others: views after these, which weigh 1, as a usual ray of these does.
         """
-        n, (rows, cols), counted = (
-            self.geometry.n_views + others,
-            self.geometry.detector_shape,
-            self.projections.weights,
-        )
-        if self.view_weights is None and counted is None:
-            return None
-        views = np.ones(n, np.float32)
+        factors: list[NDArray[np.float32]] = []
         if self.view_weights is not None:
-            views[: n - others] = self.view_weights
-        if counted is None:
-            return np.broadcast_to(views[:, None, None], (n, rows, cols))
-        weights = np.ones((n, rows, cols), np.float32)
-        np.divide(counted, counted.mean(where=counted > 0), out=weights[: n - others])
-        return weights * views[:, None, None]
+            factors.append(_and_ones(self.view_weights, others)[:, None, None])
+        if (counted := self.projections.weights) is not None:
+            factors.append(_and_ones(counted / counted.mean(where=counted > 0), others))
+        if self.measured is not None:
+            factors.append(self.measured.astype(np.float32)[None])
+        if np.ptp(self.geometry.shifts[:, 1]) > 0:
+            seen = seen_rays(self.geometry, Grid.matching(self.geometry)).astype(np.float32)
+            factors.append(_and_ones(seen, others)[:, :, None])
+        if not factors:
+            return None
+        shape = (self.geometry.n_views + others, *self.geometry.detector_shape)
+        return np.broadcast_to(functools.reduce(np.multiply, factors), shape)
 
 
 def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) -> PreparedProjections:
@@ -113,8 +122,13 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
         if cone_of(source, selection) is not None:
             axis_col = stated_axis(source)
         else:
-            axis_col, axis = locate_axis(source, correction, scan_frames, warn)
+            axis_col, axis = _axis_beside_jumps(source, correction, usable, warn)
     check_axis(source, axis_col)
+    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col)
+    if jumps.said:
+        warn(jumps.said)
+    usable = replace(usable, frames=jumps.frames, left_out=usable.left_out + scan_frames.size - jumps.frames.size)
+    scan_frames = jumps.frames
     period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
     chosen = choose_views(source, scan_frames, selection, period)
     projections = correction.at_once(scan_frames[chosen])
@@ -122,9 +136,25 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
     held_out = None
     if rest.size:
         others = correction.at_once(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
-        held_out = others.data, geometry_of(source, selection, axis_col, source.angles[others.view_ids])
-    prepared = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
-    return replace(prepared, noise=correction.noise)
+        unseen = geometry_of(source, selection, axis_col, source.angles[others.view_ids])
+        held_out = others.data, jumps.corrected(unseen, others.view_ids)
+    found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
+    return replace(
+        found, geometry=jumps.corrected(found.geometry, projections.view_ids), jumps=jumps.said, noise=correction.noise
+    )
+
+
+def _axis_beside_jumps(
+    source: ScanSource, correction: ScanCorrection, usable: UsableViews, warn: Warn
+) -> tuple[float, AxisEstimate]:
+    """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
+    part = longest_part(usable.frames, usable.jumps)
+    if part.size < usable.frames.size:
+        with suppress(DataError):
+            found = locate_axis(source, correction, part, lambda _: None)
+            if found[1].confident:
+                return found
+    return locate_axis(source, correction, usable.frames, warn)
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
@@ -187,6 +217,7 @@ def assemble(
         view_weights=usable.weights_of(projections.view_ids),
         left_out=usable.left_out,
         flags=usable.flags,
+        measured=~unknown if (unknown := areas(projections.masked)).any() else None,
     )
 
 
@@ -266,6 +297,11 @@ def report_defects(projections: Projections, warn: Warn) -> None:
             f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
             "least what the volume says."
         )
+
+
+def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
+    """The values of views, and ones for others after them."""
+    return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
 
 
 def _spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:

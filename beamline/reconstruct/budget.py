@@ -262,15 +262,19 @@ def joined(prepared: PreparedProjections, factor: int) -> PreparedProjections:
     """The same views with factor x factor pixels joined: means of line integrals."""
     if factor == 1:
         return prepared
-    held, projections, counted = prepared.held_out, prepared.projections, prepared.projections.weights
+    projections, counted = prepared.projections, prepared.projections.weights
     data, weights = bin_views(projections.data, factor), None
     if counted is not None:  # the mean of the rays that are known, each by what it says
         weights = bin_views(counted, factor)
         sums = bin_views(counted * projections.data, factor)
         data = np.divide(sums, weights, out=data, where=weights > 0)
+    held, measured = prepared.held_out, prepared.measured
+    if measured is not None:
+        measured = bin_views(measured[None].astype(np.float32), factor)[0] == 1
     return replace(
         prepared,
         projections=replace(projections, data=data, weights=weights),
         geometry=prepared.geometry.binned(factor),
+        measured=measured,
         held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
     )

@@ -101,7 +101,17 @@ def measure(
         values["snr"], values["cnr"] = metrics.snr_cnr(volume.data, mask)
     n = prepared.geometry.n_views
     some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
-    values["residual"] = data_residual(volume, prepared.projections.data[some], prepared.geometry.select(some))
+    weights = prepared.ray_weights()
+    values["residual"] = data_residual(
+        volume, prepared.projections.data[some], prepared.geometry.select(some), _known(weights, some)
+    )
     if prepared.held_out is not None:
-        values["residual_held_out"] = data_residual(volume, *prepared.held_out)
+        data, unseen = prepared.held_out
+        weights = prepared.ray_weights(unseen.n_views)
+        values["residual_held_out"] = data_residual(volume, data, unseen, _known(weights, slice(n, None)))
     return {name: float(value) for name, value in values.items()}
+
+
+def _known(weights: NDArray[np.float32] | None, views: NDArray[np.int64] | slice) -> NDArray[np.float32] | None:
+    """1 for rays of these views that weigh anything, 0 for those that were not measured; None: all were."""
+    return None if weights is None else (weights[views] > 0).astype(np.float32)

@@ -61,7 +61,8 @@ def write_result(
         return {**measure(volume, prepared, truth, mask), "seconds": seconds}
 
     left = unexplained(
-        made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed)
+        made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed),
+        prepared.ray_weights(),
     )  # fmt: skip
     metrics = {made.method: judged(made.volume, made.seconds)}
     hiding = ""
@@ -140,6 +141,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "flags": "judge" if selection.judge else "use" if selection.use_flags else "ignore",
         "views_left_out": prepared.left_out,
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
+        **({"jumps": prepared.jumps, "view_shifts_px": geometry.shifts} if prepared.jumps else {}),
         "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,

@@ -147,6 +147,11 @@ class FrameFlags:
         regions = None if self.regions is None else np.pad(self.regions, ((n, 0), (0, 0), (0, 0)), constant_values=-1)
         return FrameFlags(bits, self.legend, scores, regions)
 
+    def without(self, bit: int) -> FrameFlags:
+        """The flags without those of one check."""
+        gone = np.array(1 << bit | 1 << bit + ALARM_SHIFT, self.bits.dtype)
+        return replace(self, bits=self.bits & ~gone)
+
     def rows(self, entry: FlagBit, level: Level) -> NDArray[np.intp]:
         """Frames that a check flagged at this level."""
         alarms = self.bits >> entry.alarm_bit & 1

@@ -207,6 +207,17 @@ class Geometry:
             np.broadcast_to(self.shifts[0], (n, 2)), self.roll[0], self.tilt[0],
         )  # fmt: skip
 
+    def followed_by(self, other: Geometry) -> Geometry:
+        """The views of this geometry, then those of another one of the same set-up."""
+
+        def both(mine: F64, others: F64) -> F64:
+            return _frozen(np.concatenate((mine, others)))
+
+        return replace(
+            self, angles=both(self.angles, other.angles), shifts=both(self.shifts, other.shifts),
+            roll=both(self.roll, other.roll), tilt=both(self.tilt, other.tilt),
+        )  # fmt: skip
+
     def straightened(self) -> Geometry:
         """The same views without roll and tilt."""
         return replace(self, roll=_frozen(np.zeros(self.n_views)), tilt=_frozen(np.zeros(self.n_views)))

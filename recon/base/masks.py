@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 Mask = NDArray[np.bool_]
 Image = NDArray[np.float32]
@@ -35,6 +36,15 @@ def plan_fill(mask: Mask) -> Fill:
         known[r[ready], c[ready]] = True
         r, c = r[~ready], c[~ready]
     return plan
+
+
+def areas(mask: Mask) -> Mask:
+    """[row, col] masked pixels that lie in an area of 3 x 3 or more, the detector's edges counting as masked.
+
+    What fills them from their neighbours is a guess; a single pixel or a line is interpolated well.
+    """
+    full = np.pad(mask, 1, constant_values=True)
+    return np.asarray(ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)
 
 
 def fill(image: Image, plan: Fill) -> None:

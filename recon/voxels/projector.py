@@ -23,6 +23,7 @@ from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_las
 
 F32 = NDArray[np.float32]
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
+_EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +162,13 @@ def project(volume: Volume, geometry: Geometry) -> F32:
     return Projector(geometry, volume.grid).forward(volume.data)
 
 
-def data_residual(volume: Volume, projections: NDArray[np.float32], geometry: Geometry) -> float:
+def data_residual(
+    volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
+) -> float:
     """||A x - p|| / ||p||: the share of the measured line integrals [view, row, col] that the volume does not explain.
+
+    Args:
+        weights: of the rays, where they do not all count the same; those of weight 0 do not count.
 
     Raises:
         ValueError: if `projections` does not fit `geometry`, or is all zero.
@@ -170,10 +176,18 @@ def data_residual(volume: Volume, projections: NDArray[np.float32], geometry: Ge
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:
         raise ValueError(f"projections have shape {projections.shape}, their geometry says {expected}")
-    scale = float(np.linalg.norm(projections))
+    root = np.float32(1) if weights is None else np.sqrt(weights)
+    scale = float(np.linalg.norm(root * projections))
     if scale == 0:
         raise ValueError("projections are all zero, so there is nothing to explain")
-    return float(np.linalg.norm(project(volume, geometry) - projections)) / scale
+    return float(np.linalg.norm(root * (project(volume, geometry) - projections))) / scale
+
+
+def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
+    """[view, row] rays of a parallel beam that lie between the outer slices of the grid: the volume explains them."""
+    rows = np.arange(geometry.detector_shape[0]) - geometry.axis_row - geometry.shifts[:, 1:]
+    off = np.abs(rows * geometry.pixel_pitch - grid.centre[0]) / grid.spacing[0]
+    return np.asarray(off <= (grid.shape[0] - 1) / 2 + _EDGE_ROWS)
 
 
 def _plain(array: F32) -> F32:

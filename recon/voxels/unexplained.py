@@ -12,7 +12,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp
-from recon.voxels.projector import Projector
+from recon.voxels.projector import Projector, seen_rays
 
 F32 = NDArray[np.float32]
 
@@ -44,7 +44,13 @@ class Unexplained:
     significance: F32
 
 
-def unexplained(volume: Volume, projections: F32, geometry: Geometry, rng: np.random.Generator) -> Unexplained | None:
+def unexplained(
+    volume: Volume,
+    projections: F32,
+    geometry: Geometry,
+    rng: np.random.Generator,
+    weights: F32 | None = None,
+) -> Unexplained | None:
     """Filtered back-projection of the residual p - A x, over the noise that the same views have with random signs.
 
     Random signs of the views cancel structure, which all of them have in common, and keep noise [our own; after the
@@ -54,6 +60,7 @@ def unexplained(volume: Volume, projections: F32, geometry: Geometry, rng: np.ra
     Args:
         volume: on the slices of the detector rows, 1/mm.
         projections: [view, row, col].
+        weights: of the rays; those of weight 0 were not measured, and show nothing.
 
     Returns:
         None for cones, rolled or tilted views, fewer than 16 views, other slices, and where there is no matter.
@@ -73,7 +80,12 @@ def unexplained(volume: Volume, projections: F32, geometry: Geometry, rng: np.ra
     if level <= 0 or not matter.any():
         return None
     left = projections[:, first : first + n] - Projector(views, part.grid).forward(part.data)
+    unseen = np.broadcast_to(~seen_rays(views, part.grid)[:, :, None], left.shape)
+    if weights is not None:
+        unseen = unseen | (weights[:, first : first + n] == 0)
+    left[unseen] = 0
     left -= ring_offsets(left)
+    left[unseen] = 0
 
     def seen(residual: F32) -> F32:
         images = fbp(np.ascontiguousarray(residual, np.float32), views, part.grid, filter="hann")

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from beamline.core.text import count, spans
+from beamline.monitor.motion import Motion
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.finding import Finding
@@ -42,7 +43,8 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
             return
         message += f" Rows with an alarm beside these: {spans(rows.tolist())}."
     views = source.image_key == FrameKind.PROJECTION
-    left, lost = int((views & ~flags.alarmed).sum()), int((views & flags.alarmed).sum())
+    spoilt = flags.without(Motion.bit).alarmed  # a view in which the sample jumped is as good as those after it
+    left, lost = int((views & ~spoilt).sum()), int((views & spoilt).sum())
     if lost and left < FEWEST_VIEWS:
         message += (
             f" {left} of {views.sum()} views have none, {FEWEST_VIEWS} are needed: repeat the scan. "

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.base.masks import masked
+from recon.base.masks import areas, masked
 
 
 def test_whole_data_pass_as_they_are(rng: np.random.Generator) -> None:
@@ -76,3 +76,14 @@ def test_what_is_filled_lies_between_what_is_known(rows: int, cols: int, share: 
     filled, _ = masked(data)
     low, high = np.nanmin(data), np.nanmax(data)
     assert (filled >= low - 1e-6).all() and (filled <= high + 1e-6).all()
+
+
+def test_areas_are_what_three_by_three_pixels_fit_into() -> None:
+    mask = np.zeros((8, 20), np.bool_)
+    mask[:, :3] = mask[:, 18] = mask[4, 8] = mask[2:5, 12:15] = True
+    expected = np.zeros_like(mask)
+    expected[:, :3] = expected[2:5, 12:15] = True
+    np.testing.assert_array_equal(areas(mask), expected)
+    one_row = np.zeros((1, 9), np.bool_)
+    one_row[0, :4] = True
+    assert areas(one_row).sum() == 4 and not areas(np.eye(5, dtype=np.bool_)).any()

@@ -228,6 +228,15 @@ def test_residual_is_zero_for_the_truth_and_one_for_nothing() -> None:
     assert data_residual(half, measured, geometry) == pytest.approx(0.5, rel=1e-5)
 
 
+def test_rays_that_weigh_nothing_have_no_part_in_the_residual() -> None:
+    geometry = Geometry.parallel([0.0, 0.7], (1, 8))
+    volume = Volume(np.ones((1, 8, 8), np.float32), Grid.matching(geometry))
+    data, weights = project(volume, geometry), np.ones((2, 1, 8), np.float32)
+    data[:, :, 3], weights[:, :, 3] = 1e3, 0
+    assert data_residual(volume, data, geometry) > 0.9
+    assert data_residual(volume, data, geometry, weights) == 0
+
+
 def test_misfits_are_named() -> None:
     volume, geometry, _ = _gaussian_case([0.1], 23.5, 1.0, (2.0, 1.0), 3.0)
     with pytest.raises(ValueError, match=r"2 degrees.*Gaussians"):

@@ -1,0 +1,262 @@
+"""Jumps: views after the sample moved on its stage are corrected by shifts, or left out, as views held out say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import count
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
+from beamline.storage.readers.base import ScanSource
+from recon.base.geometry import Geometry
+from recon.base.masks import areas
+from recon.voxels.displacement import Displacement, Judgement, displaced, displacements, judge
+
+LEAST = 6  # views of a part that its displacement is fitted to
+LARGEST = 0.5  # pixels that nobody sees: a doubled edge as wide as the resolution begins there (see the check `motion`)
+ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits has no more
+_LEVELS = ((64, 2), (128, 4), (320, 2))  # columns, at most, and volumes of all views
+_ROUGH = 2  # levels that tell whether there was a jump
+_HELPS = 0.01  # share of the deviation that a jump takes away
+_ROWS = 16  # joined rows looked at
+_VIEWS = 360  # looked at, and all of parts that have no more than
+_SHORT = 40
+
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Jumps:
+    """How the views of a scan in which the sample jumped are used.
+
+    Attributes:
+        starts: int64, rows of the file at which a part begins, without the first.
+        moves: displacement of each part.
+        frames: int64 [view], the rows that are used.
+        said: what was done, in a line; empty where there was no jump.
+    """
+
+    frames: I64
+    starts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    moves: tuple[Displacement, ...] = (Displacement(),)
+    said: str = ""
+
+    def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
+        """The geometry of these rows of the file, views shifted and turned as the sample was."""
+        if all(move == Displacement() for move in self.moves):
+            return geometry
+        return displaced(geometry, _parts(self.starts, view_ids), self.moves)
+
+
+def longest_part(frames: I64, jumps: I64) -> I64:
+    """The rows between two jumps that are most."""
+    parts = _parts(jumps, frames)
+    return frames[parts == np.bincount(parts).argmax()] if frames.size else frames
+
+
+def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64, axis_col: float) -> Jumps:
+    """Where the sample was in each part of a scan between jumps, and which of the views can be used.
+
+    A part is corrected where views held out of the longest part are predicted better with it than without, and its own
+    views about as well; otherwise it is left out. A jump below half a pixel is none.
+
+    Args:
+        frames: rows of the file that are to be used.
+        jumps: rows from which on the sample is elsewhere.
+    """
+    jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
+    if not jumps.size:
+        return Jumps(frames)
+    if cone_of(source, selection) is not None:
+        where = rows_text(jumps)
+        return Jumps(
+            frames,
+            said=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as if "
+            "it had not moved. Choose those of one side with --views.",
+        )
+    fit = _Fit(source, selection, axis_col, frames, jumps)
+    clusters = _clusters(fit.sizes)
+    if len(clusters) > 1:
+        clusters = _needed(fit, clusters)
+    groups = _groups(fit.sizes, clusters)
+    moves, verdict = [Displacement()], None
+    if groups.max() > 0:
+        moves, verdict = fit.moves(groups)
+        if fit.largest(moves) < LARGEST:
+            clusters, moves, verdict = [], [Displacement()], None
+            groups = _groups(fit.sizes, clusters)
+    real = np.array([i for first, last in clusters for i in range(first, last + 1)], np.int64)
+    return _done(fit, groups, moves, verdict, real)
+
+
+def _needed(fit: _Fit, clusters: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The jumps that views held out need to be predicted, the one that helps most first."""
+    needed: list[tuple[int, int]] = []
+    least = fit.deviation(needed)
+    while len(needed) < len(clusters):
+        tried = [(fit.deviation(sorted([*needed, one])), one) for one in clusters if one not in needed]
+        deviation, best = min(tried)
+        if not deviation < (1 - _HELPS) * least:
+            break
+        needed, least = sorted([*needed, best]), deviation
+    return needed
+
+
+def _clusters(sizes: I64) -> list[tuple[int, int]]:
+    """First and last number of jumps between which no part is long enough for a displacement of its own."""
+    found: list[tuple[int, int]] = []
+    for jump in range(sizes.size - 1):
+        if found and sizes[jump] < LEAST:
+            found[-1] = found[-1][0], jump
+        else:
+            found.append((jump, jump))
+    return found
+
+
+def _groups(sizes: I64, clusters: Sequence[tuple[int, int]]) -> I64:
+    """[part] parts without one of these jumps between them are a group, numbered from 0; -1: too few views, or inside
+    a cluster of jumps."""
+    group = np.zeros(sizes.size, np.int64)
+    for first, last in clusters:
+        group[last + 1 :] += 1
+        group[first + 1 : last + 1] = -1
+    for at in range(len(clusters) + 1):
+        if sizes[group == at].sum() < LEAST:
+            group[group == at] = -1
+    group[group >= 0] = np.unique(group[group >= 0], return_inverse=True)[1]
+    return group
+
+
+def _good(verdict: Judgement) -> list[bool]:
+    """The parts that can be used with the longest one, whose own deviation is the one that is compared with."""
+    better = verdict.together <= verdict.alone
+    return [
+        part == verdict.longest or (better and own <= ALIKE * verdict.together)
+        for part, own in enumerate(verdict.others)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Displacements of groups of parts of a scan, on a band of its rows, from coarse to fine pixels."""
+
+    source: ScanSource
+    selection: Selection
+    axis_col: float
+    frames: I64
+    jumps: I64
+
+    @property
+    def sizes(self) -> I64:
+        """[part] number of views."""
+        return np.bincount(_parts(self.jumps, self.frames), minlength=self.jumps.size + 1).astype(np.int64)
+
+    @property
+    def geometry(self) -> Geometry:
+        return geometry_of(self.source, self.selection, self.axis_col, np.zeros(1))
+
+    def largest(self, moves: Sequence[Displacement]) -> float:
+        """Pixels, joined as for the volume, by which the sample moves at most."""
+        return max(move.farthest(self.geometry.reach) for move in moves) / self.geometry.pixel_pitch
+
+    def deviation(self, clusters: Sequence[tuple[int, int]]) -> float:
+        """Mean deviation of views held out, where the sample jumped in these; on joined pixels."""
+        verdict = self.moves(_groups(self.sizes, clusters), _ROUGH)[1]
+        assert verdict is not None
+        return verdict.overall
+
+    def moves(self, groups: I64, levels: int = len(_LEVELS)) -> tuple[list[Displacement], Judgement | None]:
+        """The displacement of each group of parts against the longest, and how well it predicts."""
+        group = groups[_parts(self.jumps, self.frames)]
+        frames, group = self.frames[group >= 0], group[group >= 0]
+        some = _thinned(group)
+        moves: list[Displacement] | None = None
+        verdict, width = None, self.source.shape[1] // self.selection.binning
+        steps: dict[int, int] = {}
+        for cols, rounds in _LEVELS[:levels]:
+            factor = max(1, math.ceil(width / cols))
+            steps[factor] = max(rounds, steps.get(factor, 0))
+        for i, (factor, rounds) in enumerate(steps.items()):
+            band = self._band(factor)
+            views = ScanCorrection(self.source, band, _quiet).at_once(frames[some])
+            kept = group[np.searchsorted(frames, views.view_ids)]
+            geometry = geometry_of(self.source, band, self.axis_col, self.source.angles[views.view_ids])
+            known = ~areas(views.masked)
+            moves = displacements(views.data, geometry, kept, known, moves, rounds)
+            if i == min(1, len(steps) - 1):
+                verdict = judge(views.data, geometry, kept, known, moves)
+        assert moves is not None
+        return moves, verdict
+
+    def _band(self, factor: int) -> Selection:
+        """Joined pixels, and rows around the middle of those that are used, also outside them."""
+        binning = self.selection.binning * factor
+        used, height = rows_of(self.source, self.selection), self.source.shape[0]
+        n = min(_ROWS * binning, height)
+        first = min(max((used.start + used.stop - n) // 2, 0), height - n)
+        binning = min(binning, n)
+        return replace(self.selection, rows=(first, first + n), binning=binning)
+
+
+def _done(fit: _Fit, groups: I64, moves: Sequence[Displacement], verdict: Judgement | None, real: I64) -> Jumps:
+    """The views that are used, where the sample is in them, and what was done in a line."""
+    good = [True] * len(moves) if verdict is None else _good(verdict)
+    kept = np.array([at >= 0 and good[at] for at in groups])
+    part = _parts(fit.jumps, fit.frames)
+    frames = fit.frames[kept[part]]
+    places = tuple(moves[at] if at >= 0 else Displacement() for at in groups)
+    lost, pitch, text = fit.frames.size - frames.size, fit.geometry.pixel_pitch, list[str]()
+    if real.size:
+        text.append(f"The sample jumped at {rows_text(fit.jumps[real])}.")
+    for at, m in enumerate(moves):
+        n = int((groups[part] == at).sum())
+        if good[at] and m != Displacement():
+            x, y, z = (f"{mm / pitch:+.1f}" for mm in (m.x, m.y, m.z))
+            text.append(
+                f"{count(n, 'view')} {'is' if n == 1 else 'are'} corrected by shifts: the sample lies {x}, {y}, {z} px "
+                f"(x, y, z in its own frame) elsewhere than in the others, turned by {math.degrees(m.turn):+.2f}°."
+            )
+    if lost:
+        why = "no shift and turn of the sample makes them fit the others" if not all(good) else "too few for a fit"
+        text.append(f"{count(lost, 'view')} {'is' if lost == 1 else 'are'} left out: {why}.")
+    if verdict is not None:
+        text.append(
+            f"Views held out of the longest part deviate by {verdict.together:.3g} with the others corrected, by "
+            f"{verdict.alone:.3g} without them."
+        )
+    none = np.setdiff1d(np.arange(fit.jumps.size), real)
+    if none.size:
+        text.append(
+            f"Of the alarm of motion at {rows_text(fit.jumps[none])} the other views show nothing (less than "
+            f"{LARGEST:g} px): views on both sides are used as they are."
+        )
+    return Jumps(frames, fit.jumps, places, " ".join(text))
+
+
+def _parts(jumps: I64, rows: I64) -> I64:
+    """The part that each row belongs to."""
+    return np.searchsorted(jumps, rows, side="right").astype(np.int64)
+
+
+def _thinned(group: NDArray[np.int64]) -> I64:
+    """At most about `_VIEWS` of the views, all of short groups."""
+    step = max(1, math.ceil(group.size / _VIEWS))
+    keep = [
+        np.flatnonzero(group == at)[:: 1 if (group == at).sum() <= _SHORT else step] for at in range(group.max() + 1)
+    ]
+    return np.sort(np.concatenate(keep))
+
+
+def rows_text(rows: Sequence[int] | I64) -> str:
+    """Rows of a file as `row 3` or `rows 3, 7`."""
+    rows = np.asarray(rows).tolist()
+    return ("row " if len(rows) == 1 else "rows ") + ", ".join(map(str, rows))
+
+
+def _quiet(text: str) -> None:
+    """What the correction of all views says is not said twice."""
