@@ -46,7 +46,9 @@ def test_a_scan_holds_name_bits_unit_and_meaning_of_every_check(path: Path) -> N
         assert list(legend["name"].asstr()[()]) == NAMES
         assert list(legend["unit"].asstr()[()]) == [check.unit for check in CHECKS]
         assert list(legend["meaning"].asstr()[()]) == [check.meaning for check in CHECKS]
-        assert [2**bit for bit in legend["bit"][()]] == [bitmask([Flag(n, Level.WARN, 0, 1, 0, "")]) for n in NAMES]
+        assert [2 ** int(bit) for bit in legend["bit"][()]] == [
+            bitmask([Flag(n, Level.WARN, 0, 1, 0, "")]) for n in NAMES
+        ]
         np.testing.assert_array_equal(legend["alarm_bit"][()] - legend["bit"][()], ALARM_SHIFT)
 
 
