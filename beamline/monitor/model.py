@@ -40,7 +40,7 @@ class Model:
     """Score: largest difference from the volume, in standard deviations of what it usually is at its place.
 
     The default: a frame has up to 18,000 cells, of which noise takes one beyond 5 standard deviations in 100 views;
-    edges that the volume blurs move from cell to cell and have longer tails (up to 6 in a real scan).
+    edges that the volume blurs move from cell to cell and have longer tails.
     """
 
     name: ClassVar[str] = "model"
@@ -49,7 +49,7 @@ class Model:
     meaning: ClassVar[str] = "a part of the view differs from the render of the reconstruction that was given"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="standard deviations by which a part may differ")] = 7.0
+    warn: Annotated[float, Field(ge=0, description="standard deviations by which a part may differ")] = 6.0
 
     def start(self) -> ModelState:
         return ModelState()

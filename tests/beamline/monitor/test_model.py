@@ -1,4 +1,4 @@
-"""A view is compared with what a volume lets expect: differences are flagged with their place, misfits that stay not."""
+"""Views against what a volume lets expect: differences are flagged with their place, misfits that stay are not."""
 
 from __future__ import annotations
 
