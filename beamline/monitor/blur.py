@@ -23,7 +23,7 @@ from beamline.monitor.scatter import Scatter
 from beamline.monitor.view import Cells
 from drivers.frame import Frame, FrameKind
 
-PIXELS = 2**17  # of a frame that are looked at, about
+PIXELS = 2**16  # of a frame that are looked at, about
 STRIP = 6  # neighbouring rows that are looked at together
 FAR = 4  # pixels that a difference spans; even
 STEEPEST = 0.5  # of the open beam: a larger difference is a zinger or a hot pixel

@@ -29,10 +29,12 @@ def _frames(n: int) -> list[tuple[Frame, FrameDigest]]:
     """Darks, flats and views of a turning sample whose previews have the size of a large frame's; no pixels."""
     scale = SHAPE[0] // BIN // ROWS, SHAPE[1] // BIN // COLS
     counts = np.broadcast_to(np.uint16(0), SHAPE)
-    return [
-        (replace(frame, counts=counts), replace(found, preview=np.kron(found.preview, np.ones(scale, np.float32))))
-        for frame, found in Blobs(n, step=np.pi / 1800).frames()
-    ]
+    frames = []
+    for frame, found in Blobs(n, step=np.pi / 1800).frames():
+        preview = np.kron(found.preview, np.ones(scale, np.float32))
+        seen = replace(found, preview=preview, peaks=preview + 3 * np.sqrt(preview))
+        frames.append((replace(frame, counts=counts), seen))
+    return frames
 
 
 def _processor_ms(call: Callable[[], object], repeats: int = 15) -> float:
