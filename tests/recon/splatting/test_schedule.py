@@ -12,7 +12,7 @@ import recon
 from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS, Schedule, near_noise, residual_over_noise
+from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS, Schedule, residual_over_noise
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 
@@ -81,10 +81,3 @@ def test_the_residual_is_measured_in_the_noise_of_a_pixel() -> None:
     off = 0.02 * NOISE / problem.scale
     expected = np.sqrt(np.mean(off**2)) / problem.noise
     assert residual_over_noise(state, problem) == pytest.approx(expected, rel=0.02)
-
-
-@pytest.mark.parametrize(("views", "limit"), [(8, 1.5), (20, 1.5), (21, 2.3)])
-def test_with_many_views_the_finish_makes_up_for_more(views: int, limit: float) -> None:
-    many = recon.Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), (4, 32))
-    data = np.ones((views, 4, 32), np.float32)
-    assert near_noise(fit.problem_of(data, many, recon.Grid.matching(many), 1.0, FitSettings())) == limit
