@@ -324,7 +324,7 @@ def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
     )
     result = run_scan(config, tmp_path)
     assert (result.n_frames, result.missing) == (37, ())
-    assert result.flags == {}  # noise, hot pixels, zingers and a drifting beam profile are no findings
+    assert result.flags == {"zingers": {"info": 1}}  # a fact; noise, hot pixels and a drifting profile are no findings
     with open_scan(result.path) as source:
         views = source.image_key == FrameKind.PROJECTION
         np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
