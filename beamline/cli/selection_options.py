@@ -154,7 +154,8 @@ _AFTER = (
         type=click.Choice(["use", "judge", "ignore"]),
         default="use",
         show_default=True,
-        help="use: views with an alarm of the monitor are left out, with a warning weigh half, after a jump of the "
+        help="use: views with an alarm of the monitor are left out, with a warning weigh half (or rays in the flag's "
+        "region), after a jump of the "
         "sample are corrected; judge: by what the monitor says of them now, also where the file has no flags; "
         "ignore: all are alike.",
     ),

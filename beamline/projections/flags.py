@@ -1,4 +1,4 @@
-"""Views by their flags: those with an alarm of the monitor are left out, those with a warning weigh less."""
+"""Views by their flags: those with an alarm are left out, those with a warning weigh less; or only a part of them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from beamline.core.text import count
 from beamline.monitor.check import Level
 from beamline.monitor.motion import Motion
+from beamline.projections.flag_regions import Regions, regions_of
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
 from drivers.frame import FrameKind
@@ -31,6 +32,7 @@ class UsableViews:
         left_out: views with an alarm, which are not among them.
         said: what was done, in a line; empty where no view is flagged.
         flags: of all frames, which this follows from; None where there are none.
+        regions: parts of views that weigh less, in views that are used otherwise.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
     """
 
@@ -39,6 +41,7 @@ class UsableViews:
     left_out: int = 0
     said: str = ""
     flags: FrameFlags | None = None
+    regions: Regions = field(default_factory=Regions)
     jumps: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
@@ -70,10 +73,11 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
     all_flags, flags = flags, flags.without(Motion.bit)
-    alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
     if not flags.flagged[rows].any():
         return UsableViews(rows, flags=all_flags, jumps=jumped)
-    parts = []
+    regions = regions_of(flags, source.shape)
+    alarmed, warned = (views & some & ~regions.local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
+    partly, parts = views & regions.local, []
     if alarmed.any():
         verbs = ("has", "is") if alarmed.sum() == 1 else ("have", "are")
         which = counted(flags.of(alarmed).counts())
@@ -83,12 +87,16 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
         verbs = ("has", "weighs") if warned.sum() == 1 else ("have", "weigh")
         parts.append(f"{warned.sum()} {verbs[0]} a warning and {verbs[1]} half ({counted(flags.of(warned).counts())})")
         weights = np.where(warned, np.float32(WARNED_WEIGHT), np.float32(1))
+    if partly.any():
+        verb = "is" if partly.sum() == 1 else "are"
+        which = counted(flags.of(partly).counts())
+        parts.append(f"{partly.sum()} {verb} flagged in a part, where rays weigh half, with an alarm nothing ({which})")
     good = np.flatnonzero(views & ~alarmed)
     period = np.pi if source.cone is None else 2 * np.pi
     before, after = (_widest_gap(source.angles[some], period) for some in (rows, good))
     gap = f" They leave {np.degrees(after):.3g}° without a view." if after >= WIDE * before else ""
     said = f"Of {rows.size} views {', '.join(parts)}.{gap} --flags ignore takes all alike."
-    return UsableViews(good, weights, int(alarmed.sum()), said, all_flags, jumped)
+    return UsableViews(good, weights, int(alarmed.sum()), said, all_flags, regions, jumped)
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:

@@ -61,5 +61,6 @@ def hold_out(
         ),
         geometry=geometry.select(used),
         view_weights=None if prepared.view_weights is None else prepared.view_weights[used],
+        shares=None if prepared.shares is None else prepared.shares[used],
         held_out=(projections.data[held], geometry.select(held)),
     )

@@ -22,6 +22,7 @@ from beamline.projections.selection import (
     cone_of,
     geometry_of,
     pixel_size,
+    rows_of,
     unbinned,
 )
 from beamline.storage.flag_legend import FrameFlags
@@ -61,6 +62,7 @@ class PreparedProjections:
         flags: of all frames of the scan; None where there are none.
         noise: how photons were counted, in words; empty: the line integrals are logarithms.
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
+        shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
     """
 
@@ -77,6 +79,7 @@ class PreparedProjections:
     flags: FrameFlags | None = None
     noise: str = ""
     measured: NDArray[np.bool_] | None = None
+    shares: NDArray[np.float32] | None = None
     jumps: str = ""
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
@@ -95,6 +98,8 @@ class PreparedProjections:
         if np.ptp(self.geometry.shifts[:, 1]) > 0:
             seen = seen_rays(self.geometry, Grid.matching(self.geometry)).astype(np.float32)
             factors.append(_and_ones(seen, others)[:, :, None])
+        if self.shares is not None:
+            factors.append(_and_ones(self.shares, others))
         if not factors:
             return None
         shape = (self.geometry.n_views + others, *self.geometry.detector_shape)
@@ -205,6 +210,7 @@ def assemble(
     if not projections.data.any():
         raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
     axis_col, estimate = axis
+    rows, shape = rows_of(source, selection), projections.data.shape[1:]
     return PreparedProjections(
         projections=projections,
         geometry=geometry_of(source, selection, axis_col, source.angles[projections.view_ids]),
@@ -217,6 +223,7 @@ def assemble(
         view_weights=usable.weights_of(projections.view_ids),
         left_out=usable.left_out,
         flags=usable.flags,
+        shares=usable.regions.weights(projections.view_ids, rows, selection.binning, (shape[0], shape[1])),
         measured=~unknown if (unknown := areas(projections.masked)).any() else None,
     )
 

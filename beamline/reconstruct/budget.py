@@ -276,5 +276,6 @@ def joined(prepared: PreparedProjections, factor: int) -> PreparedProjections:
         projections=replace(projections, data=data, weights=weights),
         geometry=prepared.geometry.binned(factor),
         measured=measured,
+        shares=None if prepared.shares is None else bin_views(prepared.shares, factor),
         held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
     )

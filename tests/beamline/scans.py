@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -96,8 +96,14 @@ def frames_of(scan: TwoCylinders, *, time: float = 1.8e9, period: float = 0.1) -
     ]
 
 
-def write_flagged(path: Path, frames: list[Frame], levels: Mapping[int, Level], pixel_size_mm: float = 1.0) -> Path:
-    """The frames as our scan file, in which the first check of the monitor flagged rows at these levels."""
+def write_flagged(
+    path: Path,
+    frames: list[Frame],
+    levels: Mapping[int, Level],
+    pixel_size_mm: float = 1.0,
+    flags: Sequence[Flag] = (),
+) -> Path:
+    """The frames as our scan file, in which the first check of the monitor flagged rows at these levels, or `flags`."""
     with NXtomoWriter(
         path, ScanInfo("flagged", pixel_size_mm=pixel_size_mm), frames[0].counts.shape, clock=SystemClock()
     ) as writer:
@@ -105,5 +111,5 @@ def write_flagged(path: Path, frames: list[Frame], levels: Mapping[int, Level], 
             said = (
                 [Flag(CHECKS[0].name, levels[frame.index], frame.index, 1.0, 0.0, "")] if frame.index in levels else []
             )
-            writer.append(frame, digest(frame.counts), said)
+            writer.append(frame, digest(frame.counts), said + [flag for flag in flags if flag.view == frame.index])
     return path

@@ -1,0 +1,98 @@
+"""What is done about flagged views, measured: scans with one kind of fault against the same scan without it.
+
+Run with `pytest -m bench -s`. Samples, crumbs and bands differ by seed. PSNR of OS-SIRT-TV within 0.4 mm of the axis.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+import recon
+from beamline.cli.main import main
+from beamline.config.load import config_folder
+from beamline.projections import flag_regions, flags
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import SourceOptions
+from recon.base.method import DataUse
+
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(0)]
+
+SIDE, BIN = 256, 2
+FIRST = 20  # row of the first view
+FAULTS = ("floaters", "ghost", "bands")
+WAYS = {  # largest region in shares of a view, weight of rays in one, weight of a view with a warning of all of it
+    "views": (0.0, 0.5, 0.5),
+    "regions 0.5, views 0.5": (0.5, 0.5, 0.5),
+    "regions 0.5, views 1": (0.5, 0.5, 1.0),
+    "regions 0, views 1": (0.5, 1e-6, 1.0),
+}
+
+
+def scan(folder: Path, fault: str, seed: int) -> Path:
+    settings = yaml.safe_load((config_folder() / "scenes" / "early_acquisition.yaml").read_text(encoding="utf-8"))
+    settings["detector"] |= {"shape": [SIDE, SIDE], "pixel_size_um": 5.2}
+    settings["axis_offset_px"] /= 2
+    settings["phantom"]["seed"] = 20 + seed
+    rng, effects = np.random.default_rng(seed), list[Any]()
+    for effect in settings["effects"]:
+        kind = effect if isinstance(effect, str) else effect["kind"]
+        if kind == "floaters" == fault:
+            effects.append(effect | {"seed": 30 + seed, "count": 3})
+        elif kind == "ghost" == fault:
+            effects.append(effect | {"view": 40 + 30 * seed})
+        elif kind not in ("floaters", "ghost", "jump", "lost_beam", "black_band", "narrow_field"):
+            effects.append(effect)
+    scene, path = folder / f"{fault}{seed}.yaml", folder / f"{fault}{seed}.h5"
+    scene.write_text(yaml.safe_dump(settings | {"effects": effects}), encoding="utf-8")
+    truth = ["--truth", str(folder / f"truth{seed}.h5"), "--truth-bin", str(BIN)] if fault == "none" else []
+    done = CliRunner().invoke(main, ["simulate", str(scene), "--out", str(path), "--seed", str(seed), *truth])
+    assert done.exit_code == 0, done.output
+    if fault == "bands":
+        with h5py.File(path, "r+") as file:  # ten runs of five views in which eight rows have no light
+            frames = file["entry/instrument/detector/data"]
+            for start in rng.choice(np.arange(10, 170, 8), 10, replace=False):
+                row = int(rng.integers(90, 120))
+                for view in range(start, start + 5):
+                    image = frames[FIRST + view]
+                    image[row : row + 8] = 100
+                    frames[FIRST + view] = image
+    return path
+
+
+def psnr(path: Path, truth: np.ndarray, selection: Selection) -> float:
+    with SourceOptions(path).open() as source:
+        prepared = prepare_projections(source, selection, lambda _: None)
+    use = DataUse(prepared.ray_weights())
+    found = recon.reconstruct(prepared.projections.data, prepared.geometry, "os-sirt-tv", use=use).volume.data
+    x = (np.arange(truth.shape[1]) - (truth.shape[1] - 1) / 2) * 5.2e-3 * BIN
+    inside = np.hypot(*np.meshgrid(x, x)) < 0.4
+    error = np.mean((found[:, inside] - truth[:, inside]) ** 2)
+    return float(10 * np.log10(np.ptp(truth[:, inside]) ** 2 / error))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_regions_of_flags_are_worth(tmp_path: Path, seed: int) -> None:
+    clean, rows = scan(tmp_path, "none", seed), (90, 120)
+    with h5py.File(tmp_path / f"truth{seed}.h5") as file:
+        truth = file["entry/data/data"][rows[0] // BIN : rows[1] // BIN]
+    axis = (SIDE - 1) / 2 - 2.6
+    every = Selection(rows=rows, binning=BIN, axis_col=axis, use_flags=False)
+    judged = Selection(rows=rows, binning=BIN, axis_col=axis, judge=True)
+    print(f"\nseed {seed}: clean {psnr(clean, truth, every):.2f} dB")
+    for fault in FAULTS:
+        path = scan(tmp_path, fault, seed)
+        found = {"ignore": psnr(path, truth, every)}
+        for name, (largest, share, weight) in WAYS.items():
+            of_regions = patch.multiple(flag_regions, LARGEST=largest, WARNED_SHARE=share)
+            with of_regions, patch.object(flags, "WARNED_WEIGHT", weight):
+                found[name] = psnr(path, truth, judged)
+        print(f"seed {seed}, {fault}: " + ", ".join(f"{name} {value:.2f}" for name, value in found.items()), flush=True)
