@@ -2,21 +2,24 @@
 
 Against the flats it is judged where there is air: the brightest of the places in a view. It is a drift: said once, and
 again only after it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
-air.
+air. These changes have errors of one sign where dense particles turn fast, which would sum up to a dip: one counts only
+where the light of the whole view moved with it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from beamline.monitor.change import Change
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light, more_light
+from beamline.monitor.scatter import Scatter
 from beamline.monitor.view import Cells, Grid, View
 from drivers.frame import Frame, FrameKind
 
@@ -26,6 +29,8 @@ LASTS = 5  # views that a drift must last
 GONE = 0.5  # of the limit, below which a drift has gone
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual light
+CONFIRMED = 0.5  # of a change of the light, that the whole view's light must show: the rest may be the sample's turning
+SIGMAS = 6.0  # of the changes, that a dip must have
 
 
 @dataclass(frozen=True)
@@ -36,9 +41,12 @@ class BeamState:
         drifting: views in a row beyond the limit; after `said` those are counted that are back.
         said: the drift was flagged.
         covered: that there is no air was said.
-        level: logarithm of the light over that of the first view, from its changes.
+        level: logarithm of the light over that of the first view, from its confirmed changes.
         usual: level that is normal.
         dipping: views in a row with a dip.
+        whole: logarithm of the light of the whole view before; NaN before any.
+        changes: of the light from view to view, none larger than half of `alarm`: so that one dip is no scatter, and
+            the limit at most 3.8 times `alarm`.
     """
 
     drifting: int = 0
@@ -47,6 +55,8 @@ class BeamState:
     level: float = 0.0
     usual: float = 0.0
     dipping: int = 0
+    whole: float = math.nan
+    changes: Scatter = field(default_factory=Scatter)
 
 
 @dataclass(frozen=True)
@@ -78,7 +88,7 @@ class Beam:
             return Look(state, self._flat(frame.index, score))
         if context.view is None or context.grid is None:
             return Look(state)
-        state, flag = self._dip(state, frame.index, context)
+        state, flag = self._dip(state, frame.index, context.change, _whole(context.view, context.grid))
         if flag is not None or not context.grid.flats or state.dipping:
             return Look(state, flag)
         return self._drift(state, frame.index, context.view, context.grid)
@@ -90,20 +100,24 @@ class Beam:
         advice = f"{_size(score)} light than in the flats before. Take flats more often."
         return Flag(self.name, level, row, score, limit, advice)
 
-    def _dip(self, state: BeamState, row: int, context: ScanContext) -> tuple[BeamState, Flag | None]:
+    def _dip(self, state: BeamState, row: int, change: Change | None, whole: float) -> tuple[BeamState, Flag | None]:
         """A dip or a flash of more than `alarm` is flagged in every view, until it is over or has become normal."""
-        if context.change is None:
+        moved, state = whole - state.whole, replace(state, whole=whole)
+        if change is None:
             return state, None
-        level = state.level + math.log1p(context.change.gain)
+        brighter = math.log1p(change.gain)
+        level = state.level + (brighter if brighter * moved > CONFIRMED * brighter**2 else 0.0)
         score = -math.expm1(level - state.usual)
-        if abs(score) <= self.alarm or state.dipping >= PATIENCE:
+        limit = max(self.alarm, SIGMAS * state.changes.sigma)
+        most = self.alarm / 2
+        state = replace(state, level=level, changes=state.changes.with_figure(min(max(brighter, -most), most)))
+        if abs(score) <= limit or state.dipping >= PATIENCE:
             usual = level if state.dipping >= PATIENCE else state.usual + MEMORY * (level - state.usual)
-            return replace(state, level=level, usual=usual, dipping=0), None
+            return replace(state, usual=usual, dipping=0), None
         advice = (
             f"{_size(score)} light than in the views before. Check ring current, slits and filters; take new flats."
         )
-        flag = Flag(self.name, Level.ALARM, row, score, self.alarm, advice)
-        return replace(state, level=level, dipping=state.dipping + 1), flag
+        return replace(state, dipping=state.dipping + 1), Flag(self.name, Level.ALARM, row, score, limit, advice)
 
     def _drift(self, state: BeamState, row: int, view: View, grid: Grid) -> Look[BeamState]:
         score = -math.expm1(-_air(view, grid))
@@ -128,6 +142,12 @@ class Beam:
 
 def _size(score: float) -> str:
     return f"{abs(score):.1%} {'less' if score > 0 else 'more'}"
+
+
+def _whole(view: View, grid: Grid) -> float:
+    """Logarithm of the mean transmission of the lit cells; NaN where none is."""
+    lit = grid.lit > 0
+    return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan
 
 
 def _air(view: View, grid: Grid) -> float:

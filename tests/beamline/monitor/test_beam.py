@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from beamline.monitor.beam import PATIENCE, Beam
-from beamline.monitor.check import Flag, Level
-from tests.beamline.monitor.blobs import Blobs
+from beamline.monitor.change import Change
+from beamline.monitor.check import Flag, Level, ScanContext
+from beamline.monitor.digest import digest as frame_digest
+from beamline.monitor.view import grid_of, view_of
+from drivers.frame import Frame, FrameKind
+from tests.beamline.monitor.blobs import STEP, Blobs
 
 
 def only(flags: list[Flag]) -> list[Flag]:
@@ -82,3 +87,35 @@ def test_without_flats_dips_are_seen(fake: Any) -> None:
 def test_limits_can_be_set() -> None:
     scan = Blobs(80, counts=lambda view, light: light * (1 - 5e-4 * view))
     assert scan.flags([Beam(warn=0.08)]) == []
+
+
+def told(gains: Iterable[float], light: Iterable[float]) -> list[int]:
+    """Views with a dip, where the fit says these gains and the image has this light."""
+    flat = np.full((8, 16), 1000.0, np.float32)
+    grid, check, rows = grid_of(flat.shape, 4, 0 * flat, flat), Beam(), list[int]()
+    state, digest = check.start(), frame_digest(np.ones((32, 64), np.uint16), 65535, 4)
+    for row, (gain, left) in enumerate(zip(gains, light, strict=True)):
+        view = view_of(flat * np.float32(0.5 * left), grid, row, row * STEP, 1.0)
+        change = Change(gain, 0.0, 0.0, 0.0, 0 * flat, 0.01) if row else None
+        frame = Frame(np.ones((32, 64), np.uint16), FrameKind.PROJECTION, row, row, row, row * STEP, row, 0.05)
+        look = check.look(state, frame, digest, ScanContext(65535, 2048, grid=grid, view=view, change=change))
+        state, rows = look.state, rows + ([row] if look.flag and look.flag.level is Level.ALARM else [])
+    return rows
+
+
+def test_errors_of_one_sign_are_no_dip_while_the_light_of_the_views_is_level() -> None:
+    rng = np.random.default_rng(7)
+    assert told(np.full(200, -0.007), 1 + 0.0005 * rng.normal(size=200)) == []
+
+
+def test_errors_as_large_as_the_limit_raise_it() -> None:
+    light = np.exp(0.03 * np.random.default_rng(8).normal(size=200))
+    assert told(np.diff(np.log(light), prepend=0.0) * 3, light) == []
+
+
+@pytest.mark.parametrize("depth", [0.11, 0.2])
+@pytest.mark.parametrize("lasts", [3, 10, PATIENCE])
+def test_among_such_errors_a_dip_is_told_in_each_of_its_views(depth: float, lasts: int) -> None:
+    light = np.where((np.arange(100) >= 40) & (np.arange(100) < 40 + lasts), 1 - depth, 1.0)
+    gains = np.expm1(np.diff(np.log(light), prepend=0.0)) - 0.007
+    assert told(gains, light) == list(range(40, 40 + lasts))
