@@ -120,6 +120,7 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
     """
     usable = checked_views(source, selection, warn)
     scan_frames = usable.frames
+    pixel_size(source, selection)
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
     correction = ScanCorrection(source, selection, warn)
     axis_col, axis = selection.axis_col, None

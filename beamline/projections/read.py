@@ -20,6 +20,8 @@ _BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 FEW_PHOTONS = 100
 """In a pixel of the open beam: below, counts are better than their logarithm (docs/exploration.md, "Few photons")."""
 
+_PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
+
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
@@ -105,7 +107,8 @@ def photons_of(
     the largest group of darks.
 
     Raises:
-        ConfigError: counts are asked for, and the flats do not tell the gain.
+        ConfigError: counts are asked for, and the flats do not tell the gain; or the gain given makes the photons of
+            the open beam too many or too few for any detector.
     """
     if selection.noise == "log":
         return None
@@ -117,6 +120,13 @@ def photons_of(
         for groups in (used.flats, used.darks)
     )
     if selection.gain is not None:  # a mean of n pixels has n times as many photons a count
+        light = _open_beam_counts(references) * binning**2 / selection.gain
+        low, high = _PHOTONS
+        if not low <= light <= high:
+            raise ConfigError(
+                f"--gain {selection.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
+                f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
+            )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
         found = Photons(selection.gain / binning**2, variance)
     else:
@@ -135,4 +145,8 @@ def photons_of(
 
 def open_beam(references: References, photons: Photons) -> float:
     """Photons in a pixel of the open beam, the median of the flats."""
-    return float(np.median(references.flats[0][1] - references.dark)) / photons.gain
+    return _open_beam_counts(references) / photons.gain
+
+
+def _open_beam_counts(references: References) -> float:
+    return float(np.median(references.flats[0][1] - references.dark))

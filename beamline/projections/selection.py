@@ -17,6 +17,8 @@ from recon.prep.correct import CorrectionSettings
 
 Noise = Literal["auto", "log", "counts"]
 
+_PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -133,4 +135,17 @@ def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | N
 
 
 def pixel_size(source: ScanSource, selection: Selection) -> float | None:
-    return source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm
+    """In mm, that of the selection or of the file; None where neither says it.
+
+    Raises:
+        ConfigError: no detector has such pixels.
+    """
+    found = source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm
+    low, high = _PIXEL_SIZES_UM
+    if found is not None and not low <= found * 1e3 <= high:
+        whose = source.path if selection.pixel_size_mm is None else "--pixel-size-um"
+        raise ConfigError(
+            f"{whose}: a pixel size of {found * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one with "
+            "--pixel-size-um."
+        )
+    return found

@@ -147,7 +147,7 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
 
 
 def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians by the `units` attribute, or by `default` where there is none and a default is given."""
+    """Angles in radians by the `units` attribute, or by `default` where there is none; a column of them is a list."""
     unit = attribute(item, "units") or default
     factor = ANGLE_UNITS.get(unit.lower())
     if factor is None:
@@ -156,7 +156,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
             "expected degrees or radians. Set the attribute, or give --angles FILE (degrees, one a line)."
         )
     require_real(item.dtype, f"{item.name} in {item.file.filename}")
-    return np.atleast_1d(np.asarray(item[()], np.float64)) * factor
+    return np.ravel(np.asarray(item[()], np.float64)) * factor
 
 
 def missing_links(item: h5py.Dataset) -> list[Path]:

@@ -69,6 +69,8 @@ class DataExchangeSource(ScanReader):
             lost = hdf5.missing_links(item)
             if lost:
                 raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there.")
+        if not len(self._parts[-1][1]):
+            raise DataError(f"{self.path} holds no projections: /exchange/data has shape {self._parts[-1][1].shape}.")
 
     def _theta(self, n_views: int) -> NDArray[np.float64]:
         theta = hdf5.dataset(self._file, "exchange/theta")
@@ -78,8 +80,11 @@ class DataExchangeSource(ScanReader):
                 "give them with --angles FILE (degrees, one a line)."
             )
         angles = hdf5.radians(theta, default="degrees")
-        if angles.size != n_views:
-            raise DataError(f"{self.path}: /exchange/theta has {angles.size} angles for {n_views} projections.")
+        if angles.size != n_views or n_views not in (1, *theta.shape):
+            raise DataError(
+                f"{self.path}: /exchange/theta has {angles.size} angles for {n_views} projections, "
+                f"shape {theta.shape}; expected one angle for each."
+            )
         return angles
 
     def _attributes(self) -> dict[str, str | float | int]:

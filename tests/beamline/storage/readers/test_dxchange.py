@@ -85,6 +85,8 @@ def test_without_references_the_quantity_is_unknown_until_it_is_said(
     [
         ({"theta": None}, "no /exchange/theta"),
         ({"theta": np.zeros(4)}, "4 angles for 5 projections"),
+        ({"data": np.zeros((6, 4, 6)), "theta": np.zeros((2, 3))}, r"6 angles for 6 projections, shape \(2, 3\)"),
+        ({"data": np.zeros((0, 4, 6)), "theta": np.zeros(0)}, r"no projections: .* shape \(0, 4, 6\)"),
         ({"data_white": np.zeros((3, 4, 5))}, r"/exchange/data_white \(3, 4, 5\)"),
         ({"data": np.zeros((4, 6))}, r"expected frames \[frame, row, col\]"),
     ],
@@ -95,6 +97,12 @@ def test_what_does_not_fit_is_refused(
     changed = {name: values for name, values in (parts | change).items() if values is not None}
     with pytest.raises(DataError, match=said):
         open_scan(store(tmp_path / "s.h5", changed))
+
+
+@pytest.mark.parametrize("shape", [(5, 1), (1, 5)])
+def test_a_column_of_angles_is_a_list_of_them(tmp_path: Path, parts: Parts, shape: tuple[int, int]) -> None:
+    with open_scan(store(tmp_path / "s.h5", parts | {"theta": parts["theta"].reshape(shape)})) as source:
+        np.testing.assert_allclose(source.angles[5:], np.linspace(0, np.pi, 5))
 
 
 def test_wrong_units_of_theta_are_refused(tmp_path: Path, parts: Parts) -> None:
