@@ -21,8 +21,9 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
+from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import solve
-from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
+from recon.voxels.noise_balance import EXPLAINED
 from recon.voxels.ordered_fista import ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
@@ -48,7 +49,7 @@ class _FromModel:
     unmodelled: float | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        weight = NoiseBalance.of(problem, x, modelled=True, unmodelled=self.unmodelled)
+        weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled)
         return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
 
 

@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from recon.base.masks import masked
 from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.fbp import Filter
-from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines, volume_slices
+from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.voxel_problem import VoxelProblem
 
 F32 = NDArray[np.float32]
@@ -87,7 +85,6 @@ def solve(
         nonnegative,
         np.random.default_rng(seed),
         go_on,
-        lambda filter: _direct(inside, data, rays, filter),
     )
     found = method.iterate(problem, lines)
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
@@ -156,18 +153,6 @@ def _times_power(array: F32, power: int) -> F32:
         array *= np.float32(2.0**step)
         power -= step
     return array
-
-
-def _direct(projector: Projector, data: F32, rays: F32 | None, filter: Filter) -> F32 | None:
-    """FBP or FDK [y, x, z] of the views with any weight, rays of weight 0 filled in; None: neither takes them."""
-    images, geometry = projection_images(data), projector.geometry
-    if rays is not None:
-        seen = np.flatnonzero(rays.any(axis=(1, 2)))
-        geometry = geometry.select(seen)
-        images = masked(images[seen], projection_images(rays[seen]))[0]
-    if not has_direct_method(geometry):
-        return None
-    return volume_lines(direct(images, geometry, projector.grid, filter))
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:

@@ -85,7 +85,7 @@ class NoiseBalance:
         if modelled:
             left = whitened(problem.data - problem.projector.forward_lines(start), problem.weight)
             noise = min(noise, _TOO_NOISY * noise_level(left))
-        first = problem.direct("hann")
+        first = problem.filtered("hann")
         volume = start if first is None else np.maximum(first, 0, out=first)
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))

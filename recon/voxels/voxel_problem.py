@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.masks import masked
 from recon.base.method import TrialSettings
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
+from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter
-from recon.voxels.projector import Projector
+from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.sweeps import Sweeps
 
 F32 = NDArray[np.float32]
@@ -28,8 +30,6 @@ class VoxelProblem:
         nonnegative: voxels below zero are clipped.
         rng: for the order of views and subsets.
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
-        direct: the volume [y, x, z] of filtered back-projection with this filter, when asked for; None where it
-            cannot be.
     """
 
     projector: Projector
@@ -38,7 +38,6 @@ class VoxelProblem:
     nonnegative: bool
     rng: np.random.Generator
     go_on: Callable[[int, float], bool]
-    direct: Callable[[Filter], F32 | None]
 
     @property
     def scale(self) -> float:
@@ -48,6 +47,17 @@ class VoxelProblem:
     def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
         """Data and weights of some views; the projector stays that of all views."""
         return replace(self, data=self.data[views], weight=None if self.weight is None else self.weight[views])
+
+    def filtered(self, filter: Filter) -> F32 | None:
+        """FBP or FDK [y, x, z] of the views with any weight, rays of weight 0 filled in; None: neither takes them."""
+        images, geometry = projection_images(self.data), self.projector.geometry
+        if self.weight is not None:
+            seen = np.flatnonzero(self.weight.any(axis=(1, 2)))
+            geometry = geometry.select(seen)
+            images = masked(images[seen], projection_images(self.weight[seen]))[0]
+        if not has_direct_method(geometry):
+            return None
+        return volume_lines(direct(images, geometry, self.projector.grid, filter))
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
         """Sweeps over all views in these subsets."""

@@ -97,7 +97,7 @@ class AsdPocs:
 
 def _baseline(problem: VoxelProblem) -> float:
     """Relative residual of filtered back-projection, or of a sweep where there is none."""
-    projector, volume = problem.projector, problem.direct("ram-lak")
+    projector, volume = problem.projector, problem.filtered("ram-lak")
     if volume is None:
         nz, ny, nx = projector.grid.shape
         volume = np.zeros((ny, nx, nz), np.float32)

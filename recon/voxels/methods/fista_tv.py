@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import ordered_fista
@@ -59,7 +60,7 @@ class FistaTv:
             problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
         weight: NoiseBalance | float
         if self.tv_weight is None:
-            weight = NoiseBalance.of(problem, x, modelled=False)
+            weight = choose_weight(problem, x, modelled=False)
         else:
             weight = self.tv_weight * density_unit(x) * largest_eigenvalue(projector, problem.weight)
         return ordered_fista(

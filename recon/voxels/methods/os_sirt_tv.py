@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
@@ -56,14 +57,17 @@ class OsSirtTv:
         sweeps = problem.sweeps(interleaved(projector, self.subsets))
         weights = difference_weights(projector.grid)
         prox = TotalVariationProx(x.shape, weights, problem.nonnegative, self.tv_steps)
-        scale, balance = problem.scale, None
+        scale = problem.scale
+        weight: NoiseBalance | float | None = None
         ahead = Momentum(x) if self.momentum else None
         for k in range(self.iterations):
             error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
             if self.tv_weight is None:
-                balance = balance or NoiseBalance.of(problem, x, modelled=False)
-                balance.after_sweep(sweeps.residual)
-                prox(x, float(balance.value * sweeps.pace))
+                weight = weight or choose_weight(problem, x, modelled=False)
+                if isinstance(weight, NoiseBalance):
+                    weight.after_sweep(sweeps.residual)
+                mu = weight.value if isinstance(weight, NoiseBalance) else weight
+                prox(x, float(mu * sweeps.pace))
             else:
                 # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
                 prox(x, self.tv_weight * density_unit(x))
