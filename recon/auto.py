@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.binning import bin_views
-from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Depth, Method, MethodResult, Progress, ReconProblem, RunControl, Traits
 from recon.base.method import TrialSettings as Trial
@@ -20,6 +19,7 @@ from recon.base.noise import median_deviation
 from recon.base.volume import Grid, Volume
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
+from recon.voxels.held_out_weight import LEAST_VIEWS, busiest_rows, slab_of, split_views
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 from recon.voxels.unexplained import LIMIT, unexplained
@@ -28,8 +28,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 ROWS = 32  # of a slab; enough for total variation along z
-_HELD_OUT = 8  # one of so many views
-_LEAST_VIEWS = 2 * _HELD_OUT
 _SMALLEST = 64  # pixels a side: smaller detectors are not joined
 _MATTER = 0.1  # of the largest line integrals
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
@@ -123,9 +121,8 @@ def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunCon
         ValueError: no method takes these views or data.
     """
     n, geometry = part.geometry.n_views, part.geometry
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    unseen = np.sort(order[_HELD_OUT // 2 :: _HELD_OUT])
-    trial, judge = _of_views(part, np.setdiff1d(np.arange(n), unseen)), _of_views(part, unseen)
+    seen, unseen = split_views(geometry)
+    trial, judge = _of_views(part, seen), _of_views(part, unseen)
     scores: list[Score] = []
     refused, begin = [], control.now()
     quiet = RunControl(control.should_stop, now=control.now)
@@ -188,22 +185,19 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
     """
     geometry, (rows, cols) = problem.geometry, problem.geometry.detector_shape
     data, weights = problem.projections, problem.use.weights
-    if geometry.n_views < _LEAST_VIEWS:
+    if geometry.n_views < LEAST_VIEWS:
         return None, f"{geometry.n_views} views are too few to hold any out"
     if not geometry.is_straight:
         return None, "rolled or tilted views"
     if not geometry.is_cone:
         if rows <= height:
             return problem, "all rows"
-        some = masked(data[:: max(1, len(data) // 8)])[0]
-        matter = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
-        first = int(np.argmax(matter[height:] - matter[:-height]))
-        slab = slice(first, first + height)
-        views = geometry.rows(first, first + height)
+        slab = busiest_rows(masked(data[:: max(1, len(data) // 8)])[0], height)
+        views, grid = slab_of(geometry, problem.grid, slab.start, slab.stop)
         use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, slab]))
         cut = np.ascontiguousarray(data[:, slab])
-        where = f"rows {first} to {first + height - 1}"
-        return replace(problem, projections=cut, geometry=views, grid=_grid(views, problem.grid), use=use), where
+        where = f"rows {slab.start} to {slab.stop - 1}"
+        return replace(problem, projections=cut, geometry=views, grid=grid, use=use), where
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"
     filled = masked(data, weights)[0]
@@ -212,14 +206,6 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
         problem, projections=bin_views(filled, 2), geometry=views, grid=Grid.matching(views), use=DataUse()
     )
     return joined, "pixels joined 2 x 2"
-
-
-def _grid(views: Geometry, wanted: Grid) -> Grid:
-    """The slices that a slab's views see, as wide as the box that is wanted."""
-    slab = Grid.matching(views)
-    z = slab.centre[0]
-    shape, centre = (slab.shape[0], *wanted.shape[1:]), (z, *wanted.centre[1:])
-    return replace(wanted, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
 
 
 def _of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
