@@ -21,6 +21,8 @@ from drivers.frame import FrameKind
 
 NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 LEAST_NOISE = 0.5  # counts: what rounding hides
+READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
+FEW = 20.0  # noises of the darks: flats with less light have no more noise by it, so that the variance tells nothing
 BRIGHT = 90.0  # percentile of a frame's blocks that stands for its light
 UNLIT = 0.05  # of the bright part's light: a place with less has none
 CHANGE_SIGMAS = 8.0  # beyond which a change between two flats is no noise
@@ -247,6 +249,8 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fa
     variance = (noise / of_flats) ** 2 if known else level
     score = min(level, variance)
     limit = limits.lit if known else max(limits.lit, 0.5)
+    if known and noise < READOUT and _level(flats) - _level(darks) < FEW * noise:
+        return None
     if score <= limit or _level(darks) <= 0:
         return None
     said = (

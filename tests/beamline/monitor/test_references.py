@@ -119,6 +119,16 @@ def test_darks_with_light_are_told_from_darks_with_an_offset(share: float) -> No
     assert faults(faint) == [[], []]
 
 
+def test_clean_darks_of_a_scan_of_few_photons_are_not_lit() -> None:
+    """8 photons of a count each beside 2 counts of readout: a third of the flats' variance is in clean darks too."""
+    rng = np.random.default_rng(9)
+
+    def images(photons: float) -> Images:
+        return [100 + rng.poisson(photons, SHAPE) + rng.normal(0, 2, SHAPE) for _ in range(5)]
+
+    assert faults(judge([group([i.round() for i in images(0)], FrameKind.DARK), flats(images(8))])) == [[], []]
+
+
 def test_darks_and_flats_with_the_same_light_are_the_flats_fault() -> None:
     found = judge([darks(PHOTONS), flats(frames(5, PHOTONS, 2))])
     assert faults(found) == [[], ["dark"]]
