@@ -131,7 +131,7 @@ def sharpness(lines: NDArray[Any], dark: Cells | None, flat: Cells | None) -> tu
         scale = np.full_like(low, 1 / max(float(lines.mean(dtype=np.float64)), 1e-9))
     else:
         light = flat - low
-        lit = light > DARKEST * float(light.mean())
+        lit = light > DARKEST * max(float(light.mean()), 0.0)
         scale = np.divide(1, light, out=np.zeros_like(light), where=lit)
     sums = np.zeros(4)
     _contrasts(lines, low, scale, min(STRIP, len(lines)), sums)

@@ -43,6 +43,7 @@ LEAST_LIGHT = 1e-3  # transmission
 UNEVEN = 0.2  # relative change of the angle's step for which the filters are made anew
 BOX = 3.0  # cells from the middle of a floater to the edges of its region
 NOISIER = (0.7, 30.0)  # noise of a cell over that of the cells that the filters are made for, at least and at most
+FASTEST = 1e3  # cells a view: what moves faster is in one view only
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +152,7 @@ def _with_view(state: FloaterState, view: View, noise: float) -> FloaterState:
 
 def _designed(rim: float, noise: float) -> Filters:
     """The filters for a sample whose rim moves `rim` cells a view, and cells with this noise."""
+    rim = min(rim, FASTEST)
     speeds = np.array([sign * factor * rim for factor in SPEEDS for sign in (-1, 1)] + [1e3])
     views, cols = window(LAGS)
     signals = np.exp(-0.5 * ((cols - speeds[:, None] * views) / SIZE) ** 2)

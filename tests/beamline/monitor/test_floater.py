@@ -89,3 +89,8 @@ def test_a_jump_of_the_sample_is_none() -> None:
 def test_uneven_angles_are_left_alone() -> None:
     scan = Blobs(60, depth=crossing(2.0), step=float(np.radians(77)))
     assert only(scan) == []
+
+
+def test_steps_of_any_size_overflow_nothing() -> None:
+    with np.errstate(over="raise", invalid="raise"):
+        assert only(Blobs(20, step=1e300)) == []
