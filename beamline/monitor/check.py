@@ -87,7 +87,8 @@ class ScanContext:
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
         spots: bright pixels that the frame before had not, of views and flats.
-        light_left: of the view before, see beamline.monitor.view.light_left; 1 where it is no projection.
+        light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
+            projection.
         view: the frame on this grid; None where it is no projection, or has no light.
         truncated: the sample is wider than the field, in this view or those before; or there are no flats to tell.
         change: what it has that turning since the views before does not explain; None where these are too few, or at

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import asdict
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from beamline.config import load as config
 from beamline.config.devices import DcamOrca, SimulatedOrca
 from beamline.config.models import Config
 from beamline.config.stages import STAGE_SECTIONS
+from beamline.monitor.checks import CHECKS
 
 
 def test_templates_are_complete_and_differ_only_in_devices() -> None:
@@ -91,3 +93,12 @@ def test_a_template_names_every_key_of_the_other_stages(name: str, model: type[B
         if key in here:
             assert yaml.safe_load(here[key]) == field.default, key
     assert here.keys() - {"stage", "kind", "port"} <= model.model_fields.keys()
+
+
+@pytest.mark.parametrize("name", ["simulated", "instrument"])
+def test_every_check_stands_in_the_template_with_its_policy_and_limits(name: str) -> None:
+    monitor = yaml.safe_load((config.config_folder() / f"{name}.yaml").read_text("utf-8"))["monitor"]
+    assert monitor["policy"] == {check.name: str(check.policy) for check in CHECKS}
+    assert {check.name: monitor.get(check.name, {}) for check in CHECKS} == {
+        check.name: asdict(check) for check in CHECKS
+    }  # type: ignore[call-overload]
