@@ -1,4 +1,4 @@
-"""Pixels: which of the camera's see no light where their neighbours do?"""
+"""Pixels: which of the camera's see no light where their neighbours do, and which hold no number?"""
 
 from __future__ import annotations
 
@@ -20,23 +20,30 @@ from drivers.frame import Frame, FrameKind
 
 DEAD = 0.2  # of the light of the darkest of the preview blocks around it
 NAMED = 5  # pixels that are named
+HOLES = 1e-4  # of the pixels, that may hold no number: a column of 4096 is more
+HALF = 0.5  # of the pixels, without which a view is lost
 
 Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class PixelsState:
-    """`dead`: places row * columns + column that were dark in all flats of the latest group, None before any."""
+    """`dead`: places row * columns + column that were dark in all flats of the latest group, None before any.
+
+    `holes`: largest fraction of pixels without a number in a dark or flat: a mask of the detector.
+    """
 
     dead: Places | None = None
     in_flats: bool = False
     said: bool = False
+    holes: float = 0.0
 
 
 @dataclass(frozen=True)
 class Pixels:
     """Score: fraction of the pixels that are dead: in all flats of the group at the scan's begin they have less than a
-    fifth of the light around them. It is said at the first view, as a fact where they are few.
+    fifth of the light around them. It is said at the first view, as a fact where they are few. In a view also the
+    fraction that holds no number (NaN, infinite) but does in the darks and flats.
 
     The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
     """
@@ -44,7 +51,7 @@ class Pixels:
     name: ClassVar[str] = "pixels"
     bit: ClassVar[int] = 12
     unit: ClassVar[str] = "fraction of the pixels"
-    meaning: ClassVar[str] = "many pixels of the camera are dead"
+    meaning: ClassVar[str] = "many pixels of the camera are dead, or hold no number"
     policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
@@ -53,17 +60,29 @@ class Pixels:
         return PixelsState()
 
     def look(self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[PixelsState]:
+        holes = digest.invalid_fraction
+        if frame.kind is not FrameKind.PROJECTION:
+            state = replace(state, holes=max(state.holes, holes))
+        elif holes - state.holes > HOLES:
+            return Look(state, self._without_number(frame.index, holes - state.holes))
         if state.said:
             return Look(state)
         if frame.kind is FrameKind.FLAT:
             dead = _dead(frame, digest, context)
             if state.in_flats and state.dead is not None:
                 dead = np.intersect1d(state.dead, dead, assume_unique=True)
-            return Look(PixelsState(dead, in_flats=True))
+            return Look(replace(state, dead=dead, in_flats=True))
         state = replace(state, in_flats=False)
         if frame.kind is not FrameKind.PROJECTION or state.dead is None:
             return Look(state)
         return Look(replace(state, said=True), self._flag(frame, state.dead) if state.dead.size else None)
+
+    def _without_number(self, row: int, score: float) -> Flag:
+        advice = (
+            f"{score:.2%} of the pixels hold no number (NaN or infinite) that do in the darks and flats: the camera's "
+            "link, or the program that wrote them. `beamline recon` fills pixels, and leaves out a view without any."
+        )
+        return Flag(self.name, Level.ALARM if score > HALF else Level.WARN, row, score, HOLES, advice)
 
     def _flag(self, frame: Frame, dead: Places) -> Flag:
         rows, cols = np.unravel_index(dead, frame.counts.shape)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from drivers.frame import Frame
+from drivers.frame import Frame, FrameKind
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,9 @@ class Stuck:
         return StuckState()
 
     def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
-        """Compare checksums. Frames of a single grey value (a simulated dark without noise) are not compared."""
-        if digest.checksum != state.checksum or digest.variance == 0:
+        """Compare checksums. Darks and flats of a single grey value (simulated, without noise) are not compared."""
+        plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
+        if digest.checksum != state.checksum or plain:
             return Look(replace(state, checksum=digest.checksum, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (

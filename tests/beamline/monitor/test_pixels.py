@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,3 +44,21 @@ def test_what_is_dark_in_one_flat_only_and_the_shadow_of_a_slit_are_none(fake: A
     for frame in frames[5:]:
         frame.counts[:18] = np.minimum(frame.counts[:18], 205)  # its edge is within a block
     assert only(fake, frames) == []
+
+
+def with_hole(frame: Frame, value: float, cols: slice) -> Frame:
+    counts = frame.counts.astype(np.float32)
+    counts[:, cols] = value
+    return replace(frame, counts=counts)  # type: ignore[arg-type]  # a file may hold such
+
+
+def test_views_with_pixels_that_hold_no_number_are_flagged_unless_the_darks_have_them_too(fake: Any) -> None:
+    frames = fake.references() + fake.views(6)
+    frames[12] = with_hole(frames[12], np.nan, slice(None))
+    frames[14] = with_hole(frames[14], np.inf, slice(3, 4))
+    assert [(f.view, f.level, f.score) for f in only(fake, frames)] == [
+        (12, Level.ALARM, 1.0),
+        (14, Level.WARN, pytest.approx(1 / 96)),
+    ]
+    masked = [with_hole(frame, np.nan, slice(3, 4)) for frame in fake.references() + fake.views(3)]
+    assert only(fake, masked) == []

@@ -33,3 +33,9 @@ def test_one_changed_pixel_is_another_frame(fake: Any) -> None:
 def test_darks_without_noise_are_all_equal_and_say_nothing(fake: Any) -> None:
     darks = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
     assert only(fake.flags(darks)) == []
+
+
+def test_views_of_a_single_value_are_stuck_all_the_same(fake: Any) -> None:
+    references = fake.references()
+    views = [replace(frame, counts=np.full_like(frame.counts, 5000)) for frame in fake.views(4)]
+    assert [(f.view, f.score) for f in only(fake.flags(references + views))] == [(11, 1), (12, 2), (13, 3)]
