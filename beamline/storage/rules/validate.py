@@ -24,6 +24,9 @@ from drivers.frame import FrameKind
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
 
+_TURNS = 10  # fewer are not taken for degrees
+_FARTHEST = 1e6  # degrees
+
 SAMPLES = 4  # frames of a kind that are looked at
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
@@ -82,9 +85,18 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
 
 
 def angles_spread(source: ScanSource) -> Iterator[Finding]:
-    """The projections look from different directions, over half a turn, in degrees that were not taken for radians."""
+    """The projections look from different directions, over half a turn, and degrees were not taken for radians."""
     angles = source.angles[source.image_key == FrameKind.PROJECTION]
     if angles.size < 2 or not np.isfinite(angles).all():
+        return
+    farthest = float(np.abs(angles).max()) * 180 / np.pi
+    if farthest > _FARTHEST:
+        yield Finding(
+            "error",
+            "angle-spread",
+            f"The projections are at up to {farthest:.3g} degrees; expected at most {_FARTHEST:g}, beyond which angles are "
+            "not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
+        )
         return
     span = float(np.degrees(np.ptp(angles)))
     distinct = np.unique(np.round(np.degrees(angles), 6))
@@ -92,7 +104,14 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
         return
     step = span / (distinct.size - 1)
-    if span < 2 * 3.3 and angles.size > 30:
+    if span > 360 * _TURNS and _degrees_as_radians(angles, distinct.size):
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: are these degrees "
+            "under a label of radians? If so, give them with --angles FILE (degrees, one a line).",
+        )
+    elif span < 2 * 3.3 and angles.size > 30:
         yield Finding(
             "warning",
             "angle-spread",
@@ -104,6 +123,14 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angle-spread",
             f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
         )
+
+
+def _degrees_as_radians(angles: NDArray[np.float64], distinct: int) -> bool:
+    """Whether the numbers of radians are round, or span half a turn or a turn if they are read as degrees."""
+    span = float(np.ptp(angles))
+    round_numbers = np.allclose(angles * 100, np.round(angles * 100), rtol=0, atol=1e-3)
+    step = span / (distinct - 1)
+    return bool(round_numbers or any(abs(s / turn - 1) < 1e-3 for s in (span, span + step) for turn in (180, 360)))
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:

@@ -270,6 +270,28 @@ def test_degrees_that_are_radians(tmp_path: Path, clock: StandingClock, frames: 
     assert "radians" in hits[0].message
 
 
+@pytest.mark.parametrize(
+    ("theta", "severity", "said"),
+    [
+        (np.arange(0, 180, 3.0), "warning", "28.2 turns, or 177 in radians: are these degrees"),
+        (np.linspace(-90, 90, 61), "warning", "28.6 turns, or 180 in radians"),
+        (np.arange(0, 360, 360 / 61), "warning", "under a label of radians"),
+        (2.399963229728653 * np.arange(200), "", ""),  # golden angles
+        (np.radians(np.arange(0, 7200, 1.8)), "", ""),  # twenty turns
+        (np.linspace(0, 1.8e4, 60), "error", "up to 1.03e+06 degrees; expected at most 1e+06"),
+        (np.linspace(0, 1e300, 60), "error", "Are their units right"),
+    ],
+)
+def test_radians_that_are_degrees(tmp_path: Path, theta: np.ndarray, severity: str, said: str) -> None:
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, 5)).astype(np.uint16)
+        file["exchange/theta"] = theta
+        file["exchange/theta"].attrs["units"] = "rad"
+    hits = [finding for finding in validate(tmp_path / "s.h5") if finding.rule == "angle-spread"]
+    assert [hit.severity for hit in hits] == [severity] * bool(severity)
+    assert not hits or said in hits[0].message
+
+
 def test_float_frames_that_are_all_nan(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["exchange/data"] = np.full((4, 5, 6), np.nan, np.float32)
