@@ -15,7 +15,7 @@ from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from drivers.frame import FrameKind
-from recon.prep.correct import Correction, Projections, References
+from recon.prep.correct import Correction, Projections, References, UnlitViewsError
 from recon.prep.counts import Photons
 
 Warn = Callable[[str], None]
@@ -146,6 +146,11 @@ class ScanCorrection:
                 views = correction.transmission(data, frames.astype(np.float64), frames)
                 correction.survey(views)
             return correction.line_integrals(views, last)
+        except UnlitViewsError as error:
+            advice = "" if self._selection.judge else " (--flags judge leaves out what the monitor finds dark)"
+            raise DataError(
+                f"{self._refusal(error)}{advice}; if the sample covers these columns, --air none"
+            ) from error
         except ValueError as error:
             raise self._refusal(error) from error
 

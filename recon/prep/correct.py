@@ -14,6 +14,10 @@ from recon.prep.counts import Photons, of_view
 from recon.prep.defects import dead_pixels, zingers
 
 
+class UnlitViewsError(ValueError):
+    """The air columns of some views are dark."""
+
+
 @dataclass(frozen=True, eq=False)
 class References:
     """Darks and flats: the images without beam, and with beam but without a sample.
@@ -220,7 +224,7 @@ class Correction:
             last: no view comes after these.
 
         Raises:
-            ValueError: for views whose air columns are dark, by number.
+            UnlitViewsError: for views whose air columns are dark, by number.
         """
         settings, columns = self._settings, self.air_columns
         if views is None:
@@ -231,7 +235,7 @@ class Correction:
         air = light.mean(axis=1)
         unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
         if unlit.size:
-            raise ValueError(
+            raise UnlitViewsError(
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )

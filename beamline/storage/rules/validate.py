@@ -94,8 +94,8 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "angle-spread",
-            f"The projections are at up to {farthest:.3g} degrees; expected at most {_FARTHEST:g}, beyond which angles are "
-            "not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
+            f"The projections are at up to {farthest:.3g} degrees; expected at most {_FARTHEST:g}, beyond which "
+            "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
         )
         return
     span = float(np.degrees(np.ptp(angles)))
@@ -108,8 +108,8 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "angle-spread",
-            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: are these degrees "
-            "under a label of radians? If so, give them with --angles FILE (degrees, one a line).",
+            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: are these "
+            "degrees under a label of radians? If so, give them with --angles FILE (degrees, one a line).",
         )
     elif span < 2 * 3.3 and angles.size > 30:
         yield Finding(
