@@ -21,6 +21,7 @@ from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing, whole_file
 from beamline.core.text import spans
+from beamline.monitor.aside import Aside
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.projections.flagged_frames import worst_frames
@@ -69,8 +70,8 @@ def monitor(
 ) -> None:
     """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.
 
-    Prints the flags by check and level: frames, worst score, limit, where in the frame, what to do. FILE is not
-    changed.
+    Prints the flags by check and level: frames, worst score, limit, where in the frame, what to do; and which checks
+    could not look at which views. FILE is not changed.
 
     Exit code: 0 no alarm, 4 stopped, 7 alarms, or darks or flats with a fault.
     """
@@ -88,11 +89,11 @@ def monitor(
         progress = counting("monitor", sink, clock)
         found: list[tuple[Flag, ...]] = []
         active: set[tuple[str, Level]] = set()
-        n = 0
+        n, aside = 0, Aside()
         with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
             model = None if volume is None else rendered(volume, source)
             for judged in replay(source, checks, model=model, follow=clock if follow else None, should_stop=stopped):
-                n += 1
+                n, aside = n + 1, judged.aside
                 found.append(judged.flags)
                 if not follow:
                     progress(n, judged.n)
@@ -116,6 +117,7 @@ def monitor(
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
             "flags": counts_of(kinds), "references": references,
+            "aside": aside.said(),
             "kinds": [{**asdict(kind.worst), "rows": kind.rows} for kind in kinds],
         }  # fmt: skip
         for json_sink in json_sinks:
@@ -123,7 +125,8 @@ def monitor(
     if not as_json:
         end = f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"
         end += f"; {len(again)} views were taken again: rows {spans(sorted(again))} do not count" if again else ""
-        click.echo("\n".join([*table(kinds), *references, end]))
+        left_out = [f"Not looked at: {'; '.join(aside.said())}."] if aside.said() else []
+        click.echo("\n".join([*table(kinds), *references, *left_out, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.monitor.aside import Aside
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_rows
 from beamline.monitor.digest import digest
@@ -37,12 +38,14 @@ class Judged:
         kind: of the frame.
         flags: what the checks found.
         n: frames in the file so far.
+        aside: which checks left out views so far.
     """
 
     row: int
     kind: FrameKind
     flags: tuple[Flag, ...]
     n: int
+    aside: Aside
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ def replay(
         DataError: a followed file that is not finished and grows no more.
     """
     monitor, done, waited = start(replace(context_of(source), model=model), checks), 0, 0.0
+    aside = Aside()
     while True:
         ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
         n = source.refresh()
@@ -93,7 +97,8 @@ def replay(
                 frame = replace(frame, kind=FrameKind.PROJECTION)
             seen = digest(frame.counts, monitor.context.saturation, PREVIEW_BIN)
             monitor, flags = look(monitor, frame, seen)
-            yield Judged(frame.index, frame.kind, flags, n)
+            aside = aside.with_frame(monitor.context)
+            yield Judged(frame.index, frame.kind, flags, n, aside)
         if ended:
             return
         assert follow is not None

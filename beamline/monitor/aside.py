@@ -1,0 +1,48 @@
+"""Aside: which checks could not look at views of a scan, and why; without it a scan without findings reads as good."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from beamline.monitor.change import SPAN
+from beamline.monitor.check import ScanContext
+
+
+@dataclass(frozen=True)
+class Aside:
+    """Views with light so far, and those that checks left out.
+
+    Attributes:
+        views: of them.
+        alone: that were not compared with those before.
+        without_flats, cones, wider: views of a scan without flats, of a cone beam, of a sample wider than the field.
+    """
+
+    views: int = 0
+    alone: int = 0
+    without_flats: int = 0
+    cones: int = 0
+    wider: int = 0
+
+    def with_frame(self, context: ScanContext) -> Aside:
+        """After the next frame, of which the checks knew `context`."""
+        if context.view is None or context.grid is None:
+            return self
+        return Aside(
+            self.views + 1,
+            self.alone + (context.change is None),
+            self.without_flats + (not context.grid.flats),
+            self.cones + context.cone,
+            self.wider + (context.truncated and context.grid.flats),
+        )
+
+    def said(self) -> tuple[str, ...]:
+        """Checks, views and reason, one each; the first views only where all are: they have none before them."""
+        alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
+        reasons = (
+            ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),
+            ("gain, motion, floater, ghost, dips of beam", alone, "no four views before them at even steps of angle"),
+            ("opposite", self.cones, "cone beam"),
+            ("mass", self.wider, "sample wider than the field"),
+        )
+        return tuple(f"{checks} in {n} of {self.views} views ({why})" for checks, n, why in reasons if n)
