@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -12,18 +13,22 @@ from pydantic import Field
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import thinned
+from beamline.monitor.references import FEW, READOUT
 from drivers.frame import Frame, FrameKind
 
 TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
+SHUT = 3.0  # noises of a pixel of the dark by which flats are brighter where the shutter was shut for the dark
 
 
 @dataclass(frozen=True, eq=False)
 class DarkState:
-    """Preview blocks and mean counts of the first dark and mean of the first flat, None before any."""
+    """Preview blocks and mean counts of the first dark and mean of the first flat, None before any; `noise`: counts, of
+    a pixel of that dark."""
 
     blocks: NDArray[np.float32] | None = None
     dark: float | None = None
     flat: float | None = None
+    noise: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -50,16 +55,17 @@ class Dark:
             return self._look_at_dark(state, frame.index, digest)
         if frame.kind is FrameKind.FLAT and state.flat is None:
             state = replace(state, flat=digest.mean)
-            if state.dark is not None and state.dark > self.light * digest.mean:
+            if state.dark is not None and self._lit(state.dark, digest.mean, state.noise):
                 return Look(state, self._shutter_open(frame.index, state.dark / digest.mean))
         return Look(state)
 
     def _look_at_dark(self, state: DarkState, view: int, digest: FrameDigest) -> Look[DarkState]:
-        if state.flat is not None and digest.mean > self.light * state.flat:
+        noise = math.sqrt(digest.variance)
+        if state.flat is not None and self._lit(digest.mean, state.flat, noise):
             return Look(state, self._shutter_open(view, digest.mean / state.flat))
         blocks = digest.preview[thinned(digest.preview)]
         if state.blocks is None:
-            return Look(replace(state, blocks=blocks, dark=digest.mean))
+            return Look(replace(state, blocks=blocks, dark=digest.mean, noise=noise))
         drift = _trimmed_mean(blocks - state.blocks)
         if abs(drift) <= self.drift:
             return Look(state)
@@ -68,6 +74,11 @@ class Dark:
             "light."
         )
         return Look(state, Flag(self.name, Level.WARN, view, drift, self.drift, advice))
+
+    def _lit(self, dark: float, flat: float, noise: float) -> bool:
+        """The dark has light: not an offset below flats of few photons, which are bright against readout noise only."""
+        few = noise < READOUT and SHUT * noise < flat - dark < FEW * noise
+        return dark > self.light * flat and not few
 
     def _shutter_open(self, view: int, ratio: float) -> Flag:
         advice = (

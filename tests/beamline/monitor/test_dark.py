@@ -73,3 +73,16 @@ def test_light_on_a_part_of_the_dark_is_still_seen(rng: np.random.Generator, pre
     (flag,) = flags_of(frames, preview_bin)
     assert (flag.view, flag.level) == (4, Level.WARN)
     assert 5 < flag.score < 40 / 3
+
+
+@pytest.mark.parametrize(("photons", "found"), [(8.0, 0), (0.0, 1)])
+def test_an_offset_under_few_photons_is_no_light(photons: float, found: int) -> None:
+    """8 photons of a count each beside 2 counts of readout are light; none at all is a shutter in the wrong state."""
+    rng = np.random.default_rng(4)
+    frames = [
+        replace(frame, kind=kind, counts=(100 + rng.poisson(light, (32, 48)) + rng.normal(0, 2, (32, 48))).astype("u2"))
+        for frame, kind, light in zip(
+            small_darks(2, rng), (FrameKind.DARK, FrameKind.FLAT), (0.0, photons), strict=True
+        )
+    ]
+    assert len(flags_of(frames, 4)) == len(flags_of(frames[::-1], 4)) == found
