@@ -14,7 +14,7 @@ import recon
 from beamline.projections.correction import Warn
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
-from recon.assess.plans import Choice, Speeds, plans
+from recon.assess.plans import Choice, Speeds, best_steps, plans
 from recon.assess.time_model import duration_text
 from recon.auto import ROWS, part_of, predicts_best
 from recon.base.binning import bin_views
@@ -33,6 +33,7 @@ from recon.voxels.ordered_fista import subsets_of
 
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
 _RESERVE = 0.02  # of the budget, for what no part has measured
+_LATE = 0.1  # of the time used, when it is over, is what a volume of all pixels may take
 _SLAB = 16  # slices
 _FINISH_SHARE = 0.8  # of what is left after placing, at most: it adds more than most of the steps before it
 # What goes before the sweeps of a finish, in sweeps: the largest eigenvalue of a subset, projections and an FBP.
@@ -104,7 +105,14 @@ class _Budget:
         return self.seconds - (self.now() - self.begin)
 
     def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
-        """The best choice of each method (or of one) within this share of what is left."""
+        """The best choice of each method (or of one) within this share of what is left.
+
+        Where nothing is left, the cheapest without joined pixels, if it takes little of what was used already.
+        """
+        if self.left < _RESERVE * self.seconds:
+            full = plans(_LATE * (self.now() - self.begin), self.speeds, 1, self.methods)
+            if math.isfinite(full[0].gain):
+                return [min(full, key=lambda choice: choice.seconds)]
         # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
         left = max(share * self.left, sys.float_info.min)
         return plans(left, self.speeds, self.largest, self.methods if name is None else [name])
@@ -153,7 +161,8 @@ def within(
     found = plan.choices()
     choice, because = found[0], ""
     late = spent + choice.seconds - budget
-    if late > 0 and math.isfinite(late) and not math.isfinite(choice.gain):
+    over = late > 0 and plan.left < _RESERVE * budget
+    if late > 0 and math.isfinite(late) and (over or not math.isfinite(choice.gain)):
         warn(
             f"{duration_text(budget)} are too few for this scan: measuring this machine took {duration_text(spent)}, "
             f"and the cheapest choice, {_named(choice)}, will be about {duration_text(late)} late."
@@ -163,6 +172,8 @@ def within(
     prepared = joined(prepared, choice.binning)
     method = plan.method(choice, unbinned)
     end = begin + budget * (1 - _RESERVE)
+    if over and math.isfinite(choice.gain):
+        end = now() + choice.seconds
     if isinstance(method, R2):
         result = _fitted(method, prepared, seed, end, control)
     else:
@@ -221,7 +232,13 @@ def _fitted(method: R2, prepared: PreparedProjections, seed: int, end: float, co
     end -= (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
     sweeps, finishing = finish_within(_FINISH_SHARE * (end - now()), geometry, grid, now)
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    fit = replace(method, steps=None, seconds=max(0.0, end - now() - finishing), gaussians=placed, finish=sweeps)
+    fit = replace(
+        method,
+        steps=best_steps(method.name),
+        seconds=max(0.0, end - now() - finishing),
+        gaussians=placed,
+        finish=sweeps,
+    )
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
     control = replace(control, should_stop=_until(control, end))
     return recon.reconstruct(data, geometry, fit, grid=grid, seed=seed, use=use, control=control)

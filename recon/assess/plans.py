@@ -190,13 +190,18 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
     return [replace(min(shortest, key=lambda c: c.seconds), gain=-math.inf)]
 
 
+def best_steps(method: str) -> int:
+    """Steps of this method beyond which no measured curve gains: more follow the noise."""
+    return max(max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
+
+
 def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choice | None:
     """The choice of one kind that the time suffices for; None: it does not."""
     left, step = budget - curve.fixed(speeds, further), curve.step(speeds, further)
     first, last = curve.points[0][0], max(curve.points, key=lambda point: point[1])[0]
     if not left >= first * step:
         return None
-    # More steps than were best follow the noise.
+    # More steps than were best follow the noise, see `best_steps`.
     return _choice(curve, further, int(min(left / step, last)) if step > 0 else last, speeds)
 
 

@@ -130,6 +130,35 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
     assert len(warned) == 1
 
 
+@pytest.mark.parametrize("budget", [1e-3, 5.0])
+def test_what_the_measuring_has_used_up_joins_no_pixels_to_save_milliseconds(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
+) -> None:
+    clock = Ticking(1e-4)
+
+    def slow(*_: object) -> Speeds:
+        clock.time += 15.0
+        return Speeds(8e-3, 2.0, 0.1, 0.5, 0.2)
+
+    monkeypatch.setattr(module, "calibrate", slow)
+    warned: list[str] = []
+    done = _spend(prepared, budget, clock, warned)
+    assert (done.choice.method, done.choice.binning) == ("fbp", 1)
+    assert done.result.volume.grid == Grid.matching(prepared.geometry)
+    assert len(warned) == 1 and "the cheapest choice, fbp, will be about" in warned[0]
+
+
+def test_a_fit_with_much_time_ends_with_its_plan(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More steps than were best on other scans follow the noise."""
+    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
+    monkeypatch.setattr(module, "finish_within", lambda *_: (0, 0.0))
+    monkeypatch.setattr(module, "best_steps", lambda method: 7)
+    done = _spend(prepared, 60.0, Ticking(0.1), methods=(R2(),))
+    assert done.result.history[-1].step == 7 and done.seconds < 30
+
+
 @pytest.mark.slow
 def test_the_shortest_fit_is_said_to_be_late_too(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from recon.assess.plans import CURVES, PRESETS, Choice, Curve, Speeds, plans
+from recon.assess.plans import CURVES, PRESETS, Choice, Curve, Speeds, best_steps, plans
 from recon.methods import build, by_name
 
 SPEEDS = st.builds(
@@ -75,6 +75,13 @@ def test_with_little_time_it_is_fbp_and_with_much_every_method_is_there() -> Non
     assert {c.method for c in plans(60.0, leaning, 1000)} == {"fbp", "r2"}
     with pytest.raises(ValueError, match="positive"):
         plans(0.0, speeds, 100)
+
+
+def test_no_plan_has_more_steps_than_were_best() -> None:
+    speeds = Speeds(fbp=0.5, start=1.0, step=5e-3, fill=0.2, sweep=0.3)
+    found = {c.method: c.steps for c in plans(1e9, speeds, 1000)}
+    assert best_steps("fbp") == 1 and best_steps("r2") in {n for c in CURVES for n, _ in c.points if c.method == "r2"}
+    assert all(steps <= best_steps(method) for method, steps in found.items())
 
 
 def test_a_choice_is_settings_of_its_method() -> None:
