@@ -33,7 +33,7 @@ class MassState:
 
 @dataclass(frozen=True)
 class Mass:
-    """Score: relative change of the mean line integral. No finding where the detector's edge cuts the sample off."""
+    """Score: relative change of the mean line integral. None without light, or where the field cuts the sample."""
 
     name: ClassVar[str] = "mass"
     bit: ClassVar[int] = 5
@@ -54,6 +54,8 @@ class Mass:
         if max(view.edges) > AIR:
             return Look(replace(state, running=0))
         lit = float(grid.lit.mean())
+        if not lit:
+            return Look(state)
         mass = float(view.depth.mean()) / lit - sum(view.edges) / 2  # the beam's changes are not the sample's
         if state.usual is None:
             return Look(_calibrate(state, mass))

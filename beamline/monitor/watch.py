@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.change import SPAN, change_of
-from beamline.monitor.check import Check, Flag, ScanContext
+from beamline.monitor.check import Check, Flag, Look, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.preview import more_light
@@ -53,13 +53,33 @@ def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
     return Monitor(context, tuple(checks), tuple(check.start() for check in checks))
 
 
+class CheckError(Exception):
+    """A check raised; its cause is the error. `name` is the check's."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the check {name} failed")
+        self.name = name
+
+
+def without(monitor: Monitor, name: str) -> Monitor:
+    """The monitor without the check of this name."""
+    kept = [(check, state) for check, state in zip(monitor.checks, monitor.states, strict=True) if check.name != name]
+    return replace(monitor, checks=tuple(check for check, _ in kept), states=tuple(state for _, state in kept))
+
+
 def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, tuple[Flag, ...]]:
-    """Look at the next frame: the monitor after it, and what the checks found. O(blocks of the preview)."""
+    """Look at the next frame: the monitor after it, and what the checks found. O(blocks of the preview).
+
+    Raises:
+        CheckError: a check raised. The monitor that came in is as it was: go on `without` that check.
+    """
     monitor = _with_view(monitor, frame, digest)
-    looks = [
-        check.look(state, frame, digest, monitor.context)
-        for check, state in zip(monitor.checks, monitor.states, strict=True)
-    ]
+    looks: list[Look[Any]] = []
+    for check, state in zip(monitor.checks, monitor.states, strict=True):
+        try:
+            looks.append(check.look(state, frame, digest, monitor.context))
+        except Exception as error:
+            raise CheckError(check.name) from error
     after = replace(_with_reference(monitor, frame, digest), before=digest, states=tuple(look.state for look in looks))
     unbroken = frame.index - after.counted + 1
     return after, tuple(_from(look.flag, unbroken) for look in looks if look.flag is not None)

@@ -18,7 +18,7 @@ from beamline.core.events import Emit
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_rows
 from beamline.monitor.digest import FrameDigest, digest
-from beamline.monitor.watch import Monitor, look
+from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
@@ -203,11 +203,16 @@ class Recorder:
             self._emit("frame", {**data, "mean": found.mean})
 
     def _look(self, frame: Frame, found: FrameDigest) -> tuple[Flag, ...]:
-        """The monitor's flags. A check that raises costs no frame: it is a warning, and the monitor is switched off."""
+        """The monitor's flags. An error there costs no frame: a check that raises is off, and a warning says so."""
         if self._monitor_off:
             return ()
         try:
             self._monitor, flags = look(self._monitor, frame, found)
+        except CheckError as failed:
+            self._monitor = without(self._monitor, failed.name)
+            message = f"{failed} at row {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
+            self._emit("warning", {"message": message})
+            return self._look(frame, found)
         except Exception as error:
             self._monitor_off = True
             self._emit("warning", {"message": f"the monitor failed at row {frame.index} and is off: {error!r}"})

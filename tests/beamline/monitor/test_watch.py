@@ -11,6 +11,8 @@ import pytest
 from beamline.monitor import watch as scan
 from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import digest
+from beamline.monitor.stuck import Stuck
+from beamline.monitor.timing import Timing
 from drivers.frame import Frame, FrameKind
 
 CONTEXT = ScanContext(saturation=65535, pixels=100)
@@ -80,3 +82,28 @@ def test_a_finding_reaches_back_to_the_first_of_the_frames_of_its_kind(fake: Any
     assert [list(flag.rows) for flag in flags[10:]] == [
         [10], [10, 11], [10, 11, 12], [10, 11, 12, 13], [11, 12, 13, 14], [15],
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("dark", "flat", "views"), [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (0.0, 1e3, 1e3)]
+)
+def test_no_check_fails_on_scans_without_light_or_with_far_too_much(
+    fake: Any, dark: float, flat: float, views: float
+) -> None:
+    frames = fake.darks(light=dark) + fake.flats(light=flat) + fake.views(30, light=views)
+    still = [replace(frame, counts=frames[0].counts) for frame in frames]  # the same noise in all
+    for scan_of in (frames, still):
+        fake.flags(scan_of)
+
+
+def test_a_check_that_raises_names_itself_and_the_others_go_on(fake: Any) -> None:
+    class Broken(Stuck):
+        def look(self, *_: object) -> Any:
+            raise ZeroDivisionError
+
+    frame = fake.darks(1)[0]
+    monitor = scan.start(CONTEXT, (Broken(), Timing()))
+    with pytest.raises(scan.CheckError, match="the check stuck failed"):
+        scan.look(monitor, frame, digest(frame.counts, CONTEXT.saturation, 4))
+    after, _ = scan.look(scan.without(monitor, "stuck"), frame, digest(frame.counts, CONTEXT.saturation, 4))
+    assert [check.name for check in after.checks] == ["timing"]

@@ -21,6 +21,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import connect
 from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
+from beamline.monitor.mass import Mass
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.scan import recorder as recorder_module
@@ -281,6 +282,17 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     assert ran.error is None
     ran.assert_good_file(19, "complete")
     assert ["monitor failed at row 0" in event.data["message"] for event in ran.of("warning")] == [True]
+
+
+def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(Mass, "look", broken)
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
+    (warning,) = ran.of("warning")
+    assert "the check mass failed at row 0 and is off, the other checks go on" in warning.data["message"]
+    assert {event.data["check"] for event in ran.of("flag")} == {"stuck"}
 
 
 def test_an_interpreter_interrupt_closes_the_file_too(tmp_path: Path) -> None:
