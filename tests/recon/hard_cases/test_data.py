@@ -88,7 +88,8 @@ def test_constant_projections_leave_all_finite_and_are_explained_where_they_can_
 
 def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean: F32, truth: F32) -> None:
     rng = np.random.default_rng(1)
-    counts = rng.poisson(20_000 * np.exp(-clean)) + 100
+    good = rng.poisson(20_000 * np.exp(-clean)) + 100
+    counts = good.copy()
     hit = rng.random(counts.shape)
     counts[hit < 0.01] = 0  # less than the dark: a transmission below zero
     counts[hit > 0.99] = 65_535
@@ -97,13 +98,14 @@ def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean:
     given = correct(counts.astype(np.uint16), np.arange(32.0), references)
     assert np.isfinite(given.data).all()
     assert float(given.data.max()) <= -math.log(1e-4) + 1e-3  # the floor that the settings state
-    # -log of 0 is inf; and with those of no weight the fit is the clean one's but for noise.
+    # -log of 0 is inf; and with those of no weight the fit is nearly that of the same counts without them.
     weights = ((counts > 150) & (counts < 60_000)).astype(np.float32)
-    best, with_masks, without = (
+    best = correct(good.astype(np.uint16), np.arange(32.0), references)
+    of_good, with_masks, without = (
         psnr(truth, found.volume.data)
-        for found in (fitted(clean), fitted(given.data, weights=weights), fitted(given.data))
+        for found in (fitted(best.data), fitted(given.data, weights=weights), fitted(given.data))
     )
-    assert with_masks > best - 1.0
+    assert with_masks > of_good - 0.5
     assert with_masks > without
 
 
@@ -119,7 +121,13 @@ def test_values_that_are_not_finite_weigh_nothing_whatever_they_are(clean: F32, 
     )
     for other in volumes[1:]:
         np.testing.assert_array_equal(other, volumes[0])
-    assert psnr(truth, volumes[0]) > psnr(truth, fitted(clean, steps=150).volume.data) - 0.5
+    # One fit in three loses 0.8 dB by its seed alone.
+    losses = [
+        psnr(truth, fitted(clean, steps=150, seed=seed).volume.data)
+        - psnr(truth, fitted(np.where(bad, np.float32(np.nan), clean), steps=150, seed=seed).volume.data)
+        for seed in range(3)
+    ]
+    assert np.median(losses) < 0.5
 
 
 @pytest.mark.parametrize("value", [1e30, -1e30, 1e9, 3e3, 300.0])

@@ -36,7 +36,8 @@ def _start_and_data() -> tuple[Gaussians, np.ndarray]:
 )
 def test_steps_without_drift(steps: int, loss: float) -> None:
     start, data = _start_and_data()
-    settings = FitSettings(policy=None, tv_weight=0.0)
+    # A lower last rate than by default, for which the bounds below were measured: the loss falls as far as it lets.
+    settings = FitSettings(policy=None, tv_weight=0.0, pace=20.0, decay=0.03)
     problem = fit.problem_of(data, VIEWS, Grid.matching(VIEWS), 0.7, settings)
     state = fit.init(start, 0)
     losses: list[float] = []
