@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numba.core import event
 
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method
@@ -21,9 +25,14 @@ _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 
 
 def warm_up(
-    method: Method | None = None, geometry: Geometry | None = None, *, device: str = "cpu", weighted: bool = False
+    method: Method | None = None,
+    geometry: Geometry | None = None,
+    *,
+    device: str = "cpu",
+    weighted: bool = False,
+    on_kernel: Callable[[int], None] | None = None,
 ) -> None:
-    """Reconstruct a toy: a fit takes some 30 s on a machine that has never done it, a fraction of a second afterwards.
+    """Reconstruct a toy: a fit takes 1 to 2 minutes the first time on a machine, a fraction of a second later.
 
     numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
     What another kind of geometry, first volume or ray needs is compiled for it alone: leaning views, a cone or weights
@@ -34,6 +43,7 @@ def warm_up(
         geometry: of the run to come; None: a parallel beam, straight.
         device: that it will compute on.
         weighted: its rays have weights, or values that are not finite.
+        on_kernel: called with the number of functions compiled so far, after each; never where all are there.
 
     Raises:
         ValueError: the method does not take such views.
@@ -43,7 +53,24 @@ def warm_up(
     if weighted:
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
-    reconstruct(data, views, (method or R2()).toy(), device=device, use=DataUse(weights))
+    with _counted(on_kernel or (lambda n: None)):
+        reconstruct(data, views, (method or R2()).toy(), device=device, use=DataUse(weights))
+
+
+@contextmanager
+def _counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
+    class Counter(event.Listener):  # type: ignore[misc]
+        n = 0
+
+        def on_start(self, compilation: Any) -> None:
+            pass
+
+        def on_end(self, compilation: Any) -> None:
+            self.n += 1
+            on_kernel(self.n)
+
+    with event.install_listener("numba:compile", Counter()):
+        yield
 
 
 def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:

@@ -80,6 +80,9 @@ class Terminal:
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
         elif event.event == "progress" and event.data.get("stage") == "tradeoff":
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))
+        elif event.event == "progress" and event.data.get("stage") == "kernels":
+            note = f"{event.data['n']} compiled in {event.data['seconds']:.0f} s; once on a machine, 1 to 2 minutes"
+            self._show("kernels", event.data["n"], 0, note)
         elif event.event == "progress":
             self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
         elif event.event not in ("failed", "done"):  # the command prints these itself

@@ -69,8 +69,7 @@ def follow(
     wanted = None if options.truth is None else read_truth(options.truth)
     started = clock.now()
     warn = Warnings(sink, clock)
-    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
-    warm_up()
+    _compile(sink, clock)
     with _open(options, sink, clock, rhythm) as source:
         growing = ScanFollower(options, source, sink, clock, warn)
         _watch(growing, clock, rhythm)
@@ -83,6 +82,19 @@ def follow(
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
     growing.snapshot_path.unlink(missing_ok=True)
     return metrics
+
+
+def _compile(sink: Sink, clock: Clock) -> None:
+    """Compile what the fit needs, once on a machine, before the first view; the state `ready` says that it is there."""
+    begin = clock.now()
+
+    def compiled(n: int) -> None:
+        now = clock.now()
+        sink(Event("progress", now, {"stage": "kernels", "n": n, "seconds": now - begin}))
+
+    sink(Event("state", begin, {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    warm_up(on_kernel=compiled)
+    sink(Event("state", clock.now(), {"state": "ready", "message": "The live volume is ready for views"}))
 
 
 def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> ScanSource:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,7 @@ LiveCommand = Callable[[Path, Path], Sequence[str]]
 
 _SILENCE = 300.0  # real s without output, after which the process is ended
 _GRACE = 30.0  # real s in which it may still write the volume that it has
+_POLL = 0.1  # real s between two looks whether it is ready
 
 
 # Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
@@ -104,6 +107,7 @@ class LiveReconstruction:
     def __init__(self, command: Sequence[str], log: Path, emit: Emit) -> None:
         self._emit, self._log = emit, log
         self._done: Mapping[str, Any] | None = None
+        self._ready = threading.Event()
         self._process: ChildProcess | None = None
         try:
             with log.open("x", encoding="utf-8") as stderr:
@@ -111,6 +115,23 @@ class LiveReconstruction:
         except OSError as error:
             message = f"The live reconstruction could not be started ({error}). The scan goes on without it."
             emit("warning", {"message": message})
+
+    def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
+        """Wait until it has compiled its kernels and can take views, has ended, `stop` says so, or so many real s.
+
+        Where the time is over that is a warning: the scan need not wait for it.
+        """
+        deadline = time.monotonic() + seconds
+        while self._process is not None and self._process.running and not stop():
+            if self._ready.wait(_POLL):
+                return
+            if time.monotonic() >= deadline:
+                message = (
+                    f"The live reconstruction is not ready after {seconds:.0f} s. The scan begins; the volume takes "
+                    "its views up later."
+                )
+                self._emit("warning", {"message": message})
+                return
 
     def finish(self, stop: Callable[[], bool], hurry: Callable[[], bool]) -> Mapping[str, Any] | None:
         """Wait until it ends; the data of its `done` event, or None where it failed.
@@ -146,6 +167,8 @@ class LiveReconstruction:
             return
         event = str(data.pop("event"))
         data.pop("time", None)
+        if event == "state" and data.get("state") == "ready":
+            self._ready.set()
         if event == "done":
             self._done, event = data, "recon_done"
         elif event == "failed":

@@ -59,6 +59,9 @@ MESSAGES: Mapping[State, str] = {
 LAST_ROUND = 5.0
 """Real s that a live reconstruction has after a scan that was stopped, before it is asked for the volume it has."""
 
+READY_WITHIN = 300.0
+"""Real s that a scan waits for its live reconstruction before the first frame: it compiles, once on a machine."""
+
 UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
     "the last frames are being written"
@@ -191,6 +194,7 @@ class _Run:
             if command is not None:
                 follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit)
                 ending.callback(follower.close)
+                follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
             return self._acquire_and_follow(writer, follower, release)
 
     def _acquire_and_follow(

@@ -8,12 +8,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
+from recon import warm_up as module
 from recon.base.geometry import Geometry
 from recon.voxels.view_weights import covers_the_circle
-from recon.warm_up import toy_of
+from recon.warm_up import toy_of, warm_up
 
 # In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
 _SCRIPT = """
@@ -108,3 +110,14 @@ def test_a_toy_is_of_the_same_kind(turn: float) -> None:
     assert toy.sample_pitch * toy.detector_shape[1] == pytest.approx(cone.sample_pitch * 200)  # as wide a cone
     _, plain = toy_of()
     assert not plain.is_cone and plain.is_straight and not plain.shifts.any()
+
+
+def test_it_counts_what_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    def compiles(*_: object, **__: object) -> None:
+        for _ in range(2):
+            numba.njit(lambda x: x + 1)(1.0)
+
+    monkeypatch.setattr(module, "reconstruct", compiles)
+    counted: list[int] = []
+    warm_up(on_kernel=counted.append)
+    assert counted == [1, 2]

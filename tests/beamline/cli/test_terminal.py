@@ -110,6 +110,12 @@ def test_the_fit_has_a_bar_of_its_own() -> None:
     assert "90/360" in text
 
 
+def test_compilation_is_told_with_its_time() -> None:
+    progress = {"stage": "kernels", "n": 12, "seconds": 19.4}
+    said = "kernels: 12 compiled in 19 s; once on a machine, 1 to 2 minutes\n"
+    assert shown(io.StringIO(), ("progress", progress)) == said
+
+
 def test_a_fit_with_an_end_says_how_far_it_is() -> None:
     progress = {
         "step": 500, "steps": 2000, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344, "held_out": None,

@@ -141,7 +141,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
 
     names = [event.event for event in events]
     assert names[0] == "state"
-    assert [event.data["state"] for event in events[:2]] == ["warming_up", "waiting"]
+    assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
     assert names.count("recon_started") == 1
     assert "snapshot" in names
     assert names[-1] == "done"

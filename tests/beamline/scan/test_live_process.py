@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,11 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     assert "--bin" not in follow_command(small())(Path("scan.h5"), Path("recon.h5"))
 
 
+READY = """print('{"event": "state", "state": "ready"}', flush=True)\n"""
+
+
 def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
-    return lambda scan, output: [sys.executable, "-c", code, str(scan), str(output)]
+    return lambda scan, output: [sys.executable, "-c", READY + code, str(scan), str(output)]
 
 
 def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
@@ -61,12 +65,38 @@ print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col
     assert ran.result is not None
     assert ran.folder is not None
     recon = [(e.event, e.data["source"]) for e in ran.events if "source" in e.data]
-    assert recon == [("snapshot", "recon"), ("recon_done", "recon")]
+    assert recon == [("state", "recon"), ("snapshot", "recon"), ("recon_done", "recon")]
     assert ran.result.recon is not None
     assert ran.result.recon["axis_col"] == 80.5
     assert Path(ran.result.recon["output"]) == ran.folder / "recon.h5"
     assert ran.events[-1].event == "done"
     ran.assert_good_file(19, "complete")
+
+
+@pytest.mark.parametrize("patience", [100.0, 0.0])
+def test_no_frame_is_taken_before_it_is_ready_or_the_time_to_wait_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patience: float
+) -> None:
+    monkeypatch.setattr(module, "READY_WITHIN", patience)
+    compiles = "import time; time.sleep(0.5)\n" + READY
+    ran = Ran(
+        tmp_path, FakeInstrument(), live=lambda scan, output: [sys.executable, "-c", compiles, str(scan), str(output)]
+    )
+    assert ran.error is None
+    names = [(event.event, event.data.get("state")) for event in ran.events]
+    began = next(i for i, (name, _) in enumerate(names) if name == "block_started")
+    warned = any("not ready after 0 s" in event.data["message"] for event in ran.of("warning"))
+    assert (names.index(("state", "ready")) < began) == (not warned) == (patience > 0)
+
+
+def test_a_stop_ends_the_wait_for_it(tmp_path: Path) -> None:
+    stop = StopRequest()
+    stop_soon = threading.Timer(0.3, stop.stop)
+    stop_soon.start()
+    idle = "import time; time.sleep(100)"
+    ran = Ran(tmp_path, FakeInstrument(), stop=stop, live=lambda scan, output: [sys.executable, "-c", idle])
+    stop_soon.join()
+    assert type(ran.error) is ScanAborted and "before anything was acquired" in str(ran.error)
 
 
 @pytest.mark.parametrize(
