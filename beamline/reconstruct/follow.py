@@ -46,8 +46,8 @@ def follow(
 ) -> dict[str, float]:
     """Reconstruct a scan while it runs (or one that has ended). Returns the metrics; the event `done` says the rest.
 
-    Intermediate volumes stand in `<output>.snapshot.h5`, each replacing the last in one step; a failure leaves the
-    newest one, success none.
+    Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`, each replacing the last
+    in one step; a failure leaves the newest ones, success none.
 
     Raises:
         ConfigError: a method or selection that needs the whole scan.
@@ -80,7 +80,7 @@ def follow(
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = ReportContext(facts, options.selection, options.command, options.seed, warn.messages, started)
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
-    growing.snapshot_path.unlink(missing_ok=True)
+    growing.remove_snapshot()
     return metrics
 
 

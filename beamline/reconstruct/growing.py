@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
+from beamline.core.files import named_on_failure, whole_file
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
@@ -29,12 +32,14 @@ from beamline.projections.selection import check_axis, cone_of, geometry_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import ReconOutcome
+from beamline.report.live_picture import LivePicture
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
 from drivers.frame import FrameKind
 from recon.base.method import DataUse, Progress, ReconProblem
 from recon.base.views import parse_views
+from recon.base.volume import Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections, joined
 from recon.splatting.finish import finish
@@ -66,6 +71,7 @@ class ScanFollower:
         self._begin = clock.now()
         output = options.target.output
         self.snapshot_path: Path = output.with_name(f"{output.stem}.snapshot.h5")
+        self.picture_path: Path = output.with_name(f"{output.stem}.live.png")
 
     @property
     def n_views(self) -> int:
@@ -213,11 +219,12 @@ class ScanFollower:
         progress_events(self._sink, self._clock)(progress)
 
     def write_snapshot(self) -> None:
-        """The volume as it stands, in place of the last snapshot."""
+        """The volume as it stands, and its picture, in place of the last ones."""
         assert self._fit is not None
+        unit = "mm" if self.source.pixel_size_mm or self._options.selection.pixel_size_mm else "px"
         record = ReconRecord(
             volume=self._fit.snapshot(),
-            length_unit="mm" if self.source.pixel_size_mm or self._options.selection.pixel_size_mm else "px",
+            length_unit=unit,
             raw_file=str(self.source.path.resolve()),
             title=f"Snapshot from {self._fit.n_views} views",
             sample=str(self.source.attributes.get("sample", "not stated")),
@@ -226,13 +233,36 @@ class ScanFollower:
         )
         try:
             write_reconstruction(self.snapshot_path, record, replace=True)
+            self._write_picture(self._fit, record.volume, unit)
         except DataError as error:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
             self._warn(f"A snapshot was left out: {error}")
             return
         seconds = self._clock.now() - self._begin
-        data = {"path": self.snapshot_path, "n_views": self._fit.n_views, "seconds": seconds}
+        data = {
+            "path": self.snapshot_path,
+            "picture": self.picture_path,
+            "n_views": self._fit.n_views,
+            "seconds": seconds,
+            "unlearnt": self._fit.unlearnt,
+        }
         self._sink(Event("snapshot", self._clock.now(), data))
+
+    def _write_picture(self, fit: StreamingFit, volume: Volume, unit: str) -> None:
+        new = f"residual of new views {fit.unlearnt:.3f}, " if math.isfinite(fit.unlearnt) else ""
+        title = (
+            f"{fit.n_views} views so far, {new}{fit.progress().n_gaussians} Gaussians, "
+            f"{self._clock.now() - self._begin:.0f} s after the first look"
+        )
+        picture = LivePicture(volume, *fit.newest_view(), title, unit)
+        with whole_file(self.picture_path, replace=True) as partial, named_on_failure(self.picture_path):
+            partial.write_bytes(picture.png())
+
+    def remove_snapshot(self) -> None:
+        """The volume is delivered: what stood in for it goes."""
+        for path in (self.snapshot_path, self.picture_path):
+            with suppress(PermissionError):  # Windows removes no file that a viewer holds open
+                path.unlink(missing_ok=True)
 
     def finish(
         self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]

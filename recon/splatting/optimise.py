@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -159,22 +159,22 @@ def run_steps(
 
 def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> float:
     """||rendered - measured|| / ||measured|| over all views of a problem, root mean square of the views' own."""
+    rendered = renders(state, problem, settings, range(problem.geometry.n_views))
+    squares = [
+        float(problem.backend.misfit(image, problem.images[view], problem.weights[view])) ** 2
+        for view, image in enumerate(rendered)
+    ]
+    return float(np.mean(squares)) ** 0.5
+
+
+def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: Iterable[int]) -> Iterator[Any]:
+    """What the model says of these views [row, col], in units of the problem's images, on its device."""
     p, cut = state.parameters, settings.truncation
     run = problem.backend.begin(
         p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel
     )
-    squares = [
-        float(
-            problem.backend.misfit(
-                run.view(problem.geometry, view, cut.faint, cut.sigmas, settings.rays).image,
-                problem.images[view],
-                problem.weights[view],
-            )
-        )
-        ** 2
-        for view in range(problem.geometry.n_views)
-    ]
-    return float(np.mean(squares)) ** 0.5
+    for view in views:
+        yield run.view(problem.geometry, view, cut.faint, cut.sigmas, settings.rays).image
 
 
 def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussians:

@@ -9,6 +9,7 @@ not forgotten; Meuleman et al. 2025).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,6 +33,7 @@ Clock = Callable[[], float]
 _NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _ROUND = 400.0  # steps over which the rates decay within a round
+_NEW = 0.2  # weight of the newest of the views that were looked at before they were learnt
 _BLIND = 100.0  # data so many times larger than the density unit implies: the first views showed no sample
 _ROUND_GROWTH = 0.1  # share of the first count that a round may add; the last round may add the rest of the growth
 
@@ -111,6 +113,8 @@ class StreamingFit:
         self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
         self._round_views, self._round_step, self._placed = 0, 0, 0
+        self.unlearnt = math.nan
+        """||rendered - measured|| / ||measured|| of new views before a step has seen them, running mean."""
 
     @property
     def n_views(self) -> int:
@@ -145,6 +149,23 @@ class StreamingFit:
         else:
             self._problem = extend(self._problem, images, theta)
         self._angles.extend(theta.tolist())
+        if self._state is not None:
+            measured, rendered = self.newest_view()
+            left = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
+            kept = self.unlearnt if math.isfinite(self.unlearnt) else left
+            self.unlearnt = (1 - _NEW) * kept + _NEW * left
+
+    def newest_view(self) -> tuple[F32, F32]:
+        """The newest view and what the model says of it, line integrals [row, col].
+
+        Raises:
+            ValueError: there is no model yet.
+        """
+        if self._state is None or self._problem is None:
+            raise ValueError("there is no model yet, and nothing to compare the newest view with")
+        problem = self._problem
+        (image,) = fit.renders(self._state, problem, self._settings, [self.n_views - 1])
+        return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale
 
     def replace_views(self, data: F32) -> None:
         """Other line integrals [view, row, col] of all views so far, in their order: their correction has changed.

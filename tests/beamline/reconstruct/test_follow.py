@@ -322,17 +322,25 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     clock = ScanClock()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     seen: list[tuple[int, float]] = []
+    unlearnt: list[float] = []
 
     def look(event: Event) -> None:
         if event.event == "snapshot":
             record = read_reconstruction(Path(event.data["path"]))
             assert record.parameters["n_views"] == event.data["n_views"]
+            picture = Path(event.data["picture"])
+            assert picture == tmp_path / "recon.live.png" and picture.read_bytes().startswith(b"\x89PNG")
+            unlearnt.append(event.data["unlearnt"])
             seen.append((event.data["n_views"], psnr(SCAN.truth(record.volume.grid), record.volume.data)))
 
     follow(_options(tmp_path), look, clock, RHYTHM)
     assert len(seen) >= 3
     assert seen[-1][0] > seen[0][0]
     assert max(quality for _, quality in seen) > 18
+    known = [u for u in unlearnt if np.isfinite(u)]
+    assert known[-1] < known[0] < 1  # of views that no step had seen
+    assert not (tmp_path / "recon.live.png").exists()  # nor the snapshot: the volume is there
+    assert not (tmp_path / "recon.snapshot.h5").exists()
 
 
 def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -> None:

@@ -1,0 +1,65 @@
+"""The picture of a growing volume: where things are in it, and that the difference is in units of the noise."""
+
+from __future__ import annotations
+
+import io
+import time
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from beamline.report.live_picture import LivePicture
+from recon.base.volume import Grid, Volume
+
+SIDE, GAP, LINE = 280, 14, 15
+
+
+def shown(picture: LivePicture) -> np.ndarray:
+    """[row, col, rgb] of the picture, row 0 at the bottom."""
+    return matplotlib.image.imread(io.BytesIO(picture.png()))[::-1, :, :3]
+
+
+def panel(image: np.ndarray, across: int, up: int) -> np.ndarray:
+    left, bottom = GAP + across * (SIDE + GAP), GAP + up * (SIDE + 2 * LINE + GAP)
+    return image[bottom : bottom + SIDE, left : left + SIDE]
+
+
+@pytest.mark.parametrize("side", [40, 280, 700])
+def test_slices_are_where_the_matter_is(side: int, rng: np.random.Generator) -> None:
+    grid = Grid((4, side, side), 0.01)
+    volume = np.zeros(grid.shape, np.float32)
+    volume[1:3, side // 2 : 3 * side // 4, side // 4 : side // 2] = 2.0
+    view = rng.normal(0, 0.1, (20, side)).astype(np.float32)
+    image = shown(LivePicture(Volume(volume, grid), view, view, "20 views", "mm"))
+    slice_ = panel(image, 0, 1)
+    scale = SIDE // side if side < SIDE else 1 / -(-side // SIDE)
+    y, x = (round(f * side * scale) for f in (0.625, 0.375))
+    assert slice_[y, x].min() > 0.95 and slice_[x, y].max() < 0.05  # y up, x to the right
+    assert panel(image, 2, 0)[: round(20 * scale)].min() > 0.99  # a view like its render differs by nothing
+
+
+def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None:
+    grid = Grid((8, 64, 64), 0.01)
+    volume = Volume(np.ones(grid.shape, np.float32), grid)
+    view = rng.normal(0, 0.1, (64, 64)).astype(np.float32)
+    render = np.zeros((64, 64), np.float32)
+    render[:32] = -0.5  # five times the noise less than the view
+    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 0)
+    red, _, blue = (difference[..., k].mean(axis=1) for k in range(3))
+    assert blue[10:110].mean() < 0.35 < 0.8 < red[10:110].mean()
+    assert blue[150:250].mean() == pytest.approx(red[150:250].mean(), abs=0.05)  # noise alone
+
+
+@pytest.mark.bench
+def test_the_time_that_it_takes_beside_a_fit(rng: np.random.Generator) -> None:
+    grid = Grid((256, 256, 256), 0.01)
+    volume, view = Volume(rng.random(grid.shape, np.float32), grid), rng.random((256, 256), np.float32)
+    picture = LivePicture(volume, view, 0.9 * view, "180 views so far", "mm")
+    seconds = []
+    for _ in range(5):
+        before = time.process_time()
+        picture.png()
+        seconds.append(time.process_time() - before)
+    print(f"{np.median(seconds):.2f} CPU s a picture of 256³ voxels")
+    assert np.median(seconds) < 0.3
