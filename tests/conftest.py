@@ -23,6 +23,15 @@ settings.register_profile("thorough", deadline=None, max_examples=10_000, print_
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work."""
+    if hasattr(config, "workerinput"):
+        numba.set_num_threads(max(1, numba.get_num_threads() // config.workerinput["workercount"]))
+        import torch  # here, as tests without it start in half the time
+
+        torch.set_num_threads(1)
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Before workers run the whole suite: kernels are compiled once, not by each of them (see compile_kernels)."""
     config = session.config

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numba
@@ -77,25 +75,22 @@ def _late(kind: str, warm: str) -> list[str]:
     return done.stdout.removeprefix("late:").split()
 
 
-@pytest.fixture(scope="module")
-def late() -> Iterator[Callable[[str, str], list[str]]]:
-    """`_late`, its processes two at a time, since each only uses one core."""
-    with ThreadPoolExecutor(2) as pool:
-        wanted = [*((kind, _OF_THE_FIT) for kind in _KINDS), (_EXACT, _OF_A_PARALLEL_BEAM)]
-        found = {case: pool.submit(_late, *case) for case in wanted}
-        yield lambda kind, warm: found[kind, warm].result()
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param("parallel", marks=pytest.mark.slow),
+        "parallel, some views lean, all are shifted, weights",
+        pytest.param("cone", marks=pytest.mark.slow),
+        _EXACT,
+    ],
+)
+def test_a_fit_after_warm_up_compiles_nothing(kind: str) -> None:
+    assert _late(kind, _OF_THE_FIT) == []
 
 
-@pytest.mark.parametrize("kind", _KINDS)
-def test_a_fit_after_warm_up_compiles_nothing(late: Callable[[str, str], list[str]], kind: str) -> None:
-    assert late(kind, _OF_THE_FIT) == []
-
-
-def test_a_cones_fit_would_compile_after_a_warm_up_for_a_parallel_beam(
-    late: Callable[[str, str], list[str]],
-) -> None:
+def test_a_cones_fit_would_compile_after_a_warm_up_for_a_parallel_beam() -> None:
     """That is, the count above sees what it should see."""
-    found = late(_EXACT, _OF_A_PARALLEL_BEAM)
+    found = _late(_EXACT, _OF_A_PARALLEL_BEAM)
     assert any("_forward.<locals>.kernel" in name for name in found) and "_bend" in found
 
 

@@ -27,14 +27,14 @@ gpu = importlib.import_module("recon.kernels.gpu")
 
 
 def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettings) -> tuple[fit.FitState, list]:
-    """Five steps with rounds of density control on data and weights that are always the same."""
+    """Three steps with a round of density control on data and weights that are always the same."""
     rng = np.random.default_rng(5)
     data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
     weights = (rng.random(data.shape) > 0.1).astype(np.float32)
     problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
     state, records = fit.init(g, 11, 1.5, backend), []
     fit.run_steps(
-        state, problem, settings, 5, lambda s: records.append((s.n, float(s.loss), float(s.residual))) is not None
+        state, problem, settings, 3, lambda s: records.append((s.n, float(s.loss), float(s.residual))) is not None
     )
     return state, [*records, fit.misfit_of(state, problem, settings)]
 
@@ -43,7 +43,7 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettin
     ("make", "kernel", "changes"),
     [
         (parallel, Kernel.GAUSSIAN, {"loss": "poisson", "views_per_step": 2}),
-        (cone, Kernel.COMPACT, {"loss": "l1", "rays": RayModel(exact_above=0.05)}),
+        pytest.param(cone, Kernel.COMPACT, {"loss": "l1", "rays": RayModel(exact_above=0.05)}, marks=pytest.mark.slow),
     ],
 )
 def test_a_fit_is_the_same_on_both_backends(
