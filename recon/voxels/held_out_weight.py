@@ -1,4 +1,4 @@
-"""A smaller weight of total variation, where views held out show that the one by the noise hides detail."""
+"""The weight of total variation that views held out prefer, where the one by the noise hides detail."""
 
 from __future__ import annotations
 
@@ -55,32 +55,35 @@ def busiest_rows(data: F32, height: int) -> slice:
 def choose_weight(
     problem: VoxelProblem, start: F32, *, modelled: bool, unmodelled: float | None = None
 ) -> NoiseBalance | float:
-    """The weight by the noise, or a smaller one by views held out; arguments as `NoiseBalance.of`."""
+    """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`."""
     balance = NoiseBalance.of(problem, start, modelled, unmodelled)
-    found = smaller_weight(problem, balance.first) if unmodelled is None else None
+    found = preferred_weight(problem, balance.first) if unmodelled is None else None
     return balance if found is None else found
 
 
-def smaller_weight(problem: VoxelProblem, first: float) -> float | None:
-    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, below `first` that views held out prefer; None: none is.
+def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
+    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, that views held out prefer, unless it is far above `first`.
 
-    Volumes of 16 rows are reconstructed from seven of eight views with the weight halved, until the root mean square of
-    what they leave of the other views rises; the vertex of the parabola through the last three is taken. A volume that
-    is too smooth misses the edges in unseen views. Larger weights are not tried: from fewer views than the scan has,
-    unseen ones prefer a volume that is too smooth (a walnut of 50 views lost 1.3 dB). None, too, where nothing can be
+    Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, the weight and half of it, and
+    on, until the root mean square of what they leave of the other views rises; the vertex of the parabola through the
+    last three is taken, at most √2 of `first`. A volume that is too smooth misses the edges in unseen views, one that
+    follows the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their number.
+
+    None where twice the weight does not leave more: then nothing shows that the weight by the noise hides anything, and
+    it may rise. (Weights far above it are not taken: a walnut of 50 views lost 1.3 dB.) None, too, where nothing can be
     held out: a cone, fewer than 16 views, or data without noise.
     """
     geometry = problem.projector.geometry
     if geometry.is_cone or geometry.n_views < LEAST_VIEWS or not first > 0:
         return None
     error = _Trial.of(problem)
-    heavier, here, lighter = math.inf, error(first), error(first / 2)
-    halvings = 0
+    heavier, here = error(2 * first), error(first)
+    if heavier <= here:
+        return None
+    lighter, halvings = error(first / 2), 0
     while lighter < here and halvings < _HALVINGS:
         heavier, here, lighter = here, lighter, error(first / 2 ** (halvings + 2))
         halvings += 1
-    if halvings == 0:
-        return None
     curvature = lighter - 2 * here + heavier
     vertex = (lighter - heavier) / (2 * curvature) if lighter >= here and curvature > 0 else 0.0
     return float(first * 2 ** (vertex - halvings))
@@ -121,9 +124,8 @@ class _Trial:
 
     def __call__(self, weight: float) -> float:
         """Root mean square of what the volume with this weight leaves of the views held out."""
-        share = len(self._problem.data) / (len(self._problem.data) + len(self._unseen.data))
         x = ordered_fista(
-            self._problem, self._start.copy(), weight * share,
+            self._problem, self._start.copy(), weight,
             sweeps=_SWEEPS, subsets=_SUBSETS, tv_steps=_TV_STEPS,
         )  # fmt: skip
         left = self._unseen.projector.forward_lines(x)

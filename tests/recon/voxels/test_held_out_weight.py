@@ -1,6 +1,9 @@
-"""Where the weight by the noise hides detail, views held out find a smaller one; elsewhere it stays."""
+"""Where the weight by the noise hides detail, views held out find another one; elsewhere it stays."""
 
 from __future__ import annotations
+
+import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
-from recon.voxels.held_out_weight import LEAST_VIEWS, busiest_rows, slab_of, split_views
+from recon.voxels.held_out_weight import LEAST_VIEWS, busiest_rows, preferred_weight, slab_of, split_views
 from recon.voxels.projector import Projector
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
@@ -41,7 +44,7 @@ def test_a_texture_survives(
     data, geometry, grid, truth = foam
     peak = float(truth.max())
     found = recon.reconstruct(data, geometry, method, grid=grid).volume.data
-    monkeypatch.setattr("recon.voxels.held_out_weight.smaller_weight", lambda problem, first: None)
+    monkeypatch.setattr("recon.voxels.held_out_weight.preferred_weight", lambda problem, first: None)
     by_noise = recon.reconstruct(data, geometry, method, grid=grid).volume.data
     assert psnr(truth, found, peak) > psnr(truth, by_noise, peak) + 2
 
@@ -52,8 +55,59 @@ def test_an_even_disc_keeps_the_weight_by_the_noise(monkeypatch: pytest.MonkeyPa
     data = Projector(geometry, Grid.matching(geometry)).forward((np.hypot(x, y) < 25).astype(np.float32))
     data += rng.normal(0, 1, data.shape).astype(np.float32)
     found = recon.reconstruct(data, geometry, FistaTv()).volume.data
-    monkeypatch.setattr("recon.voxels.held_out_weight.smaller_weight", lambda problem, first: None)
+    monkeypatch.setattr("recon.voxels.held_out_weight.preferred_weight", lambda problem, first: None)
     np.testing.assert_array_equal(recon.reconstruct(data, geometry, FistaTv()).volume.data, found)
+
+
+@pytest.fixture(scope="module")
+def cracked() -> tuple[F32, Geometry]:
+    """A disc with a straight crack two pixels wide and 0.9 deep, from 80 views of 300 photons a pixel."""
+    rng = np.random.default_rng(2)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 80, endpoint=False), (ROWS, COLS), 1.0)
+    fine = Geometry.parallel(geometry.angles, (ROWS, 2 * COLS), 0.5)
+    _, y, x = (np.indices((ROWS, 2 * COLS, 2 * COLS)) - 63.5) / 2
+    truth = np.where((abs(y) < 1) & (abs(x) < 14), 0.1, 1.0) * (np.hypot(x, y) < 27) * 0.028
+    clean = Projector(fine, Grid((ROWS, 2 * COLS, 2 * COLS), 0.5, slice_pitch=0.5)).forward(truth.astype(np.float32))
+    light = np.exp(-clean).reshape(80, ROWS, COLS, 2).mean(axis=3)
+    return -np.log(np.maximum(rng.poisson(300 * light), 0.5) / 300).astype(np.float32), geometry
+
+
+def _depth(volume: F32) -> float:
+    profile = volume[:, :, 20:44].mean(axis=(0, 2), dtype=np.float64)
+    return 1 - float(profile[31:33].mean() / profile[[26, 27, 28, 35, 36, 37]].mean())
+
+
+def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
+    cracked: tuple[F32, Geometry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
+    monkeypatch.setattr("recon.voxels.held_out_weight.preferred_weight", lambda problem, first: None)
+    by_noise = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
+    fbp = _depth(recon.reconstruct(*cracked, "fbp").volume.data)
+    assert by_noise < 0.8 * fbp
+    assert found > 0.9 * fbp
+
+
+@pytest.mark.parametrize("best", [0.05, 0.3, 0.7, 1.0, 1.3])
+def test_the_weight_with_the_smallest_error_is_found(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error that is a parabola of log μ has its vertex where a parabola through three points has it."""
+    _errors(best, monkeypatch)
+    assert preferred_weight(_views(), 3.0) == pytest.approx(3.0 * best)
+
+
+@pytest.mark.parametrize("best", [1.5, 10.0])
+def test_a_weight_far_above_that_by_the_noise_is_not_taken(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    _errors(best, monkeypatch)
+    assert preferred_weight(_views(), 3.0) is None
+
+
+def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Mock(of=lambda problem: lambda weight: 1 + math.log(weight / (3.0 * best)) ** 2)
+    monkeypatch.setattr("recon.voxels.held_out_weight._Trial", trial)
+
+
+def _views() -> Mock:
+    return Mock(**{"projector.geometry": Geometry.parallel(np.linspace(0, 3, 40), (4, 8), 1.0)})
 
 
 def test_one_view_of_eight_is_held_out_and_the_others_are_not() -> None:
