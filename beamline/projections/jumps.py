@@ -22,7 +22,7 @@ LARGEST = 0.5  # pixels that nobody sees: a doubled edge as wide as the resoluti
 ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits has no more
 _LEVELS = ((64, 2), (128, 4), (320, 2))  # columns, at most, and volumes of all views
 _ROUGH = 2  # levels that tell whether there was a jump
-_HELPS = 0.01  # share of the deviation that a jump takes away
+_HELPS = 0.005  # share of the deviation that a jump takes away, or a part may add
 _ROWS = 16  # joined rows looked at
 _VIEWS = 360  # looked at, and all of parts that have no more than
 _SHORT = 40
@@ -62,8 +62,9 @@ def longest_part(frames: I64, jumps: I64) -> I64:
 def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64, axis_col: float) -> Jumps:
     """Where the sample was in each part of a scan between jumps, and which of the views can be used.
 
-    A part is corrected where views held out of the longest part are predicted better with it than without, and its own
-    views about as well; otherwise it is left out. A jump below half a pixel is none.
+    A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
+    A part stays where views held out of the longest part are predicted with it as well as without, and its own views
+    about as well; otherwise it is left out. A jump below half a pixel is none.
 
     Args:
         frames: rows of the file that are to be used.
@@ -81,30 +82,77 @@ def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64
         )
     fit = _Fit(source, selection, axis_col, frames, jumps)
     clusters = _clusters(fit.sizes)
-    if len(clusters) > 1:
-        clusters = _needed(fit, clusters)
-    groups = _groups(fit.sizes, clusters)
-    moves, verdict = [Displacement()], None
-    if groups.max() > 0:
-        moves, verdict = fit.moves(groups)
-        if fit.largest(moves) < LARGEST:
-            clusters, moves, verdict = [], [Displacement()], None
-            groups = _groups(fit.sizes, clusters)
-    real = np.array([i for first, last in clusters for i in range(first, last + 1)], np.int64)
-    return _done(fit, groups, moves, verdict, real)
+    apart = _groups(fit.sizes, clusters)
+    if apart.max() < 1:
+        return _done(fit, clusters, apart, [Displacement()])
+    levels = fit.levels()
+    looked = [fit.views(apart, factor, rounds) for factor, rounds in levels[:_ROUGH]]
+    found = _needed(fit.sizes, clusters, apart, looked)
+    assert found.verdict is not None
+    bad = np.flatnonzero(~_good(found.verdict))
+    real = sorted({*found.jumps, *(one for one in clusters if np.isin(apart[[one[0], one[1] + 1]], bad).any())})
+    groups = _groups(fit.sizes, real)
+    spoilt = np.isin(apart, bad)
+    moves = [found.moves[max(apart[groups == at])] for at in range(groups.max() + 1)]
+    for factor, rounds in levels[_ROUGH:] if len(moves) > 1 else ():
+        moves = fit.views(np.where(spoilt, -1, groups), factor, rounds).displacements(moves)
+    if not bad.size and fit.largest(moves) < LARGEST:
+        return _done(fit, [], _groups(fit.sizes, []), [Displacement()])
+    return _done(fit, real, np.where(spoilt, -1, groups), moves, found.verdict, bool(bad.size))
 
 
-def _needed(fit: _Fit, clusters: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The jumps that views held out need to be predicted, the one that helps most first."""
-    needed: list[tuple[int, int]] = []
-    least = fit.deviation(needed)
-    while len(needed) < len(clusters):
-        tried = [(fit.deviation(sorted([*needed, one])), one) for one in clusters if one not in needed]
-        deviation, best = min(tried)
-        if not deviation < (1 - _HELPS) * least:
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Joined pixels of some rows of some views: line integrals, the group that each view belongs to, pixels known."""
+
+    data: NDArray[np.float32]
+    geometry: Geometry
+    group: I64
+    known: NDArray[np.bool_]
+    rounds: int
+
+    def displacements(self, start: list[Displacement] | None) -> list[Displacement]:
+        return displacements(self.data, self.geometry, self.group, self.known, start, self.rounds)
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """Clusters of jumps in which the sample moved, its displacement in each group between all of them, and how well
+    that predicts views."""
+
+    jumps: list[tuple[int, int]]
+    moves: list[Displacement]
+    verdict: Judgement
+
+
+def _needed(sizes: I64, clusters: Sequence[tuple[int, int]], apart: I64, looked: Sequence[_Views]) -> _Guess:
+    """The jumps that views held out need to be predicted, the one that helps most first.
+
+    All guesses are judged by the same views, of the groups `apart` of all clusters. A cluster with too few views on one
+    side is a jump in any case.
+    """
+    untold = [one for one in clusters if min(apart[one[0]], apart[one[1] + 1]) < 0]
+    best = _guess(sizes, untold, apart, looked)
+    while len(best.jumps) < len(clusters):
+        tried = [_guess(sizes, sorted([*best.jumps, one]), apart, looked) for one in clusters if one not in best.jumps]
+        better = min(tried, key=lambda guess: guess.verdict.overall)
+        if not better.verdict.overall < (1 - _HELPS) * best.verdict.overall:
             break
-        needed, least = sorted([*needed, best]), deviation
-    return needed
+        best = better
+    return best
+
+
+def _guess(sizes: I64, jumps: list[tuple[int, int]], apart: I64, looked: Sequence[_Views]) -> _Guess:
+    """Where the sample was if it moved in these clusters of jumps."""
+    joined = _groups(sizes, jumps)
+    group = np.array([joined[apart == at][0] for at in range(apart.max() + 1)])
+    moves: list[Displacement] | None = None
+    for views in looked:
+        moves = replace(views, group=group[views.group]).displacements(moves)
+    assert moves is not None
+    each = [moves[at] for at in group]
+    views = looked[-1]
+    return _Guess(jumps, each, judge(views.data, views.geometry, views.group, views.known, each))
 
 
 def _clusters(sizes: I64) -> list[tuple[int, int]]:
@@ -132,18 +180,17 @@ def _groups(sizes: I64, clusters: Sequence[tuple[int, int]]) -> I64:
     return group
 
 
-def _good(verdict: Judgement) -> list[bool]:
-    """The parts that can be used with the longest one, whose own deviation is the one that is compared with."""
-    better = verdict.together <= verdict.alone
-    return [
-        part == verdict.longest or (better and own <= ALIKE * verdict.together)
-        for part, own in enumerate(verdict.others)
-    ]
+def _good(verdict: Judgement) -> NDArray[np.bool_]:
+    """[group] those that can be used with the longest one, whose own deviation is the one that is compared with."""
+    better = verdict.together <= (1 + _HELPS) * verdict.alone
+    good = np.array([better and own <= ALIKE * verdict.together for own in verdict.others])
+    good[verdict.longest] = True
+    return good
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Displacements of groups of parts of a scan, on a band of its rows, from coarse to fine pixels."""
+    """What displacements of groups of parts of a scan are fitted to: a band of its rows, from coarse to fine pixels."""
 
     source: ScanSource
     selection: Selection
@@ -164,34 +211,23 @@ class _Fit:
         """Pixels, joined as for the volume, by which the sample moves at most."""
         return max(move.farthest(self.geometry.reach) for move in moves) / self.geometry.pixel_pitch
 
-    def deviation(self, clusters: Sequence[tuple[int, int]]) -> float:
-        """Mean deviation of views held out, where the sample jumped in these; on joined pixels."""
-        verdict = self.moves(_groups(self.sizes, clusters), _ROUGH)[1]
-        assert verdict is not None
-        return verdict.overall
-
-    def moves(self, groups: I64, levels: int = len(_LEVELS)) -> tuple[list[Displacement], Judgement | None]:
-        """The displacement of each group of parts against the longest, and how well it predicts."""
-        group = groups[_parts(self.jumps, self.frames)]
-        frames, group = self.frames[group >= 0], group[group >= 0]
-        some = _thinned(group)
-        moves: list[Displacement] | None = None
-        verdict, width = None, self.source.shape[1] // self.selection.binning
-        steps: dict[int, int] = {}
-        for cols, rounds in _LEVELS[:levels]:
+    def levels(self) -> list[tuple[int, int]]:
+        """Pixels a side that are joined, and volumes of all views."""
+        width, steps = self.source.shape[1] // self.selection.binning, dict[int, int]()
+        for cols, rounds in _LEVELS:
             factor = max(1, math.ceil(width / cols))
             steps[factor] = max(rounds, steps.get(factor, 0))
-        for i, (factor, rounds) in enumerate(steps.items()):
-            band = self._band(factor)
-            views = ScanCorrection(self.source, band, _quiet).at_once(frames[some])
-            kept = group[np.searchsorted(frames, views.view_ids)]
-            geometry = geometry_of(self.source, band, self.axis_col, self.source.angles[views.view_ids])
-            known = ~areas(views.masked)
-            moves = displacements(views.data, geometry, kept, known, moves, rounds)
-            if i == min(1, len(steps) - 1):
-                verdict = judge(views.data, geometry, kept, known, moves)
-        assert moves is not None
-        return moves, verdict
+        return list(steps.items())
+
+    def views(self, groups: I64, factor: int, rounds: int) -> _Views:
+        """Views of each group of parts; those of parts in no group (-1) are not among them."""
+        group = groups[_parts(self.jumps, self.frames)]
+        frames, group = self.frames[group >= 0], group[group >= 0]
+        band = self._band(factor)
+        views = ScanCorrection(self.source, band, _quiet).at_once(frames[_thinned(group)])
+        kept = group[np.searchsorted(frames, views.view_ids)]
+        geometry = geometry_of(self.source, band, self.axis_col, self.source.angles[views.view_ids])
+        return _Views(views.data, geometry, kept, ~areas(views.masked), rounds)
 
     def _band(self, factor: int) -> Selection:
         """Joined pixels, and rows around the middle of those that are used, also outside them."""
@@ -203,33 +239,44 @@ class _Fit:
         return replace(self.selection, rows=(first, first + n), binning=binning)
 
 
-def _done(fit: _Fit, groups: I64, moves: Sequence[Displacement], verdict: Judgement | None, real: I64) -> Jumps:
-    """The views that are used, where the sample is in them, and what was done in a line."""
-    good = [True] * len(moves) if verdict is None else _good(verdict)
-    kept = np.array([at >= 0 and good[at] for at in groups])
+def _done(
+    fit: _Fit,
+    real: Sequence[tuple[int, int]],
+    groups: I64,
+    moves: Sequence[Displacement],
+    verdict: Judgement | None = None,
+    unlike: bool = False,
+) -> Jumps:
+    """The views that are used, where the sample is in them, and what was done in a line.
+
+    Args:
+        real: clusters of jumps in which the sample moved.
+        groups: [part] -1: left out, because no displacement makes it fit (`unlike`) or it has too few views.
+    """
     part = _parts(fit.jumps, fit.frames)
-    frames = fit.frames[kept[part]]
+    frames = fit.frames[groups[part] >= 0]
     places = tuple(moves[at] if at >= 0 else Displacement() for at in groups)
     lost, pitch, text = fit.frames.size - frames.size, fit.geometry.pixel_pitch, list[str]()
-    if real.size:
-        text.append(f"The sample jumped at {rows_text(fit.jumps[real])}.")
+    seen = np.array([i for first, last in real for i in range(first, last + 1)], np.int64)
+    if seen.size:
+        text.append(f"The sample jumped at {rows_text(fit.jumps[seen])}.")
     for at, m in enumerate(moves):
         n = int((groups[part] == at).sum())
-        if good[at] and m != Displacement():
+        if n and m != Displacement():
             x, y, z = (f"{mm / pitch:+.1f}" for mm in (m.x, m.y, m.z))
             text.append(
                 f"{count(n, 'view')} {'is' if n == 1 else 'are'} corrected by shifts: the sample lies {x}, {y}, {z} px "
                 f"(x, y, z in its own frame) elsewhere than in the others, turned by {math.degrees(m.turn):+.2f}°."
             )
     if lost:
-        why = "no shift and turn of the sample makes them fit the others" if not all(good) else "too few for a fit"
+        why = "no shift and turn of the sample makes them fit the others" if unlike else "too few for a fit"
         text.append(f"{count(lost, 'view')} {'is' if lost == 1 else 'are'} left out: {why}.")
     if verdict is not None:
         text.append(
             f"Views held out of the longest part deviate by {verdict.together:.3g} with the others corrected, by "
             f"{verdict.alone:.3g} without them."
         )
-    none = np.setdiff1d(np.arange(fit.jumps.size), real)
+    none = np.setdiff1d(np.arange(fit.jumps.size), seen)
     if none.size:
         text.append(
             f"Of the alarm of motion at {rows_text(fit.jumps[none])} the other views show nothing (less than "

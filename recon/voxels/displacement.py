@@ -116,6 +116,8 @@ def displacements(
     """
     problem = _Problem(projections, geometry, parts, known)
     moves = list(start) if start is not None else [Displacement()] * problem.count
+    if not problem.others:
+        return moves
     if start is None:
         own = np.flatnonzero(parts == problem.longest)
         volume = problem.volume(geometry, own)

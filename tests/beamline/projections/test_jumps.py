@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,15 @@ def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, views, JUMP))
     assert found.geometry.n_views == JUMP and found.left_out == 19 and not found.geometry.shifts.any()
     assert "19 views are left out: no shift and turn of the sample makes them fit" in told
+
+
+def test_spoilt_views_between_two_false_alarms_hide_no_jump(tmp_path: Path) -> None:
+    views = moved(2.0, 2.0)
+    views[15:20] += np.random.default_rng(1).normal(0, 0.5, (5, *SHAPE)).astype(np.float32)
+    found, told = prepared(scan(tmp_path, views, 15, 20, JUMP), replace(SELECTION, binning=2))
+    assert told.startswith("The sample jumped at row 45. 19 views are corrected by shifts")
+    assert "Of the alarm of motion at rows 19, 24 the other views show nothing" in told
+    assert found.geometry.n_views == ANGLES.size and (found.geometry.shifts[~LATER] == 0).all()
 
 
 def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
