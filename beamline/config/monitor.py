@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from pydantic import Field, create_model, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from beamline.config.section import Section
 from beamline.monitor.check import Check, Policy
@@ -20,10 +20,8 @@ from beamline.monitor.checks import CHECKS
 class MonitorBase(Section):
     """The keys that do not depend on the checks."""
 
-    on_alarm: Literal["log", "stop"] = "log"
-    """An alarm of a check is logged, or it stops the scan."""
     act_after: Annotated[int, Field(ge=1)] = 10
-    """Frames in a row with an alarm before the check's policy pauses or aborts the scan."""
+    """Frames in a row with an alarm before the check's policy pauses or stops the scan."""
     retake: bool = False
     """Views with an alarm are taken again, once, after the last view."""
     retake_share: Annotated[float, Field(gt=0, le=1)] = 0.25
@@ -31,18 +29,24 @@ class MonitorBase(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _without_thresholds(cls, data: Any) -> Any:
-        """Take out `thresholds`, which held the limits in earlier versions; their resolved files have an empty one."""
-        if not isinstance(data, dict) or "thresholds" not in data:
+    def _without_earlier_keys(cls, data: Any) -> Any:
+        """Take out the keys of earlier versions, which their resolved files have with the values that did nothing:
+        `thresholds`, which held the limits, and `on_alarm`."""
+        if not isinstance(data, dict) or not {"thresholds", "on_alarm"} & data.keys():
             return data
-        if old := data["thresholds"]:
+        if data.get("on_alarm", "log") != "log":
+            raise ValueError(
+                "on_alarm is not a key any longer; write policy: {<check>: stop} for the checks whose alarms are to "
+                "stop the scan, and act_after: 1 to stop it at the first frame"
+            )
+        if old := data.get("thresholds"):
             group, keys = next(iter(old.items())) if isinstance(old, dict) else ("<check>", None)
             limit = next(iter(keys)) if isinstance(keys, dict) and keys else "<limit>"
             raise ValueError(
                 f"thresholds is not a key any longer; write monitor.{group}.{limit} instead of "
                 f"monitor.thresholds.{group}.{limit}"
             )
-        return {key: value for key, value in data.items() if key != "thresholds"}
+        return {key: value for key, value in data.items() if key not in ("thresholds", "on_alarm")}
 
 
 def _limits_of(check: Check) -> Any:
@@ -53,9 +57,18 @@ def _limits_of(check: Check) -> Any:
     return section, section()
 
 
+def _without_earlier_word(policy: Any) -> Any:
+    """`abort` was the word for a clean stop."""
+    if policy == "abort":
+        raise ValueError("abort is called stop now; write stop")
+    return policy
+
+
 def _policies() -> Any:
     """The section with the policy of each check, and its default, as pydantic.create_model takes a field."""
-    keys: dict[str, Any] = {check.name: (Policy, check.policy) for check in CHECKS}
+    keys: dict[str, Any] = {
+        check.name: (Annotated[Policy, BeforeValidator(_without_earlier_word)], check.policy) for check in CHECKS
+    }
     section = create_model("Policies", __base__=Section, __doc__="What alarms of each check do to a scan.", **keys)
     return section, section()
 

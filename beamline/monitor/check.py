@@ -36,7 +36,7 @@ class Policy(StrEnum):
     LOG = "log"  # write it down: file, events, report
     WARN = "warn"  # and say it on the terminal
     PAUSE = "pause"  # and hold the scan until the operator or the check says that it may go on
-    ABORT = "abort"  # and end the scan
+    STOP = "stop"  # and end the scan cleanly, as the first Ctrl-C does
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class Lost:
     bit: ClassVar[int] = 7
     unit: ClassVar[str] = "fraction of the light"
     meaning: ClassVar[str] = "the beam is gone"
-    policy: ClassVar[Policy] = Policy.ABORT
+    policy: ClassVar[Policy] = Policy.STOP
 
     alarm: Annotated[float, Field(ge=0.5, le=1, description="fraction of the light without which it is lost")] = 0.5
 

@@ -111,7 +111,7 @@ def _held_late(worked: Timeline, config: Config) -> list[str]:
     before = "before views are taken again" if config.monitor.retake else "not at all"
     return [
         f"monitor.policy {', '.join(pausing)}: a fly scan is held between its passes; this has one, so that it is held "
-        f"{before}; use scan.mode: step, or abort"
+        f"{before}; use scan.mode: step, or the policy stop"
     ]
 
 

@@ -287,7 +287,7 @@ class _Run:
 
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         monitor = self.config.monitor
-        policy = AlarmPolicy(monitor.on_alarm == "stop", monitor.act_after, policies(monitor))
+        policy = AlarmPolicy(monitor.act_after, policies(monitor))
         return Recorder(
             writer,
             self.ready.monitor,

@@ -44,12 +44,10 @@ class AlarmPolicy:
     """What alarms of the monitor do to a scan.
 
     Attributes:
-        stop_at_once: any alarm stops the scan.
         act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
         policies: by the name of the check.
     """
 
-    stop_at_once: bool = False
     act_after: int = 10
     policies: Mapping[str, Policy] = field(default_factory=dict)
 
@@ -66,22 +64,17 @@ class AlarmReaction:
         alarms = [flag for flag in flags if flag.level is Level.ALARM]
         self._in_a_row = Counter({flag.check: self._in_a_row[flag.check] + 1 for flag in alarms})
         for flag in alarms:
-            if self._policy.stop_at_once:
-                self._request_stop(f"the monitor's {flag.check} check raised an alarm: {flag.advice.rstrip('.')}")
-            elif self._in_a_row[flag.check] % self._policy.act_after == 0:
+            if self._in_a_row[flag.check] % self._policy.act_after == 0:
                 self._act(flag)
 
     def _act(self, flag: Flag) -> None:
         n = self._in_a_row[flag.check]
-        reason = f"{n} frames in a row have an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
+        frames = f"{n} frames in a row have" if n > 1 else "1 frame has"
+        reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
         match self._policy.policies.get(flag.check, Policy.LOG):
             case Policy.WARN:
                 self._emit("warning", {"message": f"{reason}."})
             case Policy.PAUSE:
                 self._hold.hold(reason)
-            case Policy.ABORT:
-                self._request_stop(reason)
-
-    def _request_stop(self, reason: str) -> None:
-        if not self._stop.stopping:
-            self._stop.stop(reason)
+            case Policy.STOP if not self._stop.stopping:
+                self._stop.stop(reason)

@@ -121,7 +121,7 @@ def test_2_an_unknown_monitor_check(monkeypatch: pytest.MonkeyPatch) -> None:
     on(monkeypatch, FakeInstrument())
     result = scan(**{"monitor.bean.warn": 0.1})
     assert result.exit_code == 2
-    assert "legal keys there: on_alarm, act_after, retake, retake_share, policy" in result.stderr
+    assert "legal keys there: act_after, retake, retake_share, policy" in result.stderr
 
 
 def test_3_a_device_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

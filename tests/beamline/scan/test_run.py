@@ -261,12 +261,13 @@ def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, m
     ran = Ran(
         tmp_path,
         FakeInstrument(Faults(repeats={9})),
-        "monitor.on_alarm=stop",
+        "monitor.policy.stuck=stop",
+        "monitor.act_after=1",
         "scan.angles.views=60",
         "scan.period_s=0.1",
     )
     assert type(ran.error) is ScanStopped
-    assert "stuck check raised an alarm" in str(ran.error)
+    assert "1 frame has an alarm of the monitor's stuck check" in str(ran.error)
     done = ran.of("scan_done")[0].data
     assert done["status"] == "stopped"
     assert 10 <= done["n_frames"] < 20

@@ -52,21 +52,12 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
         react(flags(level))
         held += hold.take() is not None
     assert held == acts * (policy is Policy.PAUSE)
-    assert stop.stopping is (policy is Policy.ABORT and acts > 0)
+    assert stop.stopping is (policy is Policy.STOP and acts > 0)
     assert len(events) == acts * (policy is Policy.WARN)
     for text in [data["message"] for _, data in events] + [stop.reason] * stop.stopping:
         assert (
             text.startswith("3 frames in a row have an alarm of the monitor's beam check: Look at the beam") or acts > 1
         )
-
-
-def test_any_alarm_may_stop_a_scan_at_once() -> None:
-    stop = StopRequest()
-    react = AlarmReaction(AlarmPolicy(stop_at_once=True), stop, HoldRequest(), lambda kind, data: None)
-    react(flags(W))
-    assert not stop.stopping
-    react(flags(A))
-    assert stop.reason == "the monitor's beam check raised an alarm: Look at the beam"
 
 
 WORDS = ("scan.angles.views=40", "monitor.act_after=2", "scan.settle_s=0")
@@ -118,9 +109,9 @@ def test_a_scan_that_is_held_where_nobody_is_ends(tmp_path: Path, monkeypatch: p
     ran.assert_safe()
 
 
-def test_an_abort_ends_the_scan_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_policy_stop_ends_the_scan_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (1, 1))
-    words = (*WORDS, "monitor.policy.stuck=abort", "scan.mode=step")
+    words = (*WORDS, "monitor.policy.stuck=stop", "scan.mode=step")
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10})), *words)
     assert type(ran.error) is ScanStopped
     assert "2 frames in a row have an alarm of the monitor's stuck check" in str(ran.error)
