@@ -28,7 +28,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 ROWS = 32  # of a slab; enough for total variation along z
-_SMALLEST = 64  # pixels a side: smaller detectors are not joined
+_SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # of the largest line integrals
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
 
@@ -179,7 +179,7 @@ def _standard_error(values: F64) -> float:
 
 
 def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
-    """A part of the problem for trials, and its name: a slab of so many rows, or all rows with joined pixels.
+    """A part of the problem for trials, and its name: a slab of so many rows, or all rows with binned pixels.
 
     None where nothing can be held out or projected, and why.
     """
@@ -202,10 +202,10 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
         return problem, "all rows"
     filled = masked(data, weights)[0]
     views = geometry.binned(2)
-    joined = replace(
+    coarse = replace(
         problem, projections=bin_views(filled, 2), geometry=views, grid=Grid.matching(views), use=DataUse()
     )
-    return joined, "pixels joined 2 x 2"
+    return coarse, "binned 2 x 2"
 
 
 def _of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:

@@ -23,7 +23,7 @@ ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits
 _LEVELS = ((64, 2), (128, 4), (320, 2))  # columns, at most, and volumes of all views
 _ROUGH = 2  # levels that tell whether there was a jump
 _HELPS = 0.005  # share of the deviation that a jump takes away, or a part may add
-_ROWS = 16  # joined rows looked at
+_ROWS = 16  # binned rows looked at
 _VIEWS = 360  # looked at, and all of parts that have no more than
 _SHORT = 40
 
@@ -103,7 +103,7 @@ def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """Joined pixels of some rows of some views: line integrals, the group that each view belongs to, pixels known."""
+    """Binned pixels of some rows of some views: line integrals, the group that each view belongs to, pixels known."""
 
     data: NDArray[np.float32]
     geometry: Geometry
@@ -208,7 +208,7 @@ class _Fit:
         return geometry_of(self.source, self.selection, self.axis_col, np.zeros(1))
 
     def largest(self, moves: Sequence[Displacement]) -> float:
-        """Pixels, joined as for the volume, by which the sample moves at most."""
+        """Pixels, binned as for the volume, by which the sample moves at most."""
         return max(move.farthest(self.geometry.reach) for move in moves) / self.geometry.pixel_pitch
 
     def levels(self) -> list[tuple[int, int]]:
@@ -230,7 +230,7 @@ class _Fit:
         return _Views(views.data, geometry, kept, ~areas(views.masked), rounds)
 
     def _band(self, factor: int) -> Selection:
-        """Joined pixels, and rows around the middle of those that are used, also outside them."""
+        """Binned pixels, and rows around the middle of those that are used, also outside them."""
         binning = self.selection.binning * factor
         used, height = rows_of(self.source, self.selection), self.source.shape[0]
         n = min(_ROWS * binning, height)

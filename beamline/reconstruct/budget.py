@@ -50,7 +50,7 @@ class Budgeted:
 
     Attributes:
         result: what came out.
-        prepared: the views it is of, with joined pixels if the choice joins them.
+        prepared: the views it is of, with binned pixels if the choice bins them.
         choice, speeds: what was chosen, and the measurements behind it.
         because: why this method, in words; empty where there was no other.
         seconds: of everything, calibration included.
@@ -107,7 +107,7 @@ class _Budget:
     def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
         """The best choice of each method (or of one) within this share of what is left.
 
-        Where nothing is left, the cheapest without joined pixels, if it takes little of what was used already.
+        Where nothing is left, the cheapest without binned pixels, if it takes little of what was used already.
         """
         if self.left < _RESERVE * self.seconds:
             full = plans(_LATE * (self.now() - self.begin), self.speeds, 1, self.methods)
@@ -169,7 +169,7 @@ def within(
         )
     if len(found) > 1:
         choice, because = _chosen(plan, found, prepared, seed, control)
-    prepared = joined(prepared, choice.binning)
+    prepared = binned(prepared, choice.binning)
     method = plan.method(choice, unbinned)
     end = begin + budget * (1 - _RESERVE)
     if over and math.isfinite(choice.gain):
@@ -272,11 +272,11 @@ def _named(choice: Choice, result: Reconstruction | None = None) -> str:
         text += f", {result.history[-1].step} {choice.counted}"
     if result is not None and choice.is_gaussian_fit:
         text += f" from {result.settings['gaussians_at_start']} Gaussians"
-    return text + (f", pixels joined {choice.binning} x {choice.binning}" if choice.binning > 1 else "")
+    return text + (f", binned {choice.binning} x {choice.binning}" if choice.binning > 1 else "")
 
 
-def joined(prepared: PreparedProjections, factor: int) -> PreparedProjections:
-    """The same views with factor x factor pixels joined: means of line integrals."""
+def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
+    """The same views with factor x factor binning: means of line integrals."""
     if factor == 1:
         return prepared
     projections, counted = prepared.projections, prepared.projections.weights

@@ -228,7 +228,7 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
 
 
 def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
-    """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the joined pixels a side."""
+    """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the binning of their pixels."""
     method = job.options.method
     methods = method.candidates if isinstance(method, Auto) else (method,)
     for one in methods:  # compilation happens once on a machine and is not part of the budget

@@ -41,7 +41,7 @@ from recon.base.method import DataUse, Progress, ReconProblem
 from recon.base.views import parse_views
 from recon.base.volume import Volume
 from recon.prep.align import AxisEstimate
-from recon.prep.correct import Projections, joined
+from recon.prep.correct import Projections, concatenated
 from recon.splatting.finish import finish
 from recon.splatting.stream import StreamingFit
 
@@ -324,7 +324,7 @@ class ScanFollower:
         return made, prepared
 
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
-        projections = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
+        projections = self._parts[0] if len(self._parts) == 1 else concatenated(self._parts)
         self._parts = [projections]
         assert self._correction is not None
         found = assemble(self.source, self._options.selection, projections, (axis_col, self.axis), usable, self._warn)

@@ -23,7 +23,7 @@ class FlaggedFrame:
     """A frame for the sheet.
 
     Attributes:
-        image: [row, col] counts, pixels joined where there are many.
+        image: [row, col] counts, binned where there are many.
         extent: (rows, cols) of the whole frame, in pixels of the detector.
         title: which frame it is.
         reasons: a line for each flag.

@@ -35,7 +35,7 @@ class LivePlan:
     """What of a scan the live volume is made of.
 
     Attributes:
-        binning: pixels joined along rows and columns.
+        binning: binning of rows and columns.
         every: one of so many views, in the order taken.
         bytes: of memory, about.
     """
@@ -50,9 +50,9 @@ class LivePlan:
 
 
 def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
-    """Pixels joined and views left out so that the live volume has at most 512 columns and half of the free memory.
+    """Binning, and views left out, so that the live volume has at most 512 columns and half of the free memory.
 
-    Views are left out as long as 90 are used, then more pixels are joined.
+    Views are left out as long as 90 are used, then the binning grows.
 
     Args:
         shape: rows and columns of a frame.

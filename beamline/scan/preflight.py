@@ -98,7 +98,7 @@ def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Ti
     if config.recon.live and not plan.whole:
         rows, cols = (n // plan.binning for n in shape)
         remarks.append(
-            f"the live volume has {cols} columns and {rows} rows (pixels joined {plan.binning} x {plan.binning}) from "
+            f"the live volume has {cols} columns and {rows} rows (binned {plan.binning} x {plan.binning}) from "
             f"one view of {plan.every}, in about {size(plan.bytes)} of memory; `beamline recon` makes the full one"
         )
     return replace(worked, remarks=tuple(remarks))

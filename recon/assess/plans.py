@@ -21,7 +21,7 @@ class Curve:
     Attributes:
         method: its name in `recon.methods`.
         counted: the setting of the method that its steps are; empty for one without steps.
-        binning: detector pixels joined a side.
+        binning: of detector pixels.
         share: Gaussians at the start, relative to the default number for the volume; 0 for a method on voxels.
         pace: CPU time of a step. Of a fit relative to a step with binning 1 and share 1, of a method on voxels to a
             sweep of FISTA-TV over the same views and voxels.
@@ -45,7 +45,7 @@ class Curve:
         return float(np.interp(math.log(steps), np.log(at), gains))
 
     def fixed(self, speeds: Speeds, further: int = 1) -> float:
-        """Seconds that it takes beside its steps, pixels joined further than its own by a factor."""
+        """Seconds that it takes beside its steps, binned by a further factor."""
         placed = (speeds.start + speeds.fill) * self.share / further**3
         finished = self.share == 0 or math.isfinite(speeds.sweep)
         sweeps = self.sweeps * speeds.sweep if self.sweeps > 0 and finished else 0.0
@@ -124,7 +124,7 @@ class Choice:
     Attributes:
         method: its name in `recon.methods`.
         counted: its setting that `steps` are; empty for a method without steps.
-        binning: detector pixels joined a side, on top of the selection's.
+        binning: of detector pixels, on top of the selection's.
         share: Gaussians at the start, relative to the default number for the unbinned volume; 0 for none.
         steps: number of steps for which the time suffices.
         gain: expected dB above the FBP of the unbinned views, from the measured curve.

@@ -130,7 +130,7 @@ class Traits:
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
         budget: a time budget chooses its settings, see `recon.assess.plans`.
-        any_grid: its model has no voxels, so that views of joined pixels still fill the full grid.
+        any_grid: its model has no voxels, so that views of binned pixels still fill the full grid.
     """
 
     direct: bool = False
@@ -149,7 +149,7 @@ class TrialSettings:
     Attributes:
         varies: the group of the trial: "method" for the baseline, else what differs from it, or `PRECISION`.
         settings: that differ from the defaults, by name as `recon.methods.build` takes them.
-        binning: detector pixels joined a side.
+        binning: of detector pixels.
     """
 
     varies: str

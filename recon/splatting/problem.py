@@ -133,13 +133,13 @@ def with_projections(problem: FitProblem, projections: F32) -> FitProblem:
     return _with_views(empty, *masked(projections, None, _LARGEST_LATER * problem.half_field * problem.unit))
 
 
-def joined(geometry: Geometry, factor: int) -> Geometry:
-    """The geometry of factor x factor joined pixels, each in the middle of its own, while the sample stays in place.
+def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
+    """The geometry of factor x factor binned pixels, each in the middle of its own, while the sample stays in place.
 
     `Geometry.binned` counts a parallel beam's heights from the middle of the rows that are left: a sample of its own.
 
     Raises:
-        ValueError: where the detector has fewer rows or columns than are to be joined.
+        ValueError: where the detector has fewer rows or columns than are to be binned.
     """
     if factor > min(geometry.detector_shape):
         rows, cols = geometry.detector_shape
@@ -151,15 +151,15 @@ def joined(geometry: Geometry, factor: int) -> Geometry:
 
 
 def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) -> FitProblem:
-    """The same problem on joined pixels: a first look at the large scales for a fraction of the time.
+    """The same problem on binned pixels: a first look at the large scales for a fraction of the time.
 
-    A joined pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
+    A binned pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
     have no part in it.
 
     Raises:
-        ValueError: as `joined`.
+        ValueError: as `binned_geometry`.
     """
-    geometry = joined(problem.geometry, factor)
+    geometry = binned_geometry(problem.geometry, factor)
     data, weights = problem.projections, None
     if any(w is not None for w in problem.weights):
         ones = np.ones(problem.geometry.detector_shape, np.float32)

@@ -45,7 +45,7 @@ class FitSettings:
         truncation: where Gaussians end; a compact kernel ends by itself.
         smallest: standard deviation, in pixels, below which none shrinks: point sampling sees nothing thinner.
         views_per_step: gradients of so many views are averaged.
-        coarse, coarse_until: the fit begins on pixels joined by this factor, until this fraction of its steps.
+        coarse, coarse_until: the fit begins on pixels binned by this factor, until this fraction of its steps.
         rays: the integral of a Gaussian along a ray; matters for cones.
         kernel: radial profile of the Gaussians, also by its name; a fit that starts from a model keeps the model's.
     """

@@ -103,7 +103,7 @@ class StreamingFit:
         self._settings = settings or WHILE_VIEWS_COME
         if self._settings.coarse > 1:
             raise ValueError(
-                f"coarse={self._settings.coarse} begins a fit on joined pixels, for a share of its steps: while views "
+                f"coarse={self._settings.coarse} begins a fit on binned pixels, for a share of its steps: while views "
                 "come, their number is not known. Set `coarse` to 1 here"
             )
         self._first_views, self._first_span = first_views, first_span

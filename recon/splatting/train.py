@@ -22,7 +22,7 @@ from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.optimise import FitState
-from recon.splatting.problem import FitProblem, coarser, joined
+from recon.splatting.problem import FitProblem, binned_geometry, coarser
 from recon.splatting.schedule import Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.voxels.projector import data_residual
@@ -98,7 +98,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
     seen, known = geometry.select(used), None if weights is None else weights[used]
     field_grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))
-    joined(seen, settings.coarse)  # refuses what cannot be joined before anything is computed
+    binned_geometry(seen, settings.coarse)  # refuses what cannot be binned before anything is computed
     if control.resume is None:
         state, n_start, unit = _first_state(data[used], seen, field_grid, method, problem.seed, backend)
     else:

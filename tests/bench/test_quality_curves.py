@@ -114,7 +114,7 @@ def measured(data: F32, geometry: Geometry, truth: F32) -> dict[Kind, list[tuple
 
 
 def _as_fine(volume: F32, shape: tuple[int, ...]) -> F32:
-    """A volume of joined pixels on the voxels of single ones."""
+    """A volume of binned pixels on the voxels of single ones."""
     if volume.shape == shape:
         return volume
     for axis in range(3):

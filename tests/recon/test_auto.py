@@ -136,7 +136,7 @@ def test_a_cone_is_tried_at_half_the_resolution() -> None:
     ball = np.zeros(grid.shape, np.float32)
     ball[24:40, 20:44, 22:40] = 0.02
     found = recon.reconstruct(Projector(views, grid).forward(ball), views, Auto((Scaled(factor=0.3), Scaled())))
-    assert found.settings["factor"] == 1.0 and "joined 2 x 2" in found.settings["chosen_because"]
+    assert found.settings["factor"] == 1.0 and "binned 2 x 2" in found.settings["chosen_because"]
 
 
 def test_a_stop_ends_the_trials(data: F32) -> None:

@@ -12,7 +12,7 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Noise, Selection
-from beamline.reconstruct.budget import joined
+from beamline.reconstruct.budget import binned
 from recon.prep.correct import CorrectionSettings
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource
@@ -72,7 +72,7 @@ def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, co
         assert found.photons.variance**0.5 == pytest.approx(READOUT, rel=0.1)
 
 
-def test_joined_pixels_have_the_photons_of_all() -> None:
+def test_binned_pixels_have_the_photons_of_all() -> None:
     """By the flats as they are read and by the gain of one pixel: a mean of four pixels has a quarter of the gain."""
     for gain in (None, GAIN):
         found = ScanCorrection(scan(20), replace(PLAIN, noise="counts", gain=gain, binning=2), pytest.fail)  # type: ignore[arg-type]
@@ -98,7 +98,7 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
     left = held.ray_weights(3)
     assert weights is not None and left is not None and held.projections.weights is not None
     assert left.shape == (len(EXACT) - 5 + 3, *SCAN.shape) and (left[-3:] == 1).all()
-    coarse = joined(prepared, 2).projections
+    coarse = binned(prepared, 2).projections
     assert coarse.weights is not None and coarse.weights.shape == coarse.data.shape == (len(EXACT), 8, 32)
 
 

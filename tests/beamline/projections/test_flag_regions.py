@@ -40,7 +40,7 @@ def test_a_region_and_its_margin_weigh_less_of_an_alarm_nothing() -> None:
     np.testing.assert_array_equal(weights, expected)
 
 
-def test_rows_that_are_chosen_and_joined_pixels_take_their_part() -> None:
+def test_rows_that_are_chosen_and_binned_pixels_take_their_part() -> None:
     regions = regions_of(found(flag(3, (4, 8, 10, 18), Level.ALARM)), SHAPE)
     weights = regions.weights(np.array([3]), slice(5, 13), 2, (4, 20))
     assert weights is not None

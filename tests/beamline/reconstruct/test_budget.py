@@ -15,7 +15,7 @@ from beamline.core.events import Event
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
-from beamline.reconstruct.budget import Budgeted, joined, within
+from beamline.reconstruct.budget import Budgeted, binned, within
 from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
@@ -98,14 +98,14 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for(prepared: Prepare
     assert found == [(0, 0.0), (0, 0.0), (2, 40.0), (6, 60.0), (8, 70.0)]
 
 
-def test_a_slow_machine_takes_fbp_of_joined_pixels(
+def test_a_slow_machine_takes_fbp_of_binned_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     done = _spend(prepared, 5.0, Ticking(0.01))
     assert not done.choice.is_gaussian_fit and done.choice.binning == 2
     assert done.result.volume.grid.shape == (3, 20, 20)
-    assert "pixels joined 2 x 2" in done.summary(5.0) and done.summary(5.0).startswith("fbp")
+    assert "binned 2 x 2" in done.summary(5.0) and done.summary(5.0).startswith("fbp")
 
 
 def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said_to_be_late(
@@ -120,12 +120,12 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
     monkeypatch.setattr(module, "calibrate", slow)
     warned: list[str] = []
     done = _spend(prepared, 5.0, clock, warned)
-    joined_pixels = done.choice.binning
-    assert not done.choice.is_gaussian_fit and joined_pixels >= 4  # about as many as six rows allow
+    binned_pixels = done.choice.binning
+    assert not done.choice.is_gaussian_fit and binned_pixels >= 4  # about as many as six rows allow
     assert done.seconds > 7 and f"of {5.0:.3g} s" in done.summary(5.0)
     assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
-    late = 7.01 + 432 / joined_pixels**3 - 5
-    assert warned[0].endswith(f"fbp, pixels joined {joined_pixels} x {joined_pixels}, will be about {late:.3g} s late.")
+    late = 7.01 + 432 / binned_pixels**3 - 5
+    assert warned[0].endswith(f"fbp, binned {binned_pixels} x {binned_pixels}, will be about {late:.3g} s late.")
     _spend(prepared, 20.0, clock, warned)
     assert len(warned) == 1
 
@@ -166,7 +166,7 @@ def test_the_shortest_fit_is_said_to_be_late_too(
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     warned: list[str] = []
     _spend(_cone(prepared, 3.6), 0.001, Ticking(0.01), warned)
-    assert len(warned) == 1 and "the cheapest choice, r2, pixels joined" in warned[0]
+    assert len(warned) == 1 and "the cheapest choice, r2, binned" in warned[0]
 
 
 @pytest.fixture
@@ -287,7 +287,7 @@ def test_a_cone_is_placed_as_its_parallel_likeness_is(
     assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) >= 500
 
 
-def test_a_slow_machine_takes_fdk_of_a_cones_joined_pixels(
+def test_a_slow_machine_takes_fdk_of_a_cones_binned_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
@@ -307,16 +307,16 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
     assert done.result.volume.data.max() > 0
 
 
-def test_joined_views_keep_their_scale_and_place(prepared: PreparedProjections) -> None:
-    assert joined(prepared, 1) is prepared
-    half = joined(prepared, 2)
+def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) -> None:
+    assert binned(prepared, 1) is prepared
+    half = binned(prepared, 2)
     assert half.geometry.pixel_pitch == 2 * prepared.geometry.pixel_pitch
     assert half.projections.data.shape == (24, 3, 20)
     assert half.projections.data.mean() == pytest.approx(prepared.projections.data.mean(), rel=1e-5)
     assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
 
 
-def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr(module, "plans", lambda *_: [Choice("r2", "steps", 2, 1.0, 100, 1.0, 0.5)])
@@ -334,7 +334,7 @@ def test_a_joined_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     assert (record.parameters["binning"], record.parameters["budget"]) == (2, 1.0)
     assert metrics["psnr"] > 15
     done = events[-1].data
-    assert "pixels joined 2 x 2" in done["chosen"]
+    assert "binned 2 x 2" in done["chosen"]
     assert {"seconds", "low", "high", "of"} == set(done["next_db"])
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
     assert done["chosen"] in page and "The next dB" in page

@@ -50,7 +50,7 @@ def test_a_pause_that_one_pass_cannot_make_is_told() -> None:
     assert said("scan.mode=step") == said("scan.angles={scheme: interlaced, views: 360, passes: 2}") == []
 
 
-def test_a_live_volume_of_joined_pixels_is_told() -> None:
+def test_a_live_volume_of_binned_pixels_is_told() -> None:
     def said(name: str, *overrides: str) -> list[str]:
         return [remark for remark in dry_run(shipped(name, *overrides)).timeline.remarks if "live volume" in remark]
 

@@ -105,7 +105,7 @@ def test_the_two_precisions(data: Data) -> None:
     assert found["seconds"] == found["details"]["seconds_float32"]
 
 
-def test_a_volume_of_joined_pixels_lies_where_the_fine_one_does() -> None:
+def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
     fine = Geometry.parallel([0.0], (8, 12), 0.5)
     coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)
 

@@ -64,8 +64,8 @@ def test_more_time_or_a_faster_machine_never_promises_less(budget: float, speeds
 def test_with_little_time_it_is_fbp_and_with_much_every_method_is_there() -> None:
     speeds = Speeds(fbp=0.5, start=1.0, step=5e-3, fill=0.2, sweep=0.3)
     assert plans(0.6, speeds, 1000)[0] == Choice("fbp", "", 1, 0.0, 1, 0.0, 0.5)
-    joined = plans(0.01, speeds, 1000)[0]
-    assert (joined.method, joined.binning) == ("fbp", 4)
+    coarse = plans(0.01, speeds, 1000)[0]
+    assert (coarse.method, coarse.binning) == ("fbp", 4)
     long = plans(60.0, speeds, 1000)
     assert {c.method for c in long} == METHODS == {"fbp", "r2", "os-sirt-tv", "fista-tv"}
     assert all(c.binning == 1 for c in long) and long[0].gain > 1 and long[-1].method == "fbp"

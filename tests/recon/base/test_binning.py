@@ -1,4 +1,4 @@
-"""Joined pixels against sums written out, and against the geometry that goes with them."""
+"""Binned pixels against sums written out, and against the geometry that goes with them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 
 
-def test_joined_pixels_are_means() -> None:
+def test_binned_pixels_are_means() -> None:
     views = np.arange(2 * 5 * 7, dtype=np.float32).reshape(2, 5, 7)
     out = bin_views(views, 2)
     assert out.shape == (2, *Geometry.parallel([0.0, 1.0], (5, 7)).binned(2).detector_shape)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.splatting.problem import joined
+from recon.splatting.problem import binned_geometry
 
 
 def test_the_axis_is_in_the_middle_unless_told() -> None:
@@ -187,7 +187,7 @@ def test_a_fit_takes_voxels_like_those_wanted_from_one_to_four_pixels() -> None:
 
 
 @given(factor=st.integers(1, 4), axis=st.floats(0, 30), row=st.floats(-3, 20), cone=st.booleans())
-def test_joined_pixels_stay_before_the_sample_where_they_were(
+def test_binned_pixels_stay_before_the_sample_where_they_were(
     factor: int, axis: float, row: float, cone: bool
 ) -> None:  # fmt: skip
     how = {"axis_row": row, "shifts": [[1.0, -2.0]]}
@@ -195,7 +195,7 @@ def test_joined_pixels_stay_before_the_sample_where_they_were(
         Geometry.cone([0.3], (11, 31), 0.3, 50.0, 70.0, axis, **how)
         if cone else Geometry.parallel([0.3], (11, 31), 0.3, axis, **how)
     )  # fmt: skip
-    coarse = joined(fine, factor)
+    coarse = binned_geometry(fine, factor)
     for point in ((0.0, 0.0, 0.0), (0.7, -0.4, 1.1)):
         # A bin's middle is the middle of its pixels: pixel p of the fine detector is (p - (factor - 1) / 2) / factor.
         expected = (_pixel(fine, 0, np.array(point)) - (factor - 1) / 2) / factor

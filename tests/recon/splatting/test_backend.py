@@ -59,7 +59,7 @@ def test_arrays_come_and_go_as_copies() -> None:
 def test_views_of_any_shape_one_after_the_other_are_those_of_a_fresh_backend(
     random_gaussians: Make, rng: np.random.Generator
 ) -> None:
-    # Detectors and models of other sizes take turns, as in a fit that begins on joined pixels and then grows.
+    # Detectors and models of other sizes take turns, as in a fit that begins on binned pixels and then grows.
     backend, models = Cpu(), (random_gaussians(30, 8.0), random_gaussians(45, 8.0))
     for g, shape, view in ((0, (15, 22), 0), (1, (15, 22), 1), (1, (31, 9), 0), (0, (15, 22), 1), (0, (15, 22), 0)):
         slope = rng.normal(size=shape).astype(np.float32)

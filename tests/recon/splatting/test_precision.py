@@ -38,7 +38,7 @@ def test_where_a_cones_detector_stands_does_not_matter(rng: np.random.Generator)
 
 
 def test_the_crop_shows_the_middle_of_the_scan_in_larger_pixels(rng: np.random.Generator) -> None:
-    """Rendering the same Gaussians in the crop's own geometry gives the joined pixels, up to their averaging."""
+    """Rendering the same Gaussians in the crop's own geometry gives the binned pixels, up to their averaging."""
     gaussians = _blobs(rng)
     data = project(gaussians, VIEWS).numpy()
     small, views = small_crop(data, VIEWS)
@@ -48,7 +48,7 @@ def test_the_crop_shows_the_middle_of_the_scan_in_larger_pixels(rng: np.random.G
     assert np.linalg.norm(again - small) < 0.05 * np.linalg.norm(small)
 
 
-def test_a_detector_of_one_row_is_not_joined() -> None:
+def test_a_detector_of_one_row_is_not_binned() -> None:
     thin = Geometry.parallel([0.0, 1.0], (1, 200))
     small, views = small_crop(np.ones((2, 1, 200), np.float32), thin)
     assert small.shape == (2, 1, 200) and views.detector_shape == (1, 200)

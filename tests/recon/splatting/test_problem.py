@@ -1,4 +1,4 @@
-"""The data of a fit: units, weights, noise, joined pixels, views that come later."""
+"""The data of a fit: units, weights, noise, binned pixels, views that come later."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
 
 @pytest.mark.parametrize("beam", ["parallel", "cone"])
 @pytest.mark.parametrize("factor", [2, 3, 4, 8])
-def test_the_sample_stays_in_place_behind_joined_pixels(beam: str, factor: int) -> None:
+def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) -> None:
     # 23 rows and 37 columns are a multiple of no factor, and the axis is in the middle of neither.
     width, cut = 9.0, Truncation(9.0, 1e-12)  # of the Gaussians, in pixels
     how = {"axis_col": 15.3, "axis_row": 9.6, "shifts": [[0, 0], [1.5, -0.7], [0, 0]]}
@@ -150,7 +150,7 @@ def test_the_sample_stays_in_place_behind_joined_pixels(beam: str, factor: int) 
     assert off < factor**2 / 12 / width**2 * 1.1
 
 
-def test_a_detector_too_small_to_be_joined_is_told_by_name() -> None:
+def test_a_detector_too_small_to_be_binned_is_told_by_name() -> None:
     one = Geometry.parallel(VIEWS.angles, (1, 18), 0.5)
     problem = make_problem(np.ones((3, 1, 18), np.float32), one, Grid.matching(one), 1.0, Cpu())
     with pytest.raises(ValueError, match=r"coarse=2 joins 2 x 2 pixels, and the detector has 1 x 18: .* 1 or less"):
@@ -169,7 +169,7 @@ def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(r
         extend(make_problem(data, shifted, GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
 
 
-def test_joined_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:
+def test_binned_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
     joined = coarser(problem, 3, "l1", 0.25)

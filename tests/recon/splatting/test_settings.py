@@ -35,7 +35,7 @@ def test_a_kernel_goes_by_its_name() -> None:
 
 @pytest.mark.parametrize(("noise", "weight"), [(1e-4, 0.02), (2e-3, 0.05), (4e-3, 0.2), (0.1, 0.25)])
 def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generator, noise: float, weight: float) -> None:
-    """3e5 times its variance, over 24 pixels a Gaussian; and the same on pixels joined two by two."""
+    """3e5 times its variance, over 24 pixels a Gaussian; and the same on pixels binned two by two."""
     views = Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (64, 64))
     grid = Grid.matching(views)
     flat = np.full((views.n_views, *views.detector_shape), 5.0)

@@ -162,7 +162,7 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
 
 
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="coarse=2 begins a fit on joined pixels"):
+    with pytest.raises(ValueError, match="coarse=2 begins a fit on binned pixels"):
         StreamingFit(VIEWS, GRID, settings=FitSettings(coarse=2))
 
 
