@@ -124,7 +124,7 @@ def monitor(
             json_sink(Event("done", clock.now(), done))
     if not as_json:
         end = f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"
-        end += f"; {len(again)} views were taken again: rows {spans(sorted(again))} do not count" if again else ""
+        end += f"; {len(again)} views were taken again: frames {spans(sorted(again))} do not count" if again else ""
         left_out = [f"Not looked at: {'; '.join(aside.said())}."] if aside.said() else []
         click.echo("\n".join([*table(kinds), *references, *left_out, end]))
     if stopped():

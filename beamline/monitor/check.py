@@ -46,12 +46,12 @@ class Flag:
     Attributes:
         check: name of the check.
         level: how bad.
-        view: the frame's row in the file.
+        view: the frame: its number in the file, from 0; darks and flats count.
         score: the measured figure, in the check's unit.
         limit: the figure that it exceeds.
         advice: what it means and what to do.
         region: where in the frame; None: everywhere, or nowhere in particular.
-        first: the first row that it holds for, where that is not `view`: some findings need several views. All are of
+        first: the first frame that it holds for, where that is not `view`: some findings need several views. All are of
             the frame's kind, without another between.
     """
 
@@ -66,7 +66,7 @@ class Flag:
 
     @property
     def rows(self) -> range:
-        """Rows of the file that it holds for."""
+        """Frames of the file that it holds for."""
         return range(self.view if self.first is None else self.first, self.view + 1)
 
 

@@ -129,7 +129,7 @@ class Floater:
         region = grid.region(trail.row, trail.col, 2 * BOX, 2 * BOX)
         advice = (
             f"Something crosses the field at {abs(trail.speed) * grid.cell:.1f} px a view, faster than the sample's "
-            f"turning carries anything there (seen in views of rows {trail.first:.0f} ... {trail.last:.0f}): a crumb "
+            f"turning carries anything there (seen in frames {trail.first:.0f} ... {trail.last:.0f}): a crumb "
             "in the beam or on the holder. Look for it, blow it off, and repeat these views."
         )
         flag = Flag(self.name, Level.WARN, now, trail.score, self.warn, advice, region, int(trail.first))

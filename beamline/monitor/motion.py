@@ -71,14 +71,15 @@ class Motion:
             score, limit = math.hypot(across, down), min(limit_across, limit_down)
             advice = (
                 f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
-                "on its holder, or something touched it. Fix it and begin anew, or reconstruct the views before and "
-                "after this one apart."
+                "on its holder, or something touched it. Fix it if it may go on. The views are of use: "
+                "`beamline recon` corrects those after the jump by shifts, or leaves them out (cones: choose one side with --views)."
             )
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn
             advice = (
                 f"The sample turned by {turn:+.1f} steps more than its step: triggers were lost, the stage slipped, or "
-                "the sample turned on its holder. Compare the stage's encoder with the plan."
+                "the sample turned on its holder. Compare the stage's encoder with the plan; `beamline recon` turns "
+                "the views from here on to fit the others, or leaves them out."
             )
         else:
             return Look(after)

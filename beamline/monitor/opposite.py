@@ -130,7 +130,7 @@ class Opposite:
                 fit = lay_on(one, turn / step, view, grid, mirrored=False)
                 if fit is None:
                     return Look(state)
-                return Look(state, self._moved(fit, view.index, f"the view of row {one.view.index}, taken again", grid))
+                return Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", grid))
         return Look(state)
 
     def _mirrored(
@@ -145,13 +145,13 @@ class Opposite:
         first = state.axis is None
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
-        flag = self._moved(moved, view.index, f"the view of row {one.view.index}, from the other side", context.grid)
+        flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context.grid)
         state = replace(state, axis=usual)
         stated = context.axis_col
         if flag is not None or not first or stated is None or abs(axis - stated) <= max(self.axis, CELLS[2] * cell):
             return Look(state, flag)
         advice = (
-            f"By the views of rows {one.view.index} and {view.index}, from opposite sides, the axis is at column "
+            f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
             f"{axis:.1f}; the scan states {stated:.1f}. The axis is elsewhere, or the sample moved by twice as much."
         )
         return Look(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
@@ -167,7 +167,10 @@ class Opposite:
             if moved > limits[0]
             else f"parts of it differ as if all had moved by {fit.remainder:.1f} px: it shrank, bent or lost something"
         )
-        advice = f"Against {other}, {change}. Look at both; reconstruct views before and after the change apart."
+        advice = (
+            f"Against {other}, {change}. Look at both. A jump that `motion` saw in between is corrected by `beamline "
+            "recon`; a sample that crept or changed is not: reconstruct fewer views (--views), and scan again, faster."
+        )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from beamline.core.text import count
 from beamline.monitor.check import Level
 from beamline.monitor.motion import Motion
+from beamline.monitor.opposite import Opposite
 from beamline.projections.flag_regions import Regions, regions_of
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource
@@ -54,7 +55,8 @@ class UsableViews:
 def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:
     """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike.
 
-    A view in which the sample jumped is as good as those after it: see `UsableViews.jumps`.
+    A view in which the sample jumped is as good as those after it: see `UsableViews.jumps`; and then, what views from
+    opposite sides show of it is no fault of theirs.
 
     Args:
         judged: flags that count in place of the file's.
@@ -73,6 +75,8 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
     all_flags, flags = flags, flags.without(Motion.bit)
+    if jumped.size:  # what views from the other side show of the jump is corrected with it
+        flags = flags.without(Opposite.bit)
     if not flags.flagged[rows].any():
         return UsableViews(rows, flags=all_flags, jumps=jumped)
     regions = regions_of(flags, source.shape)

@@ -74,7 +74,7 @@ def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64
     if not jumps.size:
         return Jumps(frames)
     if cone_of(source, selection) is not None:
-        where = rows_text(jumps)
+        where = frames_text(jumps)
         return Jumps(
             frames,
             said=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as if "
@@ -259,7 +259,7 @@ def _done(
     lost, pitch, text = fit.frames.size - frames.size, fit.geometry.pixel_pitch, list[str]()
     seen = np.array([i for first, last in real for i in range(first, last + 1)], np.int64)
     if seen.size:
-        text.append(f"The sample jumped at {rows_text(fit.jumps[seen])}.")
+        text.append(f"The sample jumped at {frames_text(fit.jumps[seen])}.")
     for at, m in enumerate(moves):
         n = int((groups[part] == at).sum())
         if n and m != Displacement():
@@ -279,7 +279,7 @@ def _done(
     none = np.setdiff1d(np.arange(fit.jumps.size), seen)
     if none.size:
         text.append(
-            f"Of the alarm of motion at {rows_text(fit.jumps[none])} the other views show nothing (less than "
+            f"Of the alarm of motion at {frames_text(fit.jumps[none])} the other views show nothing (less than "
             f"{LARGEST:g} px): views on both sides are used as they are."
         )
     return Jumps(frames, fit.jumps, places, " ".join(text))
@@ -299,10 +299,10 @@ def _thinned(group: NDArray[np.int64]) -> I64:
     return np.sort(np.concatenate(keep))
 
 
-def rows_text(rows: Sequence[int] | I64) -> str:
-    """Rows of a file as `row 3` or `rows 3, 7`."""
-    rows = np.asarray(rows).tolist()
-    return ("row " if len(rows) == 1 else "rows ") + ", ".join(map(str, rows))
+def frames_text(frames: Sequence[int] | I64) -> str:
+    """Frames of a file as `frame 3` or `frames 3, 7`."""
+    frames = np.asarray(frames).tolist()
+    return ("frame " if len(frames) == 1 else "frames ") + ", ".join(map(str, frames))
 
 
 def _quiet(text: str) -> None:

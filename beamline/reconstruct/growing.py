@@ -18,7 +18,7 @@ from beamline.core.stop import StopLatch
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, usable_views
-from beamline.projections.jumps import rows_text
+from beamline.projections.jumps import frames_text
 from beamline.projections.prepare import (
     PreparedProjections,
     assemble,
@@ -278,7 +278,7 @@ class ScanFollower:
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
         if usable.jumps.size:
             self._warn(
-                f"The sample jumped at {rows_text(usable.jumps)}: this volume takes the views as if it had not. "
+                f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
             )
         self._correct_again(self.axis_col, usable)

@@ -163,7 +163,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     n = int(source.image_key.size)
     again = rows_replaced(source)
     if again.size:
-        table["views taken again"] = f"{again.size}, because of an alarm: rows {spans(again.tolist())} are not used"
+        table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
     remarks = [] if flags is None else reasons(flags)
     flagged = [] if flags is None else worst_frames(source, flags)
     return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks, flagged)

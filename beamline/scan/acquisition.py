@@ -153,7 +153,7 @@ class Acquisition:
             yield replace(frame, angle=angle, trigger=views.n + i, replaces=retakes[i].row)
         if done.taken.missing:
             rows = spans([retakes[i].row for i in done.taken.missing])
-            self._emit("warning", {"message": f"The views in rows {rows} gave no frame when they were taken again."})
+            self._emit("warning", {"message": f"Frames {rows} gave no frame when they were taken again."})
 
     def _still_needed(self, block: Block) -> bool:
         """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.

@@ -210,12 +210,12 @@ class Recorder:
             self._monitor, flags = look(self._monitor, frame, found)
         except CheckError as failed:
             self._monitor = without(self._monitor, failed.name)
-            message = f"{failed} at row {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
+            message = f"{failed} at frame {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
             self._emit("warning", {"message": message})
             return self._look(frame, found)
         except Exception as error:
             self._monitor_off = True
-            self._emit("warning", {"message": f"the monitor failed at row {frame.index} and is off: {error!r}"})
+            self._emit("warning", {"message": f"the monitor failed at frame {frame.index} and is off: {error!r}"})
             return ()
         return flags
 

@@ -35,7 +35,7 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
     if again.size:
         verb = "was" if again.size == 1 else "were"
         message += (
-            f" {count(again.size, 'view')} {verb} taken again, and the first (rows {spans(again.tolist())}) not used."
+            f" {count(again.size, 'view')} {verb} taken again, and the first (frames {spans(again.tolist())}) not used."
         )
         rows = np.setdiff1d(rows, again)
         if not rows.size:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
 from beamline.monitor.motion import Motion
+from beamline.monitor.opposite import Opposite
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
@@ -38,6 +39,7 @@ def scan(path: Path, views: NDArray[np.float32], *jumps: int) -> Path:
         for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
             frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
             said = [Flag(Motion.name, Level.ALARM, i, 1.0, 0.5, "")] if i in rows else []
+            said += [Flag(Opposite.name, Level.WARN, i, 1.0, 0.5, "")] if i - 3 in rows else []
             writer.append(frame, digest(frame.counts), said)
     return path / "scan.h5"
 
@@ -61,8 +63,8 @@ def test_views_after_a_jump_are_corrected_by_shifts(tmp_path: Path) -> None:
     np.testing.assert_allclose(shifts[later, 0], 1.5 * np.cos(ANGLES[:55][later]), atol=0.2)
     np.testing.assert_allclose(shifts[later, 1], 1.0, atol=0.2)
     np.testing.assert_allclose(unseen.shifts[:, 1], shifts[-1, 1])
-    assert told.startswith("The sample jumped at row 45. 19 views are corrected by shifts: the sample lies +1.")
-    assert told == found.jumps
+    assert told.startswith("The sample jumped at frame 45. 19 views are corrected by shifts: the sample lies +1.")
+    assert told == found.jumps and found.view_weights is None  # what `opposite` saw is corrected
     rays = found.ray_weights(3)
     assert rays is not None and len(rays) == 55 + 3
     assert (rays[:JUMP] == 1).all() and (rays[JUMP:-3, 0] == 0).all() and (rays[JUMP:-3, 2:] == 1).all()
@@ -80,15 +82,15 @@ def test_spoilt_views_between_two_false_alarms_hide_no_jump(tmp_path: Path) -> N
     views = moved(2.0, 2.0)
     views[15:20] += np.random.default_rng(1).normal(0, 0.5, (5, *SHAPE)).astype(np.float32)
     found, told = prepared(scan(tmp_path, views, 15, 20, JUMP), replace(SELECTION, binning=2))
-    assert told.startswith("The sample jumped at row 45. 19 views are corrected by shifts")
-    assert "Of the alarm of motion at rows 19, 24 the other views show nothing" in told
+    assert told.startswith("The sample jumped at frame 45. 19 views are corrected by shifts")
+    assert "Of the alarm of motion at frames 19, 24 the other views show nothing" in told
     assert found.geometry.n_views == ANGLES.size and (found.geometry.shifts[~LATER] == 0).all()
 
 
 def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(0.0, 0.0), 20, 22))
     assert found.geometry.n_views == ANGLES.size and not found.geometry.shifts.any()
-    assert told.startswith("Of the alarm of motion at rows 24, 26 the other views show nothing (less than 0.5 px)")
+    assert told.startswith("Of the alarm of motion at frames 24, 26 the other views show nothing (less than 0.5 px)")
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_file_info_and_validate_count_them(tmp_path: Path) -> None:
     assert (facts["first_angle_deg"], facts["last_angle_deg"]) == (0, pytest.approx(168.75, abs=0.01))
     (found,) = [finding for finding in validate(path) if finding.rule == "flags"]
     assert found.severity == "info"
-    assert "3 views were taken again, and the first (rows 8-9, 20) not used." in found.message
+    assert "3 views were taken again, and the first (frames 8-9, 20) not used." in found.message
     with h5py.File(path) as file:
         assert list(file["entry/frame_log/replaces"][FIRST + N :]) == [8, 9, 20, -1, -1]
         assert list(file["entry/frame_log/trigger"][FIRST + N : FIRST + N + 3]) == [16, 17, 18]
@@ -139,7 +139,7 @@ def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 10}, lost={FIRST + N})), *WORDS)
     assert ran.error is None and ran.result is not None
     assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)
-    assert "rows 8 gave no frame when they were taken again" in ran.of("warning")[0].data["message"]
+    assert "Frames 8 gave no frame when they were taken again" in ran.of("warning")[0].data["message"]
     with open_scan(ran.result.path) as source:
         assert source.image_key[8] == FrameKind.PROJECTION and source.image_key[10] == FrameKind.INVALID
 

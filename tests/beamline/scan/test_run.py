@@ -282,7 +282,7 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     ran = Ran(tmp_path, FakeInstrument())
     assert ran.error is None
     ran.assert_good_file(19, "complete")
-    assert ["monitor failed at row 0" in event.data["message"] for event in ran.of("warning")] == [True]
+    assert ["monitor failed at frame 0" in event.data["message"] for event in ran.of("warning")] == [True]
 
 
 def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,7 +292,7 @@ def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(Mass, "look", broken)
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
     (warning,) = ran.of("warning")
-    assert "the check mass failed at row 0 and is off, the other checks go on" in warning.data["message"]
+    assert "the check mass failed at frame 0 and is off, the other checks go on" in warning.data["message"]
     assert {event.data["check"] for event in ran.of("flag")} == {"stuck"}
 
 
