@@ -72,7 +72,8 @@ class Motion:
             advice = (
                 f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
                 "on its holder, or something touched it. Fix it if it may go on. The views are of use: "
-                "`beamline recon` corrects those after the jump by shifts, or leaves them out (cones: choose one side with --views)."
+                "`beamline recon` corrects those after the jump by shifts, or leaves them out (cones: choose one "
+                "side with --views)."
             )
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn
