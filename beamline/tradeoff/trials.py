@@ -25,7 +25,7 @@ class Trial:
             implementation.
         method: its name in `recon.methods`.
         views: how many, spread evenly over those chosen.
-        binning: detector pixels per side of a binned one, on top of the selection's.
+        binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.
         halves: measure the half-set resolution too, which takes two more reconstructions.
     """
