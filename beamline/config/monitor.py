@@ -23,7 +23,7 @@ class MonitorBase(Section):
     act_after: Annotated[int, Field(ge=1)] = 10
     """Frames in a row with an alarm before the check's policy pauses or stops the scan."""
     retake: bool = False
-    """Views with an alarm are taken again, once, after the last view."""
+    """Views with an alarm or without a frame are taken again, once, after the last view."""
     retake_share: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Share of the views that are taken again at most."""
 

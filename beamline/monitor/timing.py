@@ -36,7 +36,8 @@ class Timing:
         return TimingState()
 
     def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
-        if frame.kind is not FrameKind.PROJECTION or context.period is None or frame.replaces >= 0:
+        again = frame.replaces >= 0 or frame.trigger < state.trigger  # a view that gave no frame has its old trigger
+        if frame.kind is not FrameKind.PROJECTION or context.period is None or again:
             return Look(state)
         after = TimingState(frame.trigger, frame.time)
         steps = frame.trigger - state.trigger

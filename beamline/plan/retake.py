@@ -14,7 +14,7 @@ from drivers.frame import FrameKind
 
 @dataclass(frozen=True)
 class Retake:
-    """A view to take again: its row in the file, and its trigger within the views."""
+    """A view to take again: its frame in the file (-1: it gave none), and its trigger within the views."""
 
     row: int
     trigger: int

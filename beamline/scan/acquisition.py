@@ -59,6 +59,8 @@ class Acquisition:
         self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit, self._hold)
         self._supervision, self._refused = supervision, ""
         self._done: list[TakenBlock] = []
+        self.recovered = 0
+        """Views that gave no frame at first, and did when they were taken again."""
         self.unsafe = False
         """A device failed while the instrument was made safe: stage, camera or shutter may be as during the scan."""
 
@@ -113,9 +115,10 @@ class Acquisition:
             if block.kind is FrameKind.PROJECTION and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            yield from self._block(TakenBlock(block, Taken()))
+            done = TakenBlock(block, Taken())
+            yield from self._block(done)
             if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
-                yield from self._again(block)
+                yield from self._again(block, done.taken)
 
     def _block(self, done: TakenBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
@@ -138,10 +141,10 @@ class Acquisition:
             },
         )
 
-    def _again(self, views: Block) -> Iterator[Frame]:
-        """The views that supervision wants again; each says which row it replaces. One that gives no frame replaces
-        none, and that is no failure of the scan."""
-        retakes = self._supervision.retakes()
+    def _again(self, views: Block, taken: Taken) -> Iterator[Frame]:
+        """The views that supervision wants again; each says which frame it replaces, or has the trigger that gave
+        none, which is then missing no more. One that gives no frame is no failure beyond what it was before."""
+        retakes = self._supervision.retakes(tuple(taken.missing))
         if not retakes:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
@@ -149,11 +152,14 @@ class Acquisition:
         done = TakenBlock(retake_block(views, triggers), Taken(), again=True)
         for frame in self._block(done):
             i = frame.trigger
-            angle = frame.angle - float(beyond[i])
-            yield replace(frame, angle=angle, trigger=views.n + i, replaces=retakes[i].row)
-        if done.taken.missing:
-            rows = spans([retakes[i].row for i in done.taken.missing])
-            self._emit("warning", {"message": f"Frames {rows} gave no frame when they were taken again."})
+            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + i
+            if row < 0:
+                trigger = retakes[i].trigger
+                taken.missing.remove(trigger)
+                self.recovered += 1
+            yield replace(frame, angle=angle, trigger=trigger, replaces=row)
+        if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
+            self._emit("warning", {"message": f"Frames {spans(rows)} gave no frame when they were taken again."})
 
     def _still_needed(self, block: Block) -> bool:
         """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.

@@ -19,6 +19,7 @@ from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_c
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.narration import UserLog
 from beamline.core.stop import HoldRequest, ScanAborted, StopRequest
+from beamline.core.text import count
 from beamline.instrument.connect import Instrument, connect
 from beamline.instrument.operator import ask_operator
 from beamline.plan.plan import Block
@@ -80,7 +81,7 @@ class RunResult:
         flags: frames that the monitor flagged: their number by check, then by level.
         alarmed_frames: frames with an alarm, without those that were taken again.
         alarmed_views: views among them.
-        retaken: views that were taken again, because they had one.
+        retaken: views that were taken again, because they had one or gave no frame.
         reference_faults: what is wrong with darks and flats, a sentence or more a group.
         seconds: real time of the whole run.
         bytes: size of the scan file.
@@ -228,7 +229,7 @@ class _Run:
             flags=recorder.flags,
             alarmed_frames=recorder.alarmed_frames,
             alarmed_views=len(recorder.alarmed_views),
-            retaken=recorder.retaken,
+            retaken=recorder.retaken + acquisition.recovered,
             reference_faults=tuple(faults.values()),
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
@@ -302,7 +303,10 @@ class _Run:
         return Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.emit,
-            Supervision(lambda: self._refusal(recorder), self.hold.take, self.ask, lambda: self._retakes(recorder)),
+            Supervision(
+                lambda: self._refusal(recorder), self.hold.take, self.ask,
+                lambda missing: self._retakes(recorder, missing),
+            ),
         )  # fmt: skip
 
     def _refusal(self, recorder: Recorder) -> str | None:
@@ -319,24 +323,25 @@ class _Run:
             "scan as it is."
         )
 
-    def _retakes(self, recorder: Recorder) -> Sequence[Retake]:
-        """Views with an alarm, evenly spread where there are more than the plan allows."""
+    def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
+        """Views with an alarm or without a frame, evenly spread where there are more than the plan allows."""
         most = self.ready.plan.retakes
         if not most:
             return ()
         recorder.wait()
-        alarmed = recorder.alarmed_views
-        chosen = spread(alarmed, most)
+        lost = [Retake(-1, trigger) for trigger in missing]
+        bad = sorted([*recorder.alarmed_views, *lost], key=lambda view: view.trigger)
+        chosen = spread(bad, most)
         if not chosen:
             return ()
-        if len(chosen) < len(alarmed):
+        if len(chosen) < len(bad):
             message = (
-                f"{len(alarmed)} views have an alarm, and {most} may be taken again (monitor.retake_share): "
-                f"{len(alarmed) - len(chosen)} between them stay as they are."
+                f"{len(bad)} views have an alarm or gave no frame, and {most} may be taken again "
+                f"(monitor.retake_share): {len(bad) - len(chosen)} between them stay as they are."
             )
             self.emit("warning", {"message": message})
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
-        self.emit("state", {"state": "retaking", "message": f"Taking {len(chosen)} views with an alarm again"})
+        self.emit("state", {"state": "retaking", "message": f"Taking {count(len(chosen), 'view')} again"})
         return chosen
 
     def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:

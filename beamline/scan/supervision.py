@@ -27,13 +27,13 @@ class Supervision:
         hold: asked before each view of a step scan and before each pass of a fly scan: why it should wait; None: it
             goes on.
         ask: puts the request to go on to the operator, and returns when it was confirmed.
-        retakes: asked once, after the last projection: which of them to take again.
+        retakes: asked once, after the last projection: which to take again; is given the triggers without a frame.
     """
 
     refusal: Callable[[], str | None] = lambda: None
     hold: Callable[[], str | None] = lambda: None
     ask: Ask = _nobody
-    retakes: Callable[[], Sequence[Retake]] = lambda: ()
+    retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
 
 
 UNSUPERVISED = Supervision()

@@ -148,7 +148,7 @@ def time_order(places: Places) -> Iterator[Finding]:
 def framestamp_order(places: Places) -> Iterator[Finding]:
     """A camera's counter goes up by one a frame.
 
-    It starts again where the camera was armed anew: with other frames, or for later triggers of the same ones; not
+    It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones; not
     always at 0, for the first frame may be lost.
     """
     stamps, triggers = _column(places, "frame_log/framestamp"), _column(places, "frame_log/trigger")
@@ -156,7 +156,9 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
     if stamps.size < 2 or key.size < stamps.size or triggers.size != stamps.size or (stamps < 0).any():
         return
     steps = np.diff(stamps)
-    armed = (np.diff(triggers) > 0) & ((steps < 0) | (stamps[1:] == 0))
+    new = np.zeros(triggers.size, np.bool_)
+    new[np.unique(triggers, return_index=True)[1]] = True
+    armed = new[1:] & ((steps < 0) | (stamps[1:] == 0))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))
     if repeated.size:

@@ -144,6 +144,23 @@ def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
         assert source.image_key[8] == FrameKind.PROJECTION and source.image_key[10] == FrameKind.INVALID
 
 
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_view_that_gave_no_frame_is_taken_again_under_its_trigger(tmp_path: Path, mode: str) -> None:
+    """In a fly scan the view after it has an alarm, of `timing`, and is taken again, too."""
+    ran = Ran(tmp_path, FakeInstrument(Faults(lost={FIRST + 3})), *WORDS, f"scan.mode={mode}")
+    assert ran.error is None and ran.result is not None
+    assert (ran.result.retaken, ran.result.missing) == (2 if mode == "fly" else 1, ())
+    with open_scan(ran.result.path) as source:
+        again = FIRST + N - 1
+        assert source.image_key[again] == FrameKind.PROJECTION
+        assert np.degrees(source.angles[again]) == pytest.approx(3 * 11.25, abs=0.01)
+        views = usable_views(source, use_flags=True).frames
+        assert views.size == N and again in views
+    with h5py.File(ran.result.path) as file:
+        assert (file["entry/frame_log/trigger"][again], file["entry/frame_log/replaces"][again]) == (3, -1)
+    assert [finding for finding in validate(ran.result.path) if finding.severity != "info"] == []
+
+
 SCENE = """simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.02, height: 1,
 attenuation: 9.0, centre: [0.06, 0, 0]}]}, beam: {photons_per_s: 1.0e+5}, effects: [%s
 {kind: lost_beam, views: [6, 9], share: 0.02}, dark_current, read_noise, offset]}"""
