@@ -106,8 +106,8 @@ class Opposite:
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return Look(state)
         if context.cone or not grid.flats:
-            why = "the beam is a cone" if context.cone else "there are no flats"
-            advice = f"Views from opposite sides are not compared: {why}, and they differ anyway."
+            why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
+            advice = f"Views from opposite sides are not compared: {why}."
             return Look(replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice))
         kept = state.kept
         if kept and kept[-1].after is None:

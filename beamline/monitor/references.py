@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum, auto
 from typing import Annotated
 
 import numpy as np
@@ -77,17 +78,29 @@ class Reference:
         return cls(row, kind, exposure, digest.saturated_fraction, blocks, block)
 
 
+class FaultKind(StrEnum):
+    """What can be wrong with darks and flats."""
+
+    SATURATED = auto()
+    NO_BEAM = auto()  # flats at the darks' level
+    BEAM_LOST = auto()  # flats with much less light than others
+    DIMMER_THAN_VIEWS = auto()
+    UNEVEN = auto()
+    MOSTLY_UNLIT = auto()
+    LIGHT_IN_DARKS = auto()
+
+
 @dataclass(frozen=True)
 class Fault:
     """What is wrong with a group.
 
     Attributes:
-        what: "saturated", "dark", "lost", "outshone", "uneven", "unlit" or "lit".
+        kind: which fault.
         score, limit: the figure, and the limit that it breaks.
         message: both in words, and what to do.
     """
 
-    what: str
+    kind: FaultKind
     score: float
     limit: float
     message: str
@@ -160,7 +173,7 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fa
         f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
         "Shorten the exposure or add a filter."
     )
-    return Fault("saturated", score, limits.saturated, said)
+    return Fault(FaultKind.SATURATED, score, limits.saturated, said)
 
 
 def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: ReferenceLimits) -> Fault | None:
@@ -173,14 +186,14 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
             f"{_level(darks):.6g}, and a pixel has a noise of {noise:.2g} (limit {limits.beam:g} times that). Was the "
             "shutter open for them, and closed for the darks?"
         )
-        return Fault("dark", light / noise, limits.beam, said)
+        return Fault(FaultKind.NO_BEAM, light / noise, limits.beam, said)
     most = _light(bright, darks)
     gone = 1 - _light(flats, darks) / most
     if gone <= limits.lost:
         return None
     where = spans([reference.row for reference in bright])
     said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.lost:.0%}): the beam was lost."
-    return Fault("lost", gone, limits.lost, said)
+    return Fault(FaultKind.BEAM_LOST, gone, limits.lost, said)
 
 
 def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> Fault | None:
@@ -196,7 +209,7 @@ def _outshone(flats: Group, darks: Group | None, views: Group, limits: Reference
         f"they have {share:.2%} of the light of the views (limit {1 - limits.lost:.0%}), though a sample only takes "
         "light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
     )
-    return Fault("outshone", share, 1 - limits.lost, said)
+    return Fault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.lost, said)
 
 
 def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
@@ -218,13 +231,13 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault
         said = (
             f"their light changes by {level:.0%} from flat to flat (limit {limits.uneven:.0%}): the beam was unstable."
         )
-        return Fault("uneven", level, limits.uneven, said)
+        return Fault(FaultKind.UNEVEN, level, limits.uneven, said)
     if place > max(limits.uneven, CHANGE_SIGMAS * noise):
         said = (
             f"in places their light changes by {place:.0%} from flat to flat (limit {limits.uneven:.0%}): something "
             "moved in the beam. Is the sample out?"
         )
-        return Fault("uneven", place, limits.uneven, said)
+        return Fault(FaultKind.UNEVEN, place, limits.uneven, said)
     return None
 
 
@@ -237,7 +250,7 @@ def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault 
         f"{score:.0%} of the frame has no light in them (limit {limits.unlit:.0%}): move beam and detector onto one "
         "another, or read fewer pixels."
     )
-    return Fault("unlit", score, limits.unlit, said)
+    return Fault(FaultKind.MOSTLY_UNLIT, score, limits.unlit, said)
 
 
 def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fault | None:
@@ -258,7 +271,7 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fa
         + (f" and their variance {variance:.0%}" if known else "")
         + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
     )
-    return Fault("lit", score, limit, said)
+    return Fault(FaultKind.LIGHT_IN_DARKS, score, limit, said)
 
 
 def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:

@@ -21,7 +21,7 @@ from beamline.core.events import Emit
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import Instrument, camera_settings
 from beamline.monitor.digest import digest
-from beamline.monitor.references import Reference, ReferenceLimits, judge
+from beamline.monitor.references import FaultKind, Reference, ReferenceLimits, judge
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
@@ -171,7 +171,7 @@ def evaluate(
     ]
     judged = judge([references[: len(darks)], references[len(darks) :]], limits)
     faults = [fault for group in judged for fault in group.faults]
-    known = not any(fault.what in ("lit", "dark") for fault in faults)
+    known = not any(fault.kind in (FaultKind.LIGHT_IN_DARKS, FaultKind.NO_BEAM) for fault in faults)
     advised = _rounded(min(used * room, longest)) if known else math.nan
     n = max(plan.flats.count, 1)
     longer = typical * advised / used

@@ -31,7 +31,7 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
     if not rows.size:
         yield Finding("info", "flags", message)
         return
-    message += f" Rows with an alarm: {spans(rows.tolist())}."
+    message += f" Frames with an alarm: {spans(rows.tolist())}."
     if again.size:
         verb = "was" if again.size == 1 else "were"
         message += (
@@ -41,7 +41,7 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
         if not rows.size:
             yield Finding("info", "flags", f"{message} No other frame has an alarm.")
             return
-        message += f" Rows with an alarm beside these: {spans(rows.tolist())}."
+        message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
     views = source.image_key == FrameKind.PROJECTION
     spoilt = flags.without(Motion.bit).alarmed  # a view in which the sample jumped is as good as those after it
     left, lost = int((views & ~spoilt).sum()), int((views & spoilt).sum())

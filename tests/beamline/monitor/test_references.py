@@ -50,7 +50,7 @@ def flats(images: Images, first: int = 10) -> list[Reference]:
 
 
 def faults(found: tuple[JudgedGroup, ...]) -> list[list[str]]:
-    return [[fault.what for fault in group.faults] for group in found]
+    return [[fault.kind for fault in group.faults] for group in found]
 
 
 def profile() -> NDArray[np.float64]:
@@ -94,10 +94,10 @@ def slit(images: Images) -> Images:
     ("spoil", "what", "said"),
     [
         (saturated, "saturated", "of their pixels are saturated (limit 0.10%)"),
-        (dimmed, "dark", "there is no beam in them"),
+        (dimmed, "no_beam", "there is no beam in them"),
         (flickering, "uneven", "changes by 22% from flat to flat (limit 10%)"),
         (crossed, "uneven", "something moved in the beam"),
-        (slit, "unlit", "62% of the frame has no light"),
+        (slit, "mostly_unlit", "62% of the frame has no light"),
     ],
 )
 def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], Images], what: str, said: str) -> None:
@@ -105,7 +105,7 @@ def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], 
     assert faults(found) == [[], [what]]
     (fault,) = found[1].faults
     assert said in fault.message
-    assert fault.score > fault.limit or what == "dark"
+    assert fault.score > fault.limit or what == "no_beam"
     assert found[1].described().startswith("The flats 10-14: ")
 
 
@@ -113,7 +113,7 @@ def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], 
 def test_darks_with_light_are_told_from_darks_with_an_offset(share: float) -> None:
     """Light brings its noise: 25 photons on an offset of 100 counts are no lit darks, a leaking shutter is."""
     found = judge([darks(share * PHOTONS), flats(frames(5, PHOTONS, 2))])
-    assert faults(found) == [["lit"], []]
+    assert faults(found) == [["light_in_darks"], []]
     assert "there is light in them" in found[0].faults[0].message
     faint = judge([darks(), flats(frames(5, 25.0, 2))])
     assert faults(faint) == [[], []]
@@ -131,20 +131,20 @@ def test_clean_darks_of_a_scan_of_few_photons_are_not_lit() -> None:
 
 def test_darks_and_flats_with_the_same_light_are_the_flats_fault() -> None:
     found = judge([darks(PHOTONS), flats(frames(5, PHOTONS, 2))])
-    assert faults(found) == [[], ["dark"]]
+    assert faults(found) == [[], ["no_beam"]]
     assert "open for them, and closed for the darks" in found[1].faults[0].message
 
 
 def test_a_group_that_lost_the_beam_is_judged_by_the_others() -> None:
     dim = flats(frames(5, 0.02 * PHOTONS, 5), first=200)
     good = flats(frames(5, PHOTONS, 2))
-    assert faults(judge([darks(), good, dim])) == [[], [], ["lost"]]
+    assert faults(judge([darks(), good, dim])) == [[], [], ["beam_lost"]]
     assert faults(judge([darks(), dim])) == [[], []]  # by itself it is a dim flat
     # Twice the exposure, half the beam: the same counts, and still half of the light is not gone by more than the limit
     half = [replace(flat, exposure=0.2) for flat in flats(frames(5, PHOTONS, 6), first=200)]
     assert faults(judge([darks(), good, half])) == [[], [], []]
     third = [replace(flat, exposure=0.3) for flat in half]
-    assert faults(judge([darks(), good, third])) == [[], [], ["lost"]]
+    assert faults(judge([darks(), good, third])) == [[], [], ["beam_lost"]]
 
 
 def test_limits_are_what_they_say() -> None:

@@ -22,10 +22,10 @@ FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 
         (
             range(6, 9),
             "warning",
-            "flagged 4 of 22 frames: beam 1 warn 3 alarm. Rows with an alarm: 6-8. A reconstruction leaves 3 v",
+            "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction leaves 3 v",
         ),
-        (range(6, 20), "error", "Rows with an alarm: 6-19. 4 of 18 views have none, 10 are needed"),
-        (range(2), "warning", "Rows with an alarm: 0-1."),
+        (range(6, 20), "error", "Frames with an alarm: 6-19. 4 of 18 views have none, 10 are needed"),
+        (range(2), "warning", "Frames with an alarm: 0-1."),
     ],
 )
 def test_flags_are_counted_by_check_and_level(tmp_path: Path, alarms: range, severity: str, said: str) -> None:
