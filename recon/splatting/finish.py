@@ -21,10 +21,10 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
-from recon.voxels.held_out_weight import choose_weight
+from recon.voxels.held_out_weight import bregman_weight, choose_weight
 from recon.voxels.iterative import solve
-from recon.voxels.noise_balance import EXPLAINED
-from recon.voxels.ordered_fista import ordered_fista
+from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
+from recon.voxels.ordered_fista import bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
@@ -47,10 +47,14 @@ class _FromModel:
 
     iterations: int
     unmodelled: float | None = None
+    again: bool = False
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled)
-        return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
+        heavy = bregman_weight(problem, weight) if self.again and not isinstance(weight, NoiseBalance) else None
+        if heavy is None:
+            return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
+        return bregman(problem, x, heavy, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
 
 
 def finish(
@@ -60,6 +64,7 @@ def finish(
     sweeps: int = SWEEPS,
     settings: FitSettings | None = None,
     should_stop: Callable[[], bool] | None = None,
+    again: bool = False,
 ) -> Volume:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -72,9 +77,9 @@ def finish(
     counts as noise. The second volume is taken unless it leaves its views worse explained by more than a tenth.
 
     Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
-    `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`. Measured on 26 small scans: 0.5
-    to 7 dB above the fit in 25 of them, 0.9 below it in one of 500 photons a pixel; level on a measured walnut
-    (docs/exploration.md).
+    `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`, or is the one that views held
+    out prefer, see `preferred_weight`. Measured on 26 small scans, with the former: 0.5 to 7 dB above the fit in 25 of
+    them, 0.9 below it in one of 500 photons a pixel; level on a measured walnut (docs/exploration.md).
     Memory: 8 volumes and 5 times the projections.
 
     Args:
@@ -86,6 +91,7 @@ def finish(
         should_stop: called after each sweep; True ends the iteration. Between the two attempts it keeps the first where
             it explains the views of a parallel beam, which see all matter, better than the fit, else the fit. Of such
             views it keeps the first during the second, too.
+        again: as many sweeps once more, where views held out are predicted better for it, see `bregman`.
 
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
@@ -105,7 +111,7 @@ def finish(
 
     def refined(views: F32, unmodelled: float | None = None) -> Volume:
         return solve(
-            _FromModel(sweeps, unmodelled), projector, views, weight=known, start=start,
+            _FromModel(sweeps, unmodelled, again), projector, views, weight=known, start=start,
             on_iteration=lambda *_: stopped(), seed=problem.seed,
         )  # fmt: skip
 

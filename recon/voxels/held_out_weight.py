@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import ordered_fista
+from recon.voxels.ordered_fista import bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -23,6 +23,12 @@ LEAST_VIEWS = 2 * ONE_IN
 _ROWS = 16  # of the slab that trials see
 _SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3  # of a trial
 _HALVINGS = 5  # at most
+_LEVEL = 0.002  # residuals of views held out that differ by less are equal
+
+# Weights of the two runs of `bregman`, in that of one run, and by how much the residual of views held out has to fall:
+# less is chance (docs/exploration.md).
+_HEAVY, _LESS_HEAVY = 3.0, 2.5
+_GAIN, _FURTHER_GAIN = 0.003, 0.001
 _MATTER = 0.1  # of the largest line integrals
 
 
@@ -66,10 +72,10 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
 
     Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, the weight and half of it, and
     on, until the root mean square of what they leave of the other views rises; the vertex of the parabola through the
-    last three is taken, at most √2 of `first`. A volume that is too smooth misses the edges in unseen views, one that
+    last three is taken, at most √2 times `first`. A volume that is too smooth misses edges of unseen views, one that
     follows the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their number.
 
-    None where twice the weight does not leave more: then nothing shows that the weight by the noise hides anything, and
+    None where twice the weight leaves less: then nothing shows that the weight by the noise hides anything, and
     it may rise. (Weights far above it are not taken: a walnut of 50 views lost 1.3 dB.) None, too, where nothing can be
     held out: a cone, fewer than 16 views, or data without noise.
     """
@@ -78,7 +84,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
         return None
     error = _Trial.of(problem)
     heavier, here = error(2 * first), error(first)
-    if heavier <= here:
+    if heavier < (1 - _LEVEL) * here:
         return None
     lighter, halvings = error(first / 2), 0
     while lighter < here and halvings < _HALVINGS:
@@ -86,7 +92,21 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
         halvings += 1
     curvature = lighter - 2 * here + heavier
     vertex = (lighter - heavier) / (2 * curvature) if lighter >= here and curvature > 0 else 0.0
-    return float(first * 2 ** (vertex - halvings))
+    return float(first * 2 ** (min(vertex, 0.5) - halvings))
+
+
+def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
+    """The weight of `bregman` that predicts views held out better than one run with `weight`; None: none does.
+
+    At the same noise two runs show more of a crack than one, most where views are few (docs/exploration.md).
+    """
+    error = _Trial.of(problem)
+    once, heavy = error(weight), error(_HEAVY * weight, twice=True)
+    if heavy > once:
+        return None
+    less_heavy = error(_LESS_HEAVY * weight, twice=True)
+    factor, best = (_LESS_HEAVY, less_heavy) if less_heavy < (1 - _FURTHER_GAIN) * heavy else (_HEAVY, heavy)
+    return factor * weight if best < (1 - _GAIN) * once else None
 
 
 class _Trial:
@@ -122,12 +142,11 @@ class _Trial:
         assert start is not None  # views of a parallel beam, straight
         return cls(trial, np.maximum(start, 0, out=start), of_views(unseen))
 
-    def __call__(self, weight: float) -> float:
-        """Root mean square of what the volume with this weight leaves of the views held out."""
-        x = ordered_fista(
-            self._problem, self._start.copy(), weight,
-            sweeps=_SWEEPS, subsets=_SUBSETS, tv_steps=_TV_STEPS,
-        )  # fmt: skip
+    def __call__(self, weight: float, twice: bool = False) -> float:
+        """Root mean square of what the volume with this weight, of one run or two, leaves of the views held out."""
+        run = bregman if twice else ordered_fista
+        problem = replace(self._problem, rng=np.random.default_rng(0))  # the same order of subsets for all
+        x = run(problem, self._start.copy(), weight, sweeps=_SWEEPS, subsets=_SUBSETS, tv_steps=_TV_STEPS)
         left = self._unseen.projector.forward_lines(x)
         left -= self._unseen.data
         return math.sqrt(float(np.average(np.square(left), weights=self._weight)))

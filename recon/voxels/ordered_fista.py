@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,37 @@ def ordered_fista(
             break
         ahead(x)
     return x
+
+
+def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subsets: int, tv_steps: int) -> F32:
+    """Two runs of `ordered_fista`, the second with what the first has left of the views added to them: 2 p - A x₁.
+
+    Bregman iteration (Osher, Burger, Goldfarb, Xu & Yin 2005, Multiscale Model. Simul. 4, 460, eq. 3.1 to 3.3). Total
+    variation takes contrast from every structure, from small ones most; the second run gives it back, and takes only
+    what it takes from the sum. The residual does not grow from run to run (their proposition 3.2). The first run wants
+    a heavy weight, at which little noise is in its volume.
+
+    Args:
+        x: as `ordered_fista`.
+        weight: μ of both runs.
+        sweeps: of each run; where `problem.go_on` ends the first one, there is no second.
+    """
+    ended = False
+
+    def first(sweep: int, residual: float) -> bool:
+        nonlocal ended
+        ended = not problem.go_on(sweep, residual)
+        return not ended
+
+    x = ordered_fista(
+        replace(problem, go_on=first), x, weight, sweeps=sweeps, subsets=subsets, tv_steps=tv_steps
+    )  # fmt: skip
+    if ended:
+        return x
+    more = problem.projector.forward_lines(x)
+    combine(2.0, problem.data, -1.0, more, more)
+    again = replace(problem, data=more, go_on=lambda sweep, residual: problem.go_on(sweeps + sweep, residual))
+    return ordered_fista(again, x, weight, sweeps=sweeps, subsets=subsets, tv_steps=tv_steps)
 
 
 def subsets_of(geometry: Geometry, most: int) -> int:

@@ -15,7 +15,14 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
-from recon.voxels.held_out_weight import LEAST_VIEWS, busiest_rows, preferred_weight, slab_of, split_views
+from recon.voxels.held_out_weight import (
+    LEAST_VIEWS,
+    bregman_weight,
+    busiest_rows,
+    preferred_weight,
+    slab_of,
+    split_views,
+)
 from recon.voxels.projector import Projector
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
@@ -49,14 +56,18 @@ def test_a_texture_survives(
     assert psnr(truth, found, peak) > psnr(truth, by_noise, peak) + 2
 
 
-def test_an_even_disc_keeps_the_weight_by_the_noise(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
     geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
     _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
-    data = Projector(geometry, Grid.matching(geometry)).forward((np.hypot(x, y) < 25).astype(np.float32))
+    truth = (np.hypot(x, y) < 25).astype(np.float32)
+    data = Projector(geometry, Grid.matching(geometry)).forward(truth)
     data += rng.normal(0, 1, data.shape).astype(np.float32)
     found = recon.reconstruct(data, geometry, FistaTv()).volume.data
     monkeypatch.setattr("recon.voxels.held_out_weight.preferred_weight", lambda problem, first: None)
-    np.testing.assert_array_equal(recon.reconstruct(data, geometry, FistaTv()).volume.data, found)
+    by_noise = recon.reconstruct(data, geometry, FistaTv()).volume.data
+    assert psnr(truth, found) > psnr(truth, by_noise) - 1
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +110,19 @@ def test_the_weight_with_the_smallest_error_is_found(best: float, monkeypatch: p
 def test_a_weight_far_above_that_by_the_noise_is_not_taken(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
     _errors(best, monkeypatch)
     assert preferred_weight(_views(), 3.0) is None
+
+
+@pytest.mark.parametrize(
+    ("once", "less_heavy", "heavy", "found"),
+    [(3, 2, 1, 6.0), (3, 1, 2, 5.0), (3, 1.9995, 2, 6.0), (1, 2, 3, None), (1, 0.998, 0.999, None)],
+)
+def test_two_runs_are_taken_where_they_predict_unseen_views_better(
+    once: float, less_heavy: float, heavy: float, found: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = {(2.0, False): once, (5.0, True): less_heavy, (6.0, True): heavy}
+    trial = Mock(of=lambda problem: lambda weight, twice=False: errors[weight, twice])
+    monkeypatch.setattr("recon.voxels.held_out_weight._Trial", trial)
+    assert bregman_weight(_views(), 2.0) == found
 
 
 def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
