@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -62,6 +63,19 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     qualities += [psnr(truth, finish(_of(g), g, _problem(data), sweeps).data) for sweeps in (1, 3, 9)]
     assert all(later > before + 1 for before, later in pairwise(qualities))
     assert qualities[-1] > 30
+
+
+@pytest.mark.parametrize(("again", "sweeps"), [(False, 2), (True, 4)])
+def test_a_second_run_takes_as_many_sweeps_where_it_is_wanted(
+    again: bool, sweeps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: 1.0)
+    monkeypatch.setattr("recon.splatting.finish.bregman_weight", lambda *_: 3.0)
+    looks, g = Mock(return_value=False), _blob()
+    data = project(g, VIEWS).numpy()
+    data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)  # so that one attempt is enough
+    finish(_of(g), g, _problem(data), 2, should_stop=looks, again=again)
+    assert looks.call_count == sweeps
 
 
 def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
