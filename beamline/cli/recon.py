@@ -20,7 +20,7 @@ from beamline.cli.method_options import (
     options_of_a_method,
     refuse_contradictions,
 )
-from beamline.cli.options import NOT_NEGATIVE, SEED, json_option
+from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import QualityError, ScanStopped
@@ -34,6 +34,7 @@ from drivers.clock import SystemClock
 from recon.assess.plans import Quality
 from recon.auto import Auto
 from recon.methods import DEFAULT, names
+from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
 
@@ -84,6 +85,18 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
 @click.option(
+    "--enough-loss",
+    type=POSITIVE,
+    metavar="DB",
+    help="With --follow: say when the views to come would add at most so many dB of PSNR.",
+)
+@click.option(
+    "--enough-gain",
+    type=POSITIVE,
+    metavar="DB",
+    help="With --follow: say when ten more views would add at most so many.",
+)
+@click.option(
     "--unfinished", is_flag=True, help="Accept an unfinished scan, one that failed or still runs, and use its frames."
 )
 @json_option
@@ -102,6 +115,8 @@ def recon(
     output: Path | None,
     report: bool,
     follow: bool,
+    enough_loss: float | None,
+    enough_gain: float | None,
     unfinished: bool,
     as_json: bool,
     **values: Any,
@@ -119,6 +134,9 @@ def recon(
     refuse_contradictions(context, method, follow)
     if follow and values["flags"] == "judge":
         raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")
+    enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
+    if enough is not None and not follow:
+        raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})
@@ -136,6 +154,7 @@ def recon(
         seed=seed,
         truth=truth,
         unfinished=unfinished,
+        enough=enough,
         command=repeated(sys.argv[1:]),
     )
     clock = SystemClock()

@@ -125,6 +125,21 @@ class Storage(Section):
     flush_every: PositiveInt = 1
 
 
+class StopWhen(Section):
+    """When the views are enough, by what the live volume foretells; where both limits are given, both must be met."""
+
+    psnr_gain_per_10_views: PositiveFloat | None = None
+    """dB that ten more views may still add; null: any."""
+    psnr_loss: PositiveFloat | None = None
+    """dB that the volume may stay below that of the whole scan; null: any."""
+
+    @model_validator(mode="after")
+    def _some_limit(self) -> Self:
+        if self.psnr_gain_per_10_views is self.psnr_loss is None:
+            raise ValueError("stop_when needs psnr_gain_per_10_views or psnr_loss, in dB; null never stops early")
+        return self
+
+
 class Recon(Section):
     live: bool = True
     method: MethodName = DEFAULT
@@ -133,6 +148,14 @@ class Recon(Section):
     """Time for the fit after the last view."""
     axis: Literal["auto"] | FiniteFloat = "auto"
     seed: int = 0
+    stop_when: StopWhen | None = None
+    """End the scan when its views are enough; needs live: true. null: take all views."""
+
+    @model_validator(mode="after")
+    def _somebody_looks(self) -> Self:
+        if self.stop_when is not None and not self.live:
+            raise ValueError("stop_when needs live: true, because the live reconstruction tells when views are enough")
+        return self
 
 
 class Speed(Section):

@@ -37,6 +37,9 @@ def sentence(event: Event) -> str | None:
             return _trial(data)
         case "snapshot":
             return f"Volume from {data['n_views']} views so far: {data['path']}"
+        case "enough":
+            spread = f"{data['mean']:.2f} dB ({data['low']:.2f} to {data['high']:.2f})"
+            return f"Enough views: {data['n_views']} of {data['planned']}; the others would add {spread}"
         case "scan_done":
             alarms = f", {data['alarmed_frames']} WITH AN ALARM" if data.get("alarmed_frames") else ""
             again = f", {data['retaken']} views taken again" if data.get("retaken") else ""

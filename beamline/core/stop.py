@@ -67,13 +67,18 @@ class StopRequest:
     """
 
     def __init__(self) -> None:
-        self._stop = self._abort = False
+        self._stop = self._abort = self._enough = False
         self._reason = ""
 
     def stop(self, reason: str = "the operator asked for it") -> None:
         """End cleanly: pending frames and missing references are still acquired, the stage returns."""
         self._reason = self._reason or reason
         self._stop = True
+
+    def stop_as_enough(self, reason: str) -> None:
+        """As `stop`, because the frames so far serve their purpose: nobody is in a hurry."""
+        self._enough = not self._stop
+        self.stop(reason)
 
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
@@ -85,6 +90,11 @@ class StopRequest:
     def stopping(self) -> bool:
         """A stop or an abort was requested."""
         return self._stop
+
+    @property
+    def enough(self) -> bool:
+        """It is stopped, and nobody asked for that but `stop_as_enough`."""
+        return self._enough and not self._abort
 
     @property
     def aborting(self) -> bool:

@@ -132,3 +132,4 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming) -> None:
         elif clock.now() - last_snapshot >= rhythm.snapshot:
             growing.write_snapshot()
             last_snapshot = clock.now()
+        growing.ask_whether_enough()

@@ -29,6 +29,7 @@ from beamline.projections.prepare import (
     stated_axis,
 )
 from beamline.projections.selection import check_axis, cone_of, geometry_of
+from beamline.reconstruct.enough import EnoughViews
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import ReconOutcome
@@ -37,6 +38,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
 from drivers.frame import FrameKind
+from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Progress, ReconProblem
 from recon.base.views import parse_views
 from recon.base.volume import Volume
@@ -69,6 +71,7 @@ class ScanFollower:
         self._next_axis = _FIRST_AXIS_VIEWS
         self._history: list[Progress] = []
         self._begin = clock.now()
+        self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
         output = options.target.output
         self.snapshot_path: Path = output.with_name(f"{output.stem}.snapshot.h5")
         self.picture_path: Path = output.with_name(f"{output.stem}.live.png")
@@ -218,6 +221,41 @@ class ScanFollower:
         self._history.append(progress)
         progress_events(self._sink, self._clock)(progress)
 
+    def ask_whether_enough(self) -> None:
+        """Where there is a goal, say what the views to come would add, and once that the views so far are enough."""
+        if self._enough is None or self._fit is None or self._fit.n_views < self._enough.next_look:
+            return
+        planned = self._planned()
+        if planned is None:
+            return
+        gain = self._enough.look(self._joined().data, planned)
+        if gain is None:
+            return
+        data = asdict(gain)
+        spread = f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"
+        if self._enough.met(gain):
+            self._enough = None
+            self._sink(Event("enough", self._clock.now(), data))
+            return
+        message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
+        self._sink(Event("state", self._clock.now(), {"state": "gain", "message": message, **data}))
+
+    def _planned(self) -> Geometry | None:
+        """Geometry of the views so far and of those that the plan still holds; None where that is not known."""
+        angles, reason = self.source.plan.get("angles_deg"), "its file does not say which views are planned"
+        if cone_of(self.source, self._options.selection) is not None:
+            angles, reason = None, "its beam is a cone"
+        if angles is None or self.axis_col is None:
+            self._warn(f"What more views of this scan would add is not known: {reason}. It is not stopped early.")
+            self._enough = None
+            return None
+        places = parse_views(self._options.selection.views, np.zeros(len(angles)))
+        last = max(int(part.view_ids[-1]) for part in self._parts)
+        taken = int(np.isin(self.source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
+        to_come = np.radians(np.asarray(angles, np.float64)[places[places >= taken]])
+        so_far = [self.source.angles[part.view_ids] for part in self._parts]
+        return geometry_of(self.source, self._options.selection, self.axis_col, np.concatenate([*so_far, to_come]))
+
     def write_snapshot(self) -> None:
         """The volume as it stands, and its picture, in place of the last ones."""
         assert self._fit is not None
@@ -323,9 +361,14 @@ class ScanFollower:
         made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter)
         return made, prepared
 
+    def _joined(self) -> Projections:
+        """The line integrals of all views taken, in one piece."""
+        if len(self._parts) > 1:
+            self._parts = [concatenated(self._parts)]
+        return self._parts[0]
+
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
-        projections = self._parts[0] if len(self._parts) == 1 else concatenated(self._parts)
-        self._parts = [projections]
+        projections = self._joined()
         assert self._correction is not None
         found = assemble(self.source, self._options.selection, projections, (axis_col, self.axis), usable, self._warn)
         return replace(found, noise=self._correction.noise)

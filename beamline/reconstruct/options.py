@@ -14,6 +14,7 @@ from recon.base.method import Method
 from recon.methods import names, streams
 from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingMethod
+from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
 
@@ -34,6 +35,7 @@ class ReconOptions:
         seed: of everything random.
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the frames that there are, where the scan still runs or died.
+        enough: of a followed scan: when its views are enough; None: nobody asks.
         command: that repeats this, for the record.
     """
 
@@ -49,6 +51,7 @@ class ReconOptions:
     seed: int = 0
     truth: str | None = None
     unfinished: bool = False
+    enough: Goal | None = None
     command: str = ""
 
     @property

@@ -87,6 +87,9 @@ def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
             "--seed": recon.seed,
             "-o": output,
         }
+        if (when := recon.stop_when) is not None:
+            limits = {"--enough-gain": when.psnr_gain_per_10_views, "--enough-loss": when.psnr_loss}
+            options |= {name: limit for name, limit in limits.items() if limit is not None}
         if plan.binning > 1:
             options["--bin"] = plan.binning
         if plan.every > 1:
@@ -102,10 +105,15 @@ class LiveReconstruction:
 
     Its `done` becomes `recon_done` and its `failed` a warning: `done` and `failed` belong to the scan. Its stderr goes
     to the file `log`. A process that cannot be started is a warning, too.
+
+    Args:
+        enough: is told why the views so far are enough, in the thread that reads the output.
     """
 
-    def __init__(self, command: Sequence[str], log: Path, emit: Emit) -> None:
-        self._emit, self._log = emit, log
+    def __init__(
+        self, command: Sequence[str], log: Path, emit: Emit, enough: Callable[[str], None] = lambda reason: None
+    ) -> None:
+        self._emit, self._log, self._enough = emit, log, enough
         self._done: Mapping[str, Any] | None = None
         self._ready = threading.Event()
         self._process: ChildProcess | None = None
@@ -169,6 +177,11 @@ class LiveReconstruction:
         data.pop("time", None)
         if event == "state" and data.get("state") == "ready":
             self._ready.set()
+        if event == "enough":
+            self._enough(
+                f"{data['n_views']} of {data['planned']} views are enough, the others would add {data['mean']:.2f} dB "
+                f"({data['low']:.2f} to {data['high']:.2f})"
+            )
         if event == "done":
             self._done, event = data, "recon_done"
         elif event == "failed":

@@ -193,7 +193,7 @@ class _Run:
         with ExitStack() as ending:
             follower = None
             if command is not None:
-                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit)
+                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit, self.stop.stop_as_enough)
                 ending.callback(follower.close)
                 follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
             return self._acquire_and_follow(writer, follower, release)
@@ -254,7 +254,10 @@ class _Run:
 
     def _give_up(self, useless: bool) -> Callable[[], bool]:
         """The live reconstruction ends early, with the volume that it has, after an abort, a stop that came after the
-        scan, LAST_ROUND after a scan that was stopped, or with a file that is broken or has no projections."""
+        scan, LAST_ROUND after a scan that was stopped (not one whose views were enough), or with a file that is broken
+        or has no projections."""
+        if self.stop.enough:
+            return lambda: useless or self.stop.aborting
         stopped, last = self.stop.stopping, time.monotonic() + LAST_ROUND
 
         def ends() -> bool:

@@ -66,6 +66,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "smoothing of sirt": ({}, ["-m", "sirt", "--tv-weight", "0.1"], 2, "fista-tv, os-sirt-tv"),
     "budget and loss": ({}, ["--budget", "30s", "--loss", "l2"], 2, "exclude"),
     "budget and early stop": ({}, ["--budget", "30s", "--early-stop"], 2, "exclude"),
+    "enough views of a scan that is over": ({}, ["-m", "r2", "--enough-loss", "0.5"], 2, "give --follow"),
     "following with a start": ({}, ["-m", "r2", "--follow", "--start", "tv"], 2, "finished scan"),
     "kernel misspelt": ({}, ["-m", "r2", "--kernel", "box"], 2, "compact:1.5"),
     "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),

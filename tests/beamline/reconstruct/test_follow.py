@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Set
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,6 +31,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
 from recon.base.method import Progress
 from recon.base.volume import Volume
 from recon.prep.align import AxisEstimate
@@ -37,6 +39,7 @@ from recon.prep.correct import Correction, CorrectionSettings, Projections, Tran
 from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
+from recon.voxels.enough_views import Goal
 from tests.beamline.scans import TwoCylinders, frames_of
 
 EPOCH = 1.8e9
@@ -89,11 +92,12 @@ def _schedule(
     axis_col: float | None = None,
     pause: float = 0.0,
     alarms: Set[int] = frozenset(),
+    plan: str = "",
 ) -> None:
     """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
     last one; status None never finishes it."""
     writers: list[NXtomoWriter] = []
-    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col)
+    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, plan=plan)
 
     def create() -> None:
         writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
@@ -341,6 +345,36 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     assert known[-1] < known[0] < 1  # of views that no step had seen
     assert not (tmp_path / "recon.live.png").exists()  # nor the snapshot: the volume is there
     assert not (tmp_path / "recon.snapshot.h5").exists()
+
+
+def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    golden = np.pi * (np.arange(60) * (5**0.5 - 1) / 2 % 1)
+    scan = replace(SCAN, angles=golden)
+    asked: list[tuple[int, int]] = []
+
+    def foretold(data: np.ndarray, planned: Geometry, rng: np.random.Generator, n: int) -> list[float]:
+        np.testing.assert_allclose(planned.angles, golden, atol=1e-6)
+        asked.append((len(data), planned.n_views))
+        return [4.0 / len(data)] * n
+
+    monkeypatch.setattr("beamline.reconstruct.enough.predicted_gains", foretold)
+    clock, events = ScanClock(), list[Event]()
+    plan = json.dumps({"angles_deg": np.degrees(golden).tolist()})
+    _schedule(clock, tmp_path / "scan.h5", frames_of(scan), plan=plan)
+    follow(_options(tmp_path, enough=Goal(psnr_loss=0.2)), events.append, clock, RHYTHM)
+    (enough,) = [event.data for event in events if event.event == "enough"]
+    assert 24 < enough["n_views"] < 60 == enough["planned"]
+    assert enough["high"] <= 0.2 and enough["low"] <= enough["mean"] <= enough["high"]
+    assert asked[0][0] >= 24 and asked[-1][0] == enough["n_views"]
+
+
+def test_where_the_plan_is_not_known_no_views_are_enough(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    scan = replace(INTERLACED, angles=np.radians(np.arange(0, 180, 3.0))[np.argsort(np.arange(60) * 0.618 % 1)])
+    _schedule(clock, tmp_path / "scan.h5", frames_of(scan))
+    follow(_options(tmp_path, enough=Goal(psnr_loss=9.0)), events.append, clock, RHYTHM)
+    assert sum("does not say which views are planned" in str(e.data.get("message")) for e in events) == 1
+    assert "enough" not in [event.event for event in events]
 
 
 def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -> None:

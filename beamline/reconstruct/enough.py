@@ -1,0 +1,54 @@
+"""Enough views: while a scan is followed, what the views to come would add, and whether the goal is met."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
+
+GROWTH = 1.25  # of the views from look to look
+_FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
+
+
+class EnoughViews:
+    """Looks at the views each time they have grown by a quarter.
+
+    A prediction scatters by about half a decibel, so that one is of the samples of two looks; the earlier ones, which
+    are larger, err on the side of more views.
+
+    Args:
+        goal: when they are enough.
+        seed: of the predictions.
+    """
+
+    def __init__(self, goal: Goal, seed: int) -> None:
+        self._goal = goal
+        self._rng = np.random.default_rng(seed)
+        self._samples: list[float] = []
+        self.next_look = _FIRST
+
+    def look(self, data: NDArray[np.float32], planned: Geometry) -> Gain | None:
+        """What the views to come would add to those so far; None where it is not known (yet).
+
+        Args:
+            data: line integrals [view, row, col] so far.
+            planned: geometry of these views and of those to come.
+        """
+        n = len(data)
+        if not self.next_look <= n < planned.n_views or not well_spread(planned.angles[:n]):
+            return None
+        self.next_look = math.ceil(GROWTH * n)
+        before = self._samples
+        try:
+            self._samples = predicted_gains(data, planned, self._rng, _SAMPLES)
+        except ValueError:  # views without matter
+            return None
+        return Gain.of(n, planned.n_views, before + self._samples) if before else None
+
+    def met(self, gain: Gain) -> bool:
+        """The views so far are enough."""
+        return self._goal.met(gain)
