@@ -24,6 +24,7 @@ from simulators.effects.floaters import Floaters
 from simulators.effects.ghost import Ghost
 from simulators.effects.jump import Jump
 from simulators.effects.lost_beam import LostBeam
+from simulators.effects.zingers import Zingers
 from simulators.frame.detector import Detector
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
@@ -240,6 +241,26 @@ class DarkLines:
         return [Label("band", (*ends, 0, cols) if self.axis == 0 else (0, rows, *ends))]
 
 
+@dataclass(frozen=True)
+class Storm:
+    """Zingers in a range of views, beside those of the scene."""
+
+    zingers: Zingers
+    views: tuple[int, int]
+
+    name: ClassVar[str] = "storm"
+    domain: ClassVar[Domain] = Domain.ELECTRONS
+    final: ClassVar[bool] = False
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        return self.zingers.apply(image, shot) if self.labels(shot) else image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        rows, cols = shot.detector.shape
+        shown = shot.sample and self.views[0] <= shot.view < self.views[1]
+        return [Label("zingers", (0, rows, 0, cols))] if shown else []
+
+
 Make = Callable[[np.random.Generator, int], Any]
 """An anomaly, drawn from a generator, for a scan of so many views."""
 CALIBRATION = 40  # views before the first anomaly
@@ -321,6 +342,17 @@ def band(lines: int, axis: int) -> Make:
     def make(rng: np.random.Generator, views: int) -> DarkLines:
         at, first = int(rng.integers((ROWS, COLS)[axis] - lines)), _views(rng, views)
         return DarkLines(slice(at, at + lines), axis, (first, first + int(rng.integers(1, 20))))
+
+    return make
+
+
+def storm(share: float, charge: float) -> Make:
+    """On average so many zingers a pixel, of so many electrons on average (exponentially distributed)."""
+
+    def make(rng: np.random.Generator, views: int) -> Storm:
+        first = _views(rng, views)
+        zingers = Zingers(share * ROWS * COLS / 0.05, charge=charge)  # 0.05 s is the exposure of `scene`
+        return Storm(zingers, (first, first + int(rng.integers(1, 20))))
 
     return make
 

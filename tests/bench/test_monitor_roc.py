@@ -36,6 +36,7 @@ from tests.bench.monitor_scenes import (
     jump,
     lost,
     seen,
+    storm,
     with_anomalies,
 )
 
@@ -78,6 +79,9 @@ STRENGTHS: dict[str, tuple[str, Make]] = {  # row of the table: the check that h
     "blur across, 1 px": ("blur", blur(0, 1)),
     "blur down, 1 px": ("blur", blur(1, 0)),
     "beam lost, 2 % left": ("lost", lost(0.02)),
+    "zingers, 2e-4 a pixel, 1 of the light": ("zingers", storm(2e-4, 5e3)),
+    "zingers, 2e-4 a pixel, 4 of the light": ("zingers", storm(2e-4, 2e4)),
+    "zingers, 4e-4 a pixel, 4 of the light": ("zingers", storm(4e-4, 2e4)),
 }
 
 
