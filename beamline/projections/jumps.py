@@ -212,7 +212,7 @@ class _Fit:
         return max(move.farthest(self.geometry.reach) for move in moves) / self.geometry.pixel_pitch
 
     def levels(self) -> list[tuple[int, int]]:
-        """Pixels a side that are joined, and volumes of all views."""
+        """Binning, and volumes of all views."""
         width, steps = self.source.shape[1] // self.selection.binning, dict[int, int]()
         for cols, rounds in _LEVELS:
             factor = max(1, math.ceil(width / cols))
