@@ -219,3 +219,26 @@ def test_a_moved_axis_is_learnt_without_beginning_anew(data: np.ndarray, phantom
         return psnr(truth, model.snapshot().data)
 
     assert run(corrected=True) > run(corrected=False) + 1
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
+def test_views_out_of_order_and_a_restart_in_mid_scan_cost_less_than_a_third_of_a_decibel(
+    data: np.ndarray, phantom: Phantom
+) -> None:
+    truth, in_order = phantom.attenuation(GRID), np.arange(40)
+
+    def quality(order: np.ndarray, restarted: bool = False) -> float:
+        model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+        for batch in [order[:20], *np.split(order[20:], 20)] if restarted else np.split(order, 40):
+            model.add_views(data[batch], ANGLES[batch])
+            model.advance(0.1)
+        model.finish(12.0)
+        return psnr(truth, model.snapshot().data)
+
+    disturbed = {
+        "golden-ratio order": quality(np.argsort(in_order * 0.618 % 1).argsort()),
+        "random order": quality(np.random.default_rng(0).permutation(40)),
+        "restarted": quality(in_order, restarted=True),
+    }
+    assert min(disturbed.values()) > quality(in_order) - 0.3, disturbed
