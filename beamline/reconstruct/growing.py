@@ -349,7 +349,7 @@ class ScanFollower:
             data, geometry = prepared.projections.data, prepared.geometry
             use = DataUse(prepared.ray_weights())
             problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
-            volume = finish(volume, gaussians, problem, sweeps, self._fit.settings, stop_latch)
+            volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, stop_latch)
         settings: dict[str, object] = {
             **asdict(self._fit.settings),
             "finish": sweeps,

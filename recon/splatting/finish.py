@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
-from recon.voxels.held_out_weight import bregman_weight, choose_weight
+from recon.voxels.held_out_weight import bregman_weight, choose_weight, preferred_sweeps
 from recon.voxels.iterative import solve
 from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
 from recon.voxels.ordered_fista import bregman, ordered_fista
@@ -32,7 +33,7 @@ from recon.voxels.voxel_problem import VoxelProblem
 F32 = NDArray[np.float32]
 
 SWEEPS = 8
-"""Default number of sweeps over the views."""
+"""Sweeps over the views, at least, where no number is given."""
 
 SUBSETS, TV_STEPS = 9, 3
 
@@ -41,31 +42,41 @@ _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
-@dataclass(frozen=True)
+@dataclass
 class _FromModel:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`."""
+    """The refinement as an iterative method of `recon.voxels.iterative.solve`, which makes as many more sweeps as views
+    held out prefer where `by_content`."""
 
     iterations: int
+    by_content: bool
     unmodelled: float | None = None
-    again: bool = False
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled)
-        heavy = bregman_weight(problem, weight) if self.again and not isinstance(weight, NoiseBalance) else None
-        if heavy is None:
-            return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
-        return bregman(problem, x, heavy, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
+        if self.by_content and not isinstance(weight, NoiseBalance):
+            self.iterations = preferred_sweeps(problem, x, weight, self.iterations)
+            heavy = bregman_weight(problem, weight) if self.iterations == SWEEPS else None
+            if heavy is not None:
+                self.iterations = 2 * SWEEPS
+                return bregman(problem, x, heavy, sweeps=SWEEPS, subsets=SUBSETS, tv_steps=TV_STEPS)
+        return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
+
+
+class Finished(NamedTuple):
+    """The refined volume, and the sweeps that it took; 0: it is the fit's."""
+
+    volume: Volume
+    sweeps: int
 
 
 def finish(
     volume: Volume,
     gaussians: Gaussians,
     problem: ReconProblem,
-    sweeps: int = SWEEPS,
+    sweeps: int | None = None,
     settings: FitSettings | None = None,
     should_stop: Callable[[], bool] | None = None,
-    again: bool = False,
-) -> Volume:
+) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
     The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 2 dB wherever voxels
@@ -86,12 +97,11 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, without roll and tilt, and the weights of their rays.
-        sweeps: 1 or more.
+        sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and `bregman_weight`.
         settings: of the fit; None: the defaults.
         should_stop: called after each sweep; True ends the iteration. Between the two attempts it keeps the first where
             it explains the views of a parallel beam, which see all matter, better than the fit, else the fit. Of such
             views it keeps the first during the second, too.
-        again: as many sweeps once more, where views held out are predicted better for it, see `bregman`.
 
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
@@ -101,7 +111,7 @@ def finish(
     data, known = masked(problem.projections, problem.use.weights)
     model = project(gaussians, problem.geometry, truncation=fit.truncation, model=fit.rays).numpy()
     if not (data.any() and model.any()):
-        return volume
+        return Finished(volume, 0)
     data, known = _without_outliers(data, known, model)
     data = data - ring_offsets(data - model)
     start = Volume(np.maximum(volume.data, 0), volume.grid)
@@ -109,11 +119,12 @@ def finish(
     def stopped() -> bool:
         return should_stop is not None and should_stop()
 
-    def refined(views: F32, unmodelled: float | None = None) -> Volume:
-        return solve(
-            _FromModel(sweeps, unmodelled, again), projector, views, weight=known, start=start,
-            on_iteration=lambda *_: stopped(), seed=problem.seed,
-        )  # fmt: skip
+    def refined(views: F32, unmodelled: float | None = None) -> Finished:
+        method = _FromModel(SWEEPS if sweeps is None else sweeps, sweeps is None, unmodelled)
+        refined = solve(
+            method, projector, views, weight=known, start=start, on_iteration=lambda *_: stopped(), seed=problem.seed
+        )
+        return Finished(refined, method.iterations)
 
     fitted = _deviation(data - model, known)
     model -= projector.forward(start.data)
@@ -121,20 +132,20 @@ def finish(
     found = refined(data)
     if unlike <= _DIFFERENT * noise:
         return found
-    left = _deviation(data - projector.forward(found.data), known)
+    left = _deviation(data - projector.forward(found.volume.data), known)
     if left <= min(fitted, EXPLAINED * noise):
         return found
     beyond = leaves_the_field(data, problem.geometry)
     bent = beyond or problem.geometry.is_cone  # however well voxels explain the views
     if stopped():
-        return volume if bent or left > fitted else found
+        return Finished(volume, 0) if bent or left > fitted else found
     # Matter beyond the field is smooth in the views, and explained by the Gaussians; an error of voxels is at edges.
     smooth = noise == 0 or beyond
     data -= model
     other = refined(data, 0.0 if smooth else unlike / noise)
     if stopped() and not bent:  # cut short
         return found
-    return other if _deviation(data - projector.forward(other.data), known) <= _ALIKE * left else found
+    return other if _deviation(data - projector.forward(other.volume.data), known) <= _ALIKE * left else found
 
 
 def _deviation(left: F32, weights: F32 | None) -> float:

@@ -42,9 +42,9 @@ class R2:
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
             that had it lowest.
-        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None: 8,
-            twice 8 where views held out prefer it, or none for rolled or tilted views, which the voxel projector does
-            not take. The result's `gaussians` stay the model as it was fitted.
+        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None: 8
+            to 24 as views held out prefer, or none for rolled or tilted views, which the voxel projector does not
+            take. The result's `gaussians` stay the model as it was fitted.
         fit: weights, rates and limits.
     """
 

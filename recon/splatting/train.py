@@ -163,8 +163,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         sweeps = 0
     if sweeps:
         fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
-        again = method.finish is None  # a number is all the sweeps that its user wants
-        finished = finish(volume, model, fitted, sweeps, settings, control.should_stop, again)
+        finished, sweeps = finish(volume, model, fitted, method.finish, settings, control.should_stop)
         if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
             sweeps = 0
         else:

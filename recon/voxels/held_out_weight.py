@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ LEAST_VIEWS = 2 * ONE_IN
 _ROWS = 16  # of the slab that trials see
 _SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3  # of a trial
 _HALVINGS = 5  # at most
+_NEARER = 0.99  # of the residual before: what further sweeps have to bring
 _LEVEL = 0.002  # residuals of views held out that differ by less are equal
 
 # Weights of the two runs of `bregman`, in that of one run, and by how much the residual of views held out has to fall:
@@ -109,16 +111,45 @@ def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
     return factor * weight if best < (1 - _GAIN) * once else None
 
 
+def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
+    """Sweeps from `start` [y, x, z] with the weight μ that views held out prefer: `sweeps`, twice or three times these.
+
+    A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24), others
+    nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Sixteen rows are refined from seven of eight
+    views for as long as each further `sweeps` bring the others nearer. Where slices are not those of rows: `sweeps`.
+    """
+    grid, rows = problem.projector.grid, Grid.matching(problem.projector.geometry)
+    if (grid.shape[0], grid.spacing[0], grid.centre[0]) != (rows.shape[0], rows.spacing[0], rows.centre[0]):
+        return sweeps
+    trial = _Trial.of(problem, start)
+    x = trial.start.copy()
+    errors: list[float] = []
+
+    def go_on(sweep: int, _: float) -> bool:
+        if sweep % sweeps:
+            return True
+        errors.append(trial.error(x))
+        return len(errors) == 1 or errors[-1] < _NEARER * errors[-2]
+
+    rounds = 3
+    ordered_fista(
+        replace(trial.problem, go_on=go_on), x, weight, sweeps=rounds * sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS
+    )
+    nearer = sum(after < _NEARER * before for before, after in pairwise(errors))
+    return sweeps * (1 + nearer)
+
+
 class _Trial:
     """What weights make of a slab, judged by views that the trials have not seen."""
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
-        self._problem, self._start, self._unseen = problem, start, unseen
+        self.problem, self.start, self._unseen = problem, start, unseen
         matter = unseen.data > _MATTER * np.percentile(unseen.data, 99)
         self._weight = matter if unseen.weight is None else matter * unseen.weight
 
     @classmethod
-    def of(cls, problem: VoxelProblem) -> _Trial:
+    def of(cls, problem: VoxelProblem, start: F32 | None = None) -> _Trial:
+        """The trial of the rows with most matter, from those slices of `start` [y, x, z]; None: from FBP."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         rows = busiest_rows(problem.data.swapaxes(1, 2), _ROWS)
         views, box = slab_of(geometry, grid, rows.start, rows.stop)
@@ -138,15 +169,21 @@ class _Trial:
 
         seen, unseen = split_views(geometry)
         trial = of_views(seen)
-        start = trial.filtered("hann")
-        assert start is not None  # views of a parallel beam, straight
-        return cls(trial, np.maximum(start, 0, out=start), of_views(unseen))
+        if start is not None:
+            return cls(trial, np.ascontiguousarray(start[:, :, rows]), of_views(unseen))
+        first = trial.filtered("hann")
+        assert first is not None  # views of a parallel beam, straight
+        return cls(trial, np.maximum(first, 0, out=first), of_views(unseen))
 
     def __call__(self, weight: float, twice: bool = False) -> float:
         """Root mean square of what the volume with this weight, of one run or two, leaves of the views held out."""
         run = bregman if twice else ordered_fista
-        problem = replace(self._problem, rng=np.random.default_rng(0))  # the same order of subsets for all
-        x = run(problem, self._start.copy(), weight, sweeps=_SWEEPS, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        problem = replace(self.problem, rng=np.random.default_rng(0))  # the same order of subsets for all
+        x = run(problem, self.start.copy(), weight, sweeps=_SWEEPS, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        return self.error(x)
+
+    def error(self, x: F32) -> float:
+        """Root mean square of what slices [y, x, z] leave of the views held out."""
         left = self._unseen.projector.forward_lines(x)
         left -= self._unseen.data
-        return math.sqrt(float(np.average(np.square(left), weights=self._weight)))
+        return math.sqrt(float(np.average(np.square(left, dtype=np.float64), weights=self._weight)))

@@ -51,7 +51,7 @@ def _problem(data: F32, weights: F32 | None = None, grid: Grid = GRID) -> ReconP
 def test_a_model_that_explains_all_is_only_smoothed() -> None:
     g = _blob()
     volume = _of(g)
-    finished = finish(volume, g, _problem(project(g, VIEWS).numpy()), 3)
+    finished = finish(volume, g, _problem(project(g, VIEWS).numpy()), 3).volume
     assert np.abs(finished.data - volume.data).max() < 0.02 * volume.data.max()
 
 
@@ -60,7 +60,7 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)
     truth = _of(g).data + missing
     qualities = [psnr(truth, _of(g).data)]
-    qualities += [psnr(truth, finish(_of(g), g, _problem(data), sweeps).data) for sweeps in (1, 3, 9)]
+    qualities += [psnr(truth, finish(_of(g), g, _problem(data), sweeps).volume.data) for sweeps in (1, 3, 9)]
     assert all(later > before + 1 for before, later in pairwise(qualities))
     assert qualities[-1] > 30
 
@@ -82,7 +82,7 @@ def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() ->
     g, missing = _blob(8.0), _box()
     data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)  # no noise: voxels explain all but that
     looks = iter([False, False, False, True])  # three sweeps, then between
-    once = finish(_of(g), g, _problem(data), 3, should_stop=lambda: next(looks))
+    once = finish(_of(g), g, _problem(data), 3, should_stop=lambda: next(looks)).volume
     assert next(looks, None) is None
     truth = _of(g).data + missing
     assert psnr(truth, once.data) > psnr(truth, _of(g).data) + 3
@@ -94,7 +94,7 @@ def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
     small = Grid((8, 40, 18), 1.0, (0.0, 0.0, -8.0))
     missing = _box(small)
     data = project(g, VIEWS).numpy() + Projector(VIEWS, small).forward(missing)
-    finished = finish(_of(g, small), g, _problem(data), 16)
+    finished = finish(_of(g, small), g, _problem(data), 16).volume
     assert psnr(missing + _of(g, small).data, finished.data) > 30
 
 
@@ -105,10 +105,10 @@ def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     bad[:, 3:5, 7:9] = True
     volumes = []
     for value in (np.nan, np.inf):
-        volumes.append(finish(_of(g), g, _problem(np.where(bad, np.float32(value), data)), 2).data)
+        volumes.append(finish(_of(g), g, _problem(np.where(bad, np.float32(value), data)), 2).volume.data)
     np.testing.assert_array_equal(*volumes)
     weights = (~bad).astype(np.float32)
-    weighed = finish(_of(g), g, _problem(np.where(bad, np.float32(1), data), weights), 2).data
+    weighed = finish(_of(g), g, _problem(np.where(bad, np.float32(1), data), weights), 2).volume.data
     np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)
 
 
@@ -159,7 +159,7 @@ def test_where_voxels_cannot_explain_the_views_the_fit_is_not_spoiled() -> None:
     g = Gaussians.from_physical(np.array([[4.0, 2.0, 0.0]]), np.full((1, 3), 2.0), np.array([0.5]), density_unit=0.5)
     data = project(g, VIEWS).numpy() + np.random.default_rng(1).normal(0, 0.002, (30, 8, 40)).astype(np.float32)
     volume = _of(g, grid)
-    found = finish(volume, g, _problem(data, grid=grid)).data
+    found = finish(volume, g, _problem(data, grid=grid)).volume.data
     raw = FistaTv(20).run(_problem(data, grid=grid), RunControl()).volume.data
     assert psnr(volume.data, found) > psnr(volume.data, raw) + 3
 
@@ -169,7 +169,7 @@ def test_single_rays_gone_wild_do_not_spoil_what_the_fit_withstood() -> None:
     data = project(g, VIEWS).numpy() + 0.1 * Projector(VIEWS, GRID).forward(_box())
     wild = data.copy()
     wild[4, 3, 11] = 3 * data.max()
-    clean, found = (finish(_of(g), g, _problem(views)).data for views in (data, wild))
+    clean, found = (finish(_of(g), g, _problem(views)).volume.data for views in (data, wild))
     assert np.abs(found - clean).max() < 0.1 * clean.max()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from unittest.mock import Mock
 
 import numpy as np
@@ -13,17 +14,21 @@ import recon
 from recon import FistaTv, OsSirtTv
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
 from recon.voxels.held_out_weight import (
     LEAST_VIEWS,
     bregman_weight,
     busiest_rows,
+    preferred_sweeps,
     preferred_weight,
     slab_of,
     split_views,
 )
+from recon.voxels.iterative import solve
+from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import VoxelProblem
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
 
@@ -132,6 +137,30 @@ def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _views() -> Mock:
     return Mock(**{"projector.geometry": Geometry.parallel(np.linspace(0, 3, 40), (4, 8), 1.0)})
+
+
+@dataclass
+class _Asked:
+    """An iteration that only asks how many sweeps views held out prefer."""
+
+    iterations: int = 4
+    sweeps: int = 0
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        self.sweeps = preferred_sweeps(problem, x, NoiseBalance.of(problem, x, True).first / 4, self.iterations)
+        return x
+
+
+@pytest.mark.parametrize(("blur", "slices", "more"), [(2.0, ROWS, True), (0.0, ROWS, False), (2.0, ROWS // 2, False)])
+def test_more_sweeps_are_made_from_a_volume_that_lacks_detail(
+    foam: tuple[F32, Geometry, Grid, F32], blur: float, slices: int, more: bool
+) -> None:
+    """And none from the truth, which they can only spoil, nor where slices are not those of rows."""
+    data, geometry, grid, truth = foam
+    start = gaussian_filter(truth, blur).reshape(slices, -1, COLS, COLS).mean(axis=1)
+    fewer = replace(grid, shape=(slices, COLS, COLS), slice_pitch=ROWS / slices)
+    solve(asked := _Asked(), Projector(geometry, fewer), data, start=Volume(start, fewer))
+    assert (asked.sweeps > 4) == more and asked.sweeps in (4, 8, 12)
 
 
 def test_one_view_of_eight_is_held_out_and_the_others_are_not() -> None:
