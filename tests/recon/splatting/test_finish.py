@@ -65,17 +65,18 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     assert qualities[-1] > 30
 
 
-@pytest.mark.parametrize(("again", "sweeps"), [(False, 2), (True, 4)])
-def test_a_second_run_takes_as_many_sweeps_where_it_is_wanted(
-    again: bool, sweeps: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("sweeps", "preferred", "made"), [(2, 16, 2), (None, 8, 16), (None, 24, 24)])
+def test_more_sweeps_or_a_second_run_are_made_where_no_number_is_given(
+    sweeps: int | None, preferred: int, made: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: 1.0)
+    monkeypatch.setattr("recon.splatting.finish.preferred_sweeps", lambda *_: preferred)
     monkeypatch.setattr("recon.splatting.finish.bregman_weight", lambda *_: 3.0)
     looks, g = Mock(return_value=False), _blob()
     data = project(g, VIEWS).numpy()
     data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)  # so that one attempt is enough
-    finish(_of(g), g, _problem(data), 2, should_stop=looks, again=again)
-    assert looks.call_count == sweeps
+    found = finish(_of(g), g, _problem(data), sweeps, should_stop=looks)
+    assert looks.call_count == found.sweeps == made
 
 
 def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
