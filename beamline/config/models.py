@@ -126,7 +126,7 @@ class Storage(Section):
 
 
 class StopWhen(Section):
-    """When the views are enough, by what the live volume foretells; where both limits are given, both must be met."""
+    """When the views are enough, by what the live volume predicts; where both limits are given, both must be met."""
 
     psnr_gain_per_10_views: PositiveFloat | None = None
     """dB that ten more views may still add; null: any."""

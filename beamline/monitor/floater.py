@@ -1,4 +1,4 @@
-"""Floater: a crumb that crosses the field in some views, faster than the sample's turning carries anything.
+"""Floater: a particle that crosses the field in some views, faster than the sample's turning carries anything.
 
 It is found by filters that are blind to all that turns within the field (beamline.monitor.fan), as peaks of absorption
 that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of the sample
@@ -129,8 +129,8 @@ class Floater:
         region = grid.region(trail.row, trail.col, 2 * BOX, 2 * BOX)
         advice = (
             f"Something crosses the field at {abs(trail.speed) * grid.cell:.1f} px a view, faster than the sample's "
-            f"turning carries anything there (seen in frames {trail.first:.0f} ... {trail.last:.0f}): a crumb "
-            "in the beam or on the holder. Look for it, blow it off, and repeat these views."
+            f"turning carries anything there (seen in frames {trail.first:.0f} ... {trail.last:.0f}): a floating "
+            "particle in the beam or on the holder. Look for it, blow it off, and repeat these views."
         )
         flag = Flag(self.name, Level.WARN, now, trail.score, self.warn, advice, region, int(trail.first))
         return Look(state, flag)

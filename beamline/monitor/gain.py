@@ -18,7 +18,7 @@ from drivers.frame import Frame
 
 SIGMAS = 8.0
 PARTS = 5  # of the field, from left to right
-ALIKE = 0.5  # of the gain, by which the parts may differ: fog is in some of them only
+ALIKE = 0.5  # of the gain, by which the parts may differ: a ghost is in some of them only
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Gain:
 
 
 def _everywhere(change: Change, view: View | None) -> float:
-    """The gain, if it is the same in all fifths of the field, from left to right; else 0: it is fog."""
+    """The gain, if it is the same in all fifths of the field, from left to right; else 0: it is a ghost."""
     assert view is not None
     starts = np.arange(PARTS) * view.depth.shape[1] // PARTS
     extra, light = (np.add.reduceat(part.sum(axis=0), starts) for part in (change.residual * view.weight, view.weight))

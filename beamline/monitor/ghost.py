@@ -1,4 +1,4 @@
-"""Ghost: fog that crosses the field from side to side, with more or less light than any view should have.
+"""Ghost: a broad hump of more or less light than any view should have that crosses the field from side to side.
 
 As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan), but they look at the mean of
 all rows on broad columns, for a hump as broad as a part of the field: 2 % of light in one cell are lost in the noise,
@@ -24,7 +24,7 @@ from drivers.frame import Frame
 COLUMNS = 32  # broad columns of the field
 PARTS = 8  # of the rows
 MOST_PARTS = 25.0  # percentile of the parts that must have
-ALIKE = 0.25  # of the mean: fog is as high as the frame, a floater is in some parts only
+ALIKE = 0.25  # of the mean: a ghost is as high as the frame, a floater is in some parts only
 LAGS = (-4, -3, -2, -1, 0)  # times the stride
 SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
 MOST_STRIDE = 3
@@ -63,19 +63,19 @@ class GhostState:
 
 @dataclass(frozen=True)
 class Ghost:
-    """Score: relative change of the light in the middle of the fog, without its sign: in the few views of a window, fog
-    that leaves a place looks like a shadow that comes.
+    """Score: relative change of the light in the middle of the ghost, without its sign: in the few views of a window, a
+    ghost that leaves a place looks like a shadow that comes.
     """
 
     name: ClassVar[str] = "ghost"
     bit: ClassVar[int] = 11
     unit: ClassVar[str] = "relative change of the light"
     meaning: ClassVar[str] = (
-        "fog crosses the field: a broad hump of more or less light that does not turn with the sample"
+        "a ghost crosses the field: a broad hump of more or less light that does not turn with the sample"
     )
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the fog")] = 0.01
+    warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the ghost")] = 0.01
     alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.8
 
     def start(self) -> GhostState:
@@ -134,7 +134,7 @@ class Ghost:
         broad = cols / COLUMNS
         region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
         advice = (
-            f"Fog crosses the field: it changes the light by {light:.1%}, "
+            f"A ghost crosses the field, a broad hump: it changes the light by {light:.1%}, "
             f"{abs(trail.speed) * broad * context.grid.cell:.0f} px a view, which no part of the sample does. "
             "Something between source and detector reflects or shadows the beam and moves with the stage: find it; "
             "repeat these views."

@@ -1,8 +1,8 @@
-"""When views are enough: what the views still to come would add to the volume, foretold without a truth.
+"""When views are enough: what the views still to come would add to the volume, predicted without a truth.
 
 The volume of the views so far is taken for the sample: its views at all planned angles get the noise that it leaves of
 the measured ones, and are reconstructed from those so far and from all (a parametric bootstrap; Efron & Tibshirani
-1993, ch. 6.5). How much nearer the second volume is to the sample is the gain that is foretold.
+1993, ch. 6.5). How much nearer the second volume is to the sample is the gain that is predicted.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ class Goal:
             raise ValueError(f"a goal is at least one number of dB above 0, got {self}")
 
     def met(self, gain: Gain) -> bool:
-        """The upper ends of what is foretold are within the limits."""
+        """The upper ends of what is predicted are within the limits."""
         limits = ((self.psnr_loss, gain.high), (self.psnr_gain_per_10_views, gain.high * gain.share_of(10)))
         return all(limit is None or value <= limit for limit, value in limits)
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What the views to come would add, foretold.
+    """What the views to come would add, predicted.
 
     Attributes:
         n_views, planned: so far, and in all.
@@ -98,7 +98,7 @@ def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, sam
     """
     n, cols = len(data), data.shape[2]
     if not 2 <= n < geometry.n_views:
-        raise ValueError(f"{n} of {geometry.n_views} views leave nothing to foretell")
+        raise ValueError(f"{n} of {geometry.n_views} views leave nothing to predict")
     rows = busiest_rows(data, min(max(_PIXELS // cols**2, _ROWS[0]), _ROWS[1]))
     part = np.ascontiguousarray(data[:, rows])
     planned = geometry.rows(rows.start, rows.stop)

@@ -16,7 +16,7 @@ from simulators.wires.zaber.conditions import INPUTS, OUTPUTS, is_output, number
 from simulators.wires.zaber.triggers import ACTIONS, TRIGGERS, Edge, Triggers
 
 LOOK_AHEAD = 10.0
-"""s beyond the end of a move for which edges are foretold."""
+"""s beyond the end of a move for which edges are predicted."""
 WRITABLE = {"maxspeed", "motion.accelonly", "motion.decelonly", "limit.min", "limit.max"}
 NOTHING = "0"
 
@@ -124,7 +124,7 @@ class ZaberDevice:
             case ["tools", "echo", *text]:
                 return " ".join(text) or NOTHING
         self._change(axis, words)
-        self._foretell()
+        self._predict()
         return NOTHING
 
     def information(self, words: Sequence[str]) -> list[str]:
@@ -233,11 +233,11 @@ class ZaberDevice:
         if "schedule" in words and not self._can_schedule:
             raise Rejected("BADDATA")
 
-    def _foretell(self) -> None:
-        """Put the pulses on the line that are still to come as things stand now, in place of those foretold before."""
+    def _predict(self) -> None:
+        """Put the pulses on the line that are still to come as things stand now, in place of those predicted before."""
         now = self._clock.now()
         happened = self._happened()
-        coming = self.triggers.foretold(max(now, self.axis.move.end) + LOOK_AHEAD)
+        coming = self.triggers.predicted(max(now, self.axis.move.end) + LOOK_AHEAD)
         self._line.cancel_after(now)
         self._emit(now, happened + self._pulses(coming, self._counted))
 

@@ -1,7 +1,7 @@
 """Simulated Zaber triggers and digital outputs: conditions on a moving axis, two actions each, edges with their times.
 
 Nothing runs in the background: `advance` goes from event to event up to a time, and a copy that is advanced beyond it
-foretells the edges still to come. As the vendor's library has it, a trigger fires when its condition turns true, at
+predicts the edges still to come. As the vendor's library has it, a trigger fires when its condition turns true, at
 once where it is true when enabled, and COUNT fires disable it. From memory, not confirmed: a distance is counted, in
 both directions, from where the trigger was enabled or last fired; a new value of an output cancels its schedule.
 """
@@ -137,7 +137,7 @@ class Triggers:
                 self._fire(trigger, position)
         self.now = max(self.now, to)
 
-    def foretold(self, until: float) -> list[Edge]:
+    def predicted(self, until: float) -> list[Edge]:
         """The edges from now to `until` if nobody does anything."""
         coming = replace(
             self,

@@ -1,4 +1,4 @@
-"""Composition root: a configuration becomes devices whose figures are those foretold; what cannot be is refused."""
+"""Composition root: a configuration becomes devices whose figures are those predicted; what cannot be is refused."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def test_a_faint_crumb_that_crosses_is_found_within_ten_views_and_where_it_is(sp
         assert top <= 12.5 * BLOCK < below
         judged = flag.view - 10 - 4  # the view that four later ones have confirmed
         assert left <= (speed * (judged - BEGINS) + 0.5) * BLOCK <= right
-    assert "crumb" in flags[0].advice
+    assert "floating particle" in flags[0].advice
 
 
 def test_it_is_flagged_in_most_of_the_views_that_show_it() -> None:

@@ -352,12 +352,12 @@ def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     scan = replace(SCAN, angles=golden)
     asked: list[tuple[int, int]] = []
 
-    def foretold(data: np.ndarray, planned: Geometry, rng: np.random.Generator, n: int) -> list[float]:
+    def predicted(data: np.ndarray, planned: Geometry, rng: np.random.Generator, n: int) -> list[float]:
         np.testing.assert_allclose(planned.angles, golden, atol=1e-6)
         asked.append((len(data), planned.n_views))
         return [4.0 / len(data)] * n
 
-    monkeypatch.setattr("beamline.reconstruct.enough.predicted_gains", foretold)
+    monkeypatch.setattr("beamline.reconstruct.enough.predicted_gains", predicted)
     clock, events = ScanClock(), list[Event]()
     plan = json.dumps({"angles_deg": np.degrees(golden).tolist()})
     _schedule(clock, tmp_path / "scan.h5", frames_of(scan), plan=plan)

@@ -346,17 +346,17 @@ def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preview_bin", [1, 3])
-def test_the_bytes_foretold_are_what_the_file_takes(tmp_path: Path, preview_bin: int) -> None:
+def test_the_bytes_predicted_are_what_the_file_takes(tmp_path: Path, preview_bin: int) -> None:
     overrides = [*SMALL, "simulation.clock=virtual", "devices.stage.low_deg=-60", f"storage.preview_bin={preview_bin}"]
     config = load(config_folder() / "simulated.yaml", overrides, environment={})
     events: list[Event] = []
     result = run_scan(config, tmp_path, [events.append])
-    foretold = next(event.data["total_bytes"] for event in events if event.event == "run_started")
-    assert 0 < result.bytes - foretold < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
+    predicted = next(event.data["total_bytes"] for event in events if event.event == "run_started")
+    assert 0 < result.bytes - predicted < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
-def test_the_duration_foretold_is_what_it_takes(tmp_path: Path, mode: str) -> None:
+def test_the_duration_predicted_is_what_it_takes(tmp_path: Path, mode: str) -> None:
     """From the stage's zero through a quarter turn away from it and back, with darks and flats at both ends."""
     angles = "scan.angles={scheme: sector, views: 12, first_deg: 200, last_deg: 290}"
     overrides = [*SMALL, f"scan.mode={mode}", angles, "simulation.clock=virtual", "scan.darks.at=both"]
@@ -368,8 +368,8 @@ def test_the_duration_foretold_is_what_it_takes(tmp_path: Path, mode: str) -> No
         run_scan(config, tmp_path, [events.append], instrument=instrument)
         seconds = instrument.clock.now() - began
         assert instrument.devices.stage.position() == 0.0
-    foretold = next(event.data["duration"] for event in events if event.event == "run_started")
-    assert foretold == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
+    predicted = next(event.data["duration"] for event in events if event.event == "run_started")
+    assert predicted == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
 
 
 def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:

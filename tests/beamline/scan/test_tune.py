@@ -56,7 +56,7 @@ def test_what_the_frames_hold_is_found(per_s: float) -> None:
     assert 0.95 * TARGET * FULL < top < 1.01 * TARGET * FULL  # noise in the brightest blocks errs to the safe side
 
 
-def test_the_noise_foretold_is_that_of_line_integrals() -> None:
+def test_the_noise_predicted_is_that_of_line_integrals() -> None:
     """Against the scatter of line integrals of many views at the exposure advised."""
     found = evaluate(frames(8e4, 0.3), PLAN, FULL, longest=10.0, limits=ReferenceLimits())
     rng = np.random.default_rng(9)

@@ -1,4 +1,4 @@
-"""Enough views: the gain foretold falls with the views, and angles that are a part of the circle are never enough."""
+"""Enough views: the gain predicted falls with the views, and angles that are a part of the circle are never enough."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ GOLDEN = (5**0.5 - 1) / 2
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_the_gain_foretold_falls_with_the_views(rng: np.random.Generator) -> None:
+def test_the_gain_predicted_falls_with_the_views(rng: np.random.Generator) -> None:
     data, geometry, _ = spheres(side=32, rows=8, views=90, photons=2000)
     order = np.argsort(np.arange(90) * GOLDEN % 1).argsort()
     data, planned = data[order], geometry.select(order)
     few, most = (np.mean(predicted_gains(data[:n], planned, rng, 2)) for n in (10, 85))
     assert few > most + 1 and abs(most) < 1
-    with pytest.raises(ValueError, match="nothing to foretell"):
+    with pytest.raises(ValueError, match="nothing to predict"):
         predicted_gains(data, planned, rng, 1)
     with pytest.raises(ValueError, match=r"zero|matter"):
         predicted_gains(np.zeros_like(data[:20]), planned, rng, 1)

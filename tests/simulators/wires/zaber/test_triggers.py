@@ -91,7 +91,7 @@ def test_without_a_count_it_goes_on_until_disabled(wire: Wire) -> None:
     assert wire.counts() == [500, 1000]
 
 
-def test_a_stop_takes_away_what_was_foretold(wire: Wire) -> None:
+def test_a_stop_takes_away_what_was_predicted(wire: Wire) -> None:
     set_up(wire, "1 dist 500")
     wire.do("move abs 90000")
     wire.clock.sleep(1.0)
@@ -221,16 +221,16 @@ def test_an_action_changes_a_setting(wire: Wire) -> None:
     assert wire.data("get maxspeed", axis=1) == "100"
 
 
-def test_what_is_foretold_is_what_happens() -> None:
+def test_what_is_predicted_is_what_happens() -> None:
     """The copy that looks ahead leaves the triggers as they are."""
     wire = Wire()
     set_up(wire, "1 dist 300", "io set do 1 t", enable="enable 7")
     wire.do("move abs 5000")
     triggers: Triggers = wire.box.device.triggers
-    foretold = triggers.foretold(60.0)
+    predicted = triggers.predicted(60.0)
     assert triggers.edges == []
     for _ in range(100):
         wire.clock.sleep(0.013)
         wire.tell("/1")
-    assert triggers.edges == foretold
-    assert len(foretold) == 7
+    assert triggers.edges == predicted
+    assert len(predicted) == 7
