@@ -451,11 +451,14 @@ def _has_no_flats(clock: ScanClock, path: Path) -> None:
     _schedule(clock, path, [replace(f, index=i) for i, f in enumerate(frames)])
 
 
+SO_FAR = ("recon.snapshot.h5", "recon.live.png")
+
+
 @pytest.mark.parametrize(
     ("scan", "said", "left"),
     [
         (_no_scan, "No scan began in .* within 3 s", set()),
-        (_dies, "has not grown for 3 s and is not finished.*12 views", {"scan.h5", "recon.snapshot.h5"}),
+        (_dies, "has not grown for 3 s and is not finished.*12 views", {"scan.h5", *SO_FAR}),
         (_ends_without_views, "0 projections", {"scan.h5"}),
         (_ends_with_one_view, "1 projections", {"scan.h5"}),
         (_has_no_flats, "without flats", {"scan.h5"}),

@@ -124,8 +124,8 @@ def test_slices_meet_where_the_volume_is_bright() -> None:
     grid = Grid((40, 50, 60), 1.0)
     z, y, x = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
     ball = ((z - 10) ** 2 + (y - 38) ** 2 + (x - 15) ** 2 < 16).astype(np.float32)
-    assert figures._bright_centre(ball) == (10, 38, 15)
-    assert figures._bright_centre(np.zeros((4, 6, 8), np.float32)) == (2, 3, 4)
+    assert figures.bright_centre(ball) == (10, 38, 15)
+    assert figures.bright_centre(np.zeros((4, 6, 8), np.float32)) == (2, 3, 4)
 
 
 @pytest.mark.parametrize("shape", [(1, 64, 64), (2, 8, 300), (40, 20, 20)])
