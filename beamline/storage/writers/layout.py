@@ -239,6 +239,7 @@ class Rows:
         self._preview: h5py.Dataset = file[PREVIEW]
         paths = (*COLUMNS, VALID, SCORES, REGIONS)
         self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in paths}
+        self._types = {column: column.dtype for column in self._columns.values()}
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
         """Row `row`, which may exist or be the next: pixels first, then what is said about them.
@@ -264,7 +265,7 @@ class Rows:
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
         for name, column in self._columns.items():
             self._grow(column, row + 1)
-            column[row] = said[name] if name in said else vars(digest)[name]
+            self._put(column, row, said[name] if name in said else vars(digest)[name])
         if record.replaces >= 0:
             for name in ("image_key", "kind"):
                 self._columns[name][record.replaces] = int(FrameKind.INVALID)
@@ -276,6 +277,13 @@ class Rows:
         if (marked != flags).any():
             self._columns["flags"][rows.start : rows.stop] = marked
             self._columns["frame_valid"][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
+
+    def _put(self, column: h5py.Dataset, row: int, value: object) -> None:
+        """column[row] = value, in a quarter of the time that h5py's own takes: a frame has twenty of them."""
+        item = np.asarray(value, self._types[column])
+        place = column.id.get_space()
+        place.select_hyperslab((row, *(0,) * item.ndim), (1, *item.shape))
+        column.id.write(h5py.h5s.create_simple((1, *item.shape)), place, item)
 
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:
