@@ -37,6 +37,7 @@ _COMMANDS = {
     "xafs": _Entry("xafs", "Find a material's absorption edge and the energy of its highest contrast."),
     "recon": _Entry("recon", "Reconstruct a scan, finished or still running."),
     "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
+    "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
     "bench": _Entry("bench", "Measure this machine: kernels, fits, and quality against time."),
     "info": _Entry("files", "Describe a scan file."),
     "validate": _Entry("files", "Check a scan file against the rules of its format."),

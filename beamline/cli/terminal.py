@@ -78,7 +78,7 @@ class Terminal:
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs", "monitor"):
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
-        elif event.event == "progress" and event.data.get("stage") == "tradeoff":
+        elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study"):
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))
         elif event.event == "progress" and event.data.get("stage") == "kernels":
             note = f"{event.data['n']} compiled in {event.data['seconds']:.0f} s; once on a machine, 1 to 2 minutes"
@@ -131,7 +131,7 @@ def copied(data: Mapping[str, Any]) -> str:
 
 
 def trials(data: Mapping[str, Any]) -> str:
-    """n/N, trials/min, the time left if it is known, and the running trial, of a `progress` event of a trade-off."""
+    """n/N, trials/min, the time left if known, and the running trial, of a `progress` event of a trade-off or study."""
     parts = [f"{data['n']}/{data['of']}"]
     if data["eta_s"] is not None:
         parts += [f"{data['per_min']:.1f} trials/min", f"{_clock_time(data['eta_s'])} left"]

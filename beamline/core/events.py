@@ -26,8 +26,8 @@ class Event:
         data: its values, by name.
 
     Vocabulary: run_started, state, block_started, frame (throttled), block_done, beam, flag, warning, snapshot, enough,
-    progress, scan_done, recon_started, recon_done, tradeoff_started, trial, bench_started, bench, explain, check, done,
-    failed.
+    progress, scan_done, recon_started, recon_done, tradeoff_started, study_started, trial, bench_started, bench,
+    explain, check, done, failed.
     Events of a live reconstruction have source="recon".
     """
 

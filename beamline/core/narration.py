@@ -33,6 +33,8 @@ def sentence(event: Event) -> str | None:
             return f"{data['method']}{again}: {data['n_views']} views, {axis}"
         case "tradeoff_started":
             return f"{data['trials']} trials of {data['file']}, quality by {data['by']}"
+        case "study_started":
+            return f"{data['study']}: {data['rows']} reconstructions of {data['file']}"
         case "trial":
             return _trial(data)
         case "snapshot":

@@ -38,14 +38,17 @@ def _kernels(trial: Trial) -> tuple[str, ...]:
     return trial.method, *(value for value in trial.settings.values() if isinstance(value, str))
 
 
-def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float | None = None) -> Outcome:
+def run_trial(
+    trial: Trial, work: Path, seed: int, max_seconds: float | None = None, keep: Path | None = None
+) -> Outcome:
     """Run one trial in a process of its own, which has ended when this returns or raises.
 
     Args:
         work: a folder with data.npz.
         max_seconds: after which the process is killed; None: no limit.
+        keep: a .npy file for its volume [z, y, x]; None: the volume is forgotten.
     """
-    job = {"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed}
+    job = {"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed, "keep": keep and str(keep)}
     return _outcome(trial, _run(job, work, max_seconds))
 
 

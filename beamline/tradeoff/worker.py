@@ -54,8 +54,12 @@ def run(
     say: Say,
     now: Callable[[], float] = time.perf_counter,
     cpu: Callable[[], float] = time.process_time,
+    keep: Path | None = None,
 ) -> dict[str, Any]:
     """Make a trial's reconstruction and measure it; the fields of an Outcome.
+
+    Args:
+        keep: a .npy file to leave the volume in; None: it is measured and forgotten.
 
     Raises:
         ValueError: the reconstruction refuses these settings.
@@ -74,6 +78,8 @@ def run(
     cpu_seconds = cpu() - before
     peak = peak_memory()  # before measuring, which has needs of its own
     volume = on_grid(result.volume, grid)
+    if keep is not None:
+        np.save(keep, volume.data)
     found = {}
     if data.truth is not None:
         found["psnr"] = metrics.psnr(data.truth, volume.data)
@@ -182,7 +188,7 @@ def end_with(pipe: int) -> None:
 def main(job: Path) -> int:
     """Run the job in the file `job`.
 
-    That is {"data": .npz, "trial": {...}, "seed": n}, or {"data": .npz, "compile": [{...}, ...]}.
+    That is {"data": .npz, "trial": {...}, "seed": n, "keep": .npy or null}, or {"data": .npz, "compile": [{...}, ...]}.
     """
 
     def say(line: Mapping[str, Any]) -> None:
@@ -196,8 +202,10 @@ def main(job: Path) -> int:
                 warm_up(Trial(**trial).build(), geometry)
         return 0
     trial = Trial(**request["trial"])
+    keep = request.get("keep")
     try:
-        result = run(trial, Data.load(Path(request["data"])), int(request["seed"]), say)
+        data = Data.load(Path(request["data"]))
+        result = run(trial, data, int(request["seed"]), say, keep=None if keep is None else Path(keep))
     except ValueError as error:
         say({"event": "failed", "message": str(error)})
         return 1

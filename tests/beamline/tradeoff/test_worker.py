@@ -59,6 +59,21 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: Data) -> None:
     assert found["seconds"] > 0 and found["gaussians"] is None
 
 
+def test_a_volume_that_is_kept_is_the_one_measured(data: Data, tmp_path: Path, capsys: Any) -> None:
+    data.save(tmp_path / "data.npz")
+    job = {
+        "data": str(tmp_path / "data.npz"), "trial": asdict(Trial("method", "fbp", 27)), "seed": 0,
+        "keep": str(tmp_path / "volume.npy"),
+    }  # fmt: skip
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert main(tmp_path / "job.json") == 0
+    expected = fbp(data.projections, data.geometry, filter="hann")
+    np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), expected)
+    assert data.truth is not None
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert said["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
+
+
 def test_fewer_views_are_worse_and_spread_over_all_angles(data: Data) -> None:
     all_views, few = (run(Trial("views", "fbp", n, halves=False), data, 0, _silent)["metrics"] for n in (27, 9))
     assert few["psnr"] < all_views["psnr"] - 1

@@ -1,0 +1,109 @@
+"""`beamline study`: what fewer views, a narrower sector, random angles or averaged views cost on a scan."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.options import SEED, json_option
+from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.terminal import Terminal
+from beamline.core.errors import ScanStopped
+from beamline.core.events import fan_out
+from beamline.study.run import StudyOptions, run_study
+from beamline.study.studies import STUDIES
+from beamline.study.table import text
+from drivers.clock import SystemClock
+from recon.methods import BASELINE, DEFAULT, names
+from recon.voxels.fbp import Filter
+
+
+@click.command()
+@click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "-m",
+    "--method",
+    "methods",
+    type=click.Choice(names()),
+    multiple=True,
+    default=(DEFAULT, BASELINE),
+    show_default=True,
+    help="Method of each row; may be repeated.",
+)
+@click.option(
+    "--truth", metavar="FILE[:A:B]", help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use."
+)
+@selection_options
+@click.option(
+    "--filter",
+    "ramp",
+    type=click.Choice(get_args(Filter)),
+    default="shepp-logan",
+    show_default=True,
+    help="Filter of the FBP of all views; hann where these are few or noisy.",
+)
+@click.option(
+    "--draws",
+    type=click.IntRange(min=1, max=100),
+    default=3,
+    show_default=True,
+    help="How often the study random draws its views.",
+)
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="New folder for the results. Default: FILE's stem and the study's name, in this folder.",
+)
+@json_option
+def study(
+    which: str,
+    file: Path,
+    methods: tuple[str, ...],
+    truth: str | None,
+    ramp: Filter,
+    draws: int,
+    seed: int,
+    output: Path | None,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    """Reconstruct the scan in FILE from chosen views, and compare each volume with the FBP of all its views.
+
+    fixed-views: 360, 180, 90 and 45 views, evenly spread. sector: 30-150, 45-135 and 60-120 degrees, at falling and at
+    equal numbers of views. random: views at random beside evenly spread ones. window-average: means of neighbouring
+    views, side by side and overlapping.
+
+    Prints PSNR, SSIM, SNR and CNR of every row, PSNR and SSIM also against --truth. A row that asks for more views than
+    the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
+    the rows done so far (exit code 4; 130 and no folder if there are none).
+    """
+    source, selection = chosen(file, seed, values)
+    options = StudyOptions(
+        source=source,
+        selection=selection,
+        study=STUDIES[which],
+        folder=output or Path(f"{file.stem}_{which}"),
+        methods=tuple(dict.fromkeys(methods)),
+        filter=ramp,
+        truth=truth,
+        draws=draws,
+        seed=seed,
+        command=shlex.join(["beamline", *sys.argv[1:]]),
+    )
+    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        table = run_study(options, fan_out(*(json_sinks or [terminal])), SystemClock())
+    if not as_json:
+        click.echo(text(table))
+    if table.stopped:
+        rows = sum(cell.row.groups is not None for cell in table.cells)
+        raise ScanStopped(
+            f"The study was stopped after {len(table.done)} of {rows} rows; {options.folder} holds those."
+        )

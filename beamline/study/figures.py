@@ -1,0 +1,120 @@
+"""Pictures and page of a study: the same slice of every row by each method, and the figures of all rows."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from beamline.core.files import named_on_failure, whole_file
+from beamline.core.machine import machine_line
+from beamline.report.figures import bright_centre, grey_window, png
+from beamline.report.html import Picture, render
+from beamline.study.table import HEADINGS, StudyTable, formatted, write_text
+from recon.methods import by_name
+
+F32 = NDArray[np.float32]
+_COLUMNS, _WIDTH, _DPI = 4, 8.6, 110
+
+
+class Slices:
+    """The slice [y, x] of each volume through the bright parts of the first one, by label.
+
+    Attributes:
+        families: of rows, of which one is enough.
+    """
+
+    def __init__(self, first: F32, label: str) -> None:
+        self._at = bright_centre(first)[0]
+        self._shown: dict[str, F32] = {label: first[self._at].copy()}
+        self.families: set[str] = set()
+
+    def add(self, label: str, volume: F32, family: str = "") -> None:
+        self._shown[label] = volume[self._at].copy()
+        self.families |= {family} - {""}
+
+    def png(self, labels: list[str]) -> bytes:
+        """These slices, four beside one another, in the grey window of the first."""
+        window = Normalize(*grey_window([self._shown[labels[0]]]))
+        down = -(-len(labels) // _COLUMNS)
+        rows, cols = self._shown[labels[0]].shape
+        figure = Figure(
+            figsize=(_WIDTH, (_WIDTH / _COLUMNS * rows / cols + 0.25) * down), dpi=_DPI, layout="constrained"
+        )
+        panels = np.ravel(figure.subplots(down, _COLUMNS, squeeze=False))
+        for axes in panels:
+            axes.set_axis_off()
+        for axes, label in zip(panels, labels, strict=False):
+            axes.imshow(self._shown[label], cmap="gray", norm=window, origin="lower", interpolation="nearest")
+            axes.set_title(label.rpartition(": ")[0] or label, fontsize=7)
+        return png(figure)
+
+    def labels(self, method: str) -> list[str]:
+        """Those of a method, after those that are of no row."""
+        return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
+
+
+def figures_of_rows(table: StudyTable) -> bytes:
+    """Every figure of all rows, a line a method."""
+    names, rows = table.names, list(dict.fromkeys(cell.row.label for cell in table.done))
+    down = -(-len(names) // 2)
+    figure = Figure(figsize=(_WIDTH, 2.1 * down + 1.6), dpi=_DPI, layout="constrained")
+    panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
+    for axes, name in zip(panels, names, strict=False):
+        for method in dict.fromkeys(cell.method for cell in table.done):
+            cells = [c for c in table.done if c.method == method and math.isfinite(c.figures[name])]
+            places = [rows.index(cell.row.label) for cell in cells]
+            values = [cell.figures[name] for cell in cells]
+            axes.plot(places, values, marker="o", ms=4, lw=0.8, color=by_name(method).colour, label=method)
+        axes.set_ylabel(HEADINGS[name] + ("" if name.startswith("ssim") else " (dB)"), fontsize=8)
+        axes.set_xticks(range(len(rows)), rows, rotation=90, fontsize=6.5)
+        axes.tick_params(axis="y", labelsize=7)
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize=8)
+    return png(figure)
+
+
+def write_page(folder: Path, table: StudyTable, slices: Slices) -> None:
+    """Write the pictures and report.html."""
+    pictures = []
+    if table.done:
+        caption = "PSNR and SSIM against the FBP of all views" + (
+            ", and against the truth" if "psnr_truth" in table.names else ""
+        )
+        caption += "; SNR and CNR of the dense and the empty region. More is better."
+        pictures.append(("figures.png", Picture("Figures of all rows", caption, figures_of_rows(table))))
+    for method in dict.fromkeys(cell.method for cell in table.done):
+        caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
+        picture = Picture(f"{by_name(method).label}, slice by slice", caption, slices.png(slices.labels(method)))
+        pictures.append((f"slices_{method}.png", picture))
+    for name, picture in pictures:
+        with named_on_failure(folder / name), whole_file(folder / name, replace=True) as partial:
+            partial.write_bytes(picture.png)
+    rows = [
+        {
+            "label": cell.row.label,
+            "method": cell.method,
+            "cells": [f"{cell.cpu_seconds:.1f}", *(formatted(n, cell.figures[n]) for n in table.names)]
+            if cell.status == "done"
+            else [],
+            "reason": cell.said,
+        }
+        for cell in table.cells
+    ]
+    page = render(
+        "study.html",
+        title=table.study.title,
+        summary=f"{table.study.question} {len(table.done)} of {len(table.cells)} rows on "
+        f"{machine_line(dict(table.machine))}.",
+        columns=["CPU s", *(HEADINGS[name] for name in table.names)],
+        rows=rows,
+        sentences=[*table.draws, *table.notes],
+        pictures=[picture for _, picture in pictures],
+        scan=table.scan,
+        command=table.command,
+    )
+    write_text(folder / "report.html", page)

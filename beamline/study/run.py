@@ -1,0 +1,255 @@
+"""Runs a study: each row by each method in a process of its own, all compared with the FBP of the whole scan."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.events import Emit, Event, Sink, Warnings
+from beamline.core.files import named_on_failure
+from beamline.core.machine import machine
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.reconstruct.measure import fit_truth, read_truth, regions
+from beamline.reconstruct.recon_report import facts_of
+from beamline.storage.readers.open import SourceOptions
+from beamline.study.figures import Slices, write_page
+from beamline.study.studies import Row, Study, ViewSet, averaged
+from beamline.study.table import Cell, StudyTable, write_table
+from beamline.tradeoff.data import Data
+from beamline.tradeoff.launch import compile_kernels, run_trial
+from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
+from drivers.clock import Clock
+from recon.assess import metrics
+from recon.base.geometry import Geometry
+from recon.base.method import Plain
+from recon.base.volume import Grid, Volume
+from recon.methods import BASELINE
+from recon.voxels.fbp import Filter
+
+F32 = NDArray[np.float32]
+REFERENCE = "FBP of all views"
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """The scan and the study.
+
+    Attributes:
+        source, selection: the scan and the part of it to use; the study chooses from its views.
+        study: what is asked.
+        folder: for the results; must not exist.
+        methods: names in `recon.methods`.
+        filter: of the FBP of all views that rows are compared with.
+        truth: FILE or FILE:first:end to compare with, too.
+        draws: how often random views are drawn.
+        seed: of everything random.
+        command: the command line that repeats the study, for the record.
+    """
+
+    source: SourceOptions
+    selection: Selection
+    study: Study
+    folder: Path
+    methods: Sequence[str]
+    filter: Filter = "shepp-logan"
+    truth: str | None = None
+    draws: int = 3
+    seed: int = 0
+    command: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """What every volume is compared with.
+
+    Attributes:
+        reference: FBP of all views, on `Grid.matching` of their geometry.
+        truth: on the same grid; None where nobody knows it.
+        mask: of the dense and the empty regions, see `regions`; None without two.
+    """
+
+    reference: F32
+    truth: F32 | None
+    mask: NDArray[np.int8] | None
+
+    def figures(self, volume: F32) -> dict[str, float]:
+        """By the names of `table.HEADINGS`."""
+        found = {"psnr_fbp": metrics.psnr(self.reference, volume), "ssim_fbp": metrics.ssim3d(self.reference, volume)}
+        if self.truth is not None:
+            found |= {"psnr_truth": metrics.psnr(self.truth, volume), "ssim_truth": metrics.ssim3d(self.truth, volume)}
+        if self.mask is not None:
+            found["snr"], found["cnr"] = metrics.snr_cnr(volume, self.mask)
+        return found
+
+
+def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> StudyTable:
+    """Run all rows and write table, pictures and page into the folder. The event `done` names the folder.
+
+    The table is written after every row. After Ctrl-C the table is `stopped`. A folder without results is removed. The
+    views lie in a file of the folder while the study runs; the memory holds those of one row.
+
+    Raises:
+        ConfigError, DataError: nothing was written, or the table of the rows that were done.
+        KeyboardInterrupt: before the first row was done; nothing was written.
+    """
+    folder, started = options.folder, clock.now()
+    if folder.exists():
+        raise DataError(f"{folder} exists and results are never overwritten. Name another folder, or move it away.")
+    if not folder.parent.is_dir():
+        raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
+    wanted = None if options.truth is None else read_truth(options.truth)
+    warn = Warnings(sink, clock)
+    with options.source.open() as source:
+        facts = facts_of(source)
+        prepared = prepare_projections(source, options.selection, warn)
+    geometry, grid = prepared.geometry, Grid.matching(prepared.geometry)
+    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning).data
+    shape = " × ".join(map(str, grid.shape))
+    table = _planned(options, geometry, {**facts.table, "volume": shape}, truth is not None)
+    todo = [cell for cell in table.cells if cell.row.groups is not None]
+    if not todo:
+        raise DataError(
+            f"{options.source.path}: {geometry.n_views} views are too few for any row of {options.study.name}: "
+            f"{table.cells[-1].said}. Take a scan with more views."
+        )
+    counts = {"rows": len(todo), "left_out": len(table.cells) - len(todo), "study": options.study.name}
+    sink(Event("study_started", clock.now(), {"file": options.source.path, **counts}))
+    for cell in table.cells:
+        if cell.row.groups is None and cell.method == options.methods[0]:
+            warn(f"{cell.row.label} is left out: {cell.message}")
+    folder.mkdir()
+    work = folder / "work"
+    work.mkdir()
+    slices: Slices | None = None
+    try:
+        with named_on_failure(work / "views.npy"):
+            np.save(work / "views.npy", prepared.projections.data)
+        del prepared  # from here on the views are in the file alone
+        rig = _Rig(work, geometry, options.seed)
+        whole = Row(REFERENCE, np.arange(geometry.n_views)[:, None])
+        reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
+        if reference is None:
+            raise DataError(f"{options.source.path}: the FBP of all views, to compare with, failed: {outcome.message}")
+        mask = regions(Volume(reference if truth is None else truth, grid), options.seed)
+        slices = Slices(reference, REFERENCE)
+        if truth is not None:
+            slices.add("truth", truth)
+        rig.compile(options.methods)
+        judge = _Judge(reference, truth, mask)
+
+        def say(event: str, data: Mapping[str, Any]) -> None:
+            sink(Event(event, clock.now(), data))
+
+        for table in _each(table, rig, judge, slices, say, now):  # noqa: B020 - each has one more row than the last
+            write_table(folder, table)
+    except KeyboardInterrupt:
+        if not table.done:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        table = replace(table, stopped=True)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        if folder.is_dir() and not any(folder.iterdir()):  # an empty folder would refuse the next run
+            folder.rmdir()
+    write_table(folder, table)
+    assert slices is not None
+    write_page(folder, table, slices)
+    summary = {"output": folder, "rows": len(todo), "done": len(table.done), "stopped": table.stopped}
+    sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))
+    return table
+
+
+def _planned(options: StudyOptions, geometry: Geometry, facts: Mapping[str, str], truth: bool) -> StudyTable:
+    """The table before any row is done."""
+    rows = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws))
+    notes = [
+        f"PSNR and SSIM are against the {REFERENCE} ({geometry.n_views}, {options.filter}): it has noise and streaks "
+        "of its own, which rows share as far as they share its views.",
+        "SNR and CNR are of the dense and the empty region (k-means of the "
+        + ("truth" if truth else "FBP of all views")
+        + "); a smoother volume has more.",
+    ]
+    if truth:
+        notes.insert(1, "PSNR truth and SSIM truth are against the truth.")
+    return StudyTable(
+        options.study,
+        tuple(Cell(row, method, message=row.reason) for row in rows for method in options.methods),
+        {**facts, "views to choose from": str(geometry.n_views)},
+        machine(),
+        options.command,
+        notes,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """Where rows are reconstructed: a folder with the views of the scan, views.npy, and their geometry."""
+
+    work: Path
+    geometry: Geometry
+    seed: int
+
+    def reconstructed(
+        self, row: Row, method: str, settings: Mapping[str, Plain] = MappingProxyType({})
+    ) -> tuple[F32 | None, Outcome]:
+        """The volume of a row; None where the method failed."""
+        assert row.groups is not None
+        # Opened here and closed with the return: Windows removes no file that is open.
+        data, angles = averaged(np.load(self.work / "views.npy", mmap_mode="r"), self.geometry.angles, row.groups)
+        angles.setflags(write=False)
+        geometry = replace(self.geometry.select(row.groups[:, row.window // 2]), angles=angles)
+        with named_on_failure(self.work / "data.npz"):
+            Data(data, geometry, None, None).save(self.work / "data.npz")
+        del data
+        kept = self.work / "volume.npy"
+        trial = Trial("method", method, row.n_views, settings=dict(settings))
+        outcome = run_trial(trial, self.work, self.seed, keep=kept)
+        return (np.load(kept), outcome) if outcome.status == "done" else (None, outcome)
+
+    def compile(self, methods: Sequence[str]) -> None:
+        """Compile the kernels of these methods; the folder has the data of a row."""
+        compile_kernels([Trial("method", method, 2) for method in methods], self.work)
+
+
+def _each(
+    table: StudyTable, rig: _Rig, judge: _Judge, slices: Slices, say: Emit, now: Callable[[], float]
+) -> Iterator[StudyTable]:
+    """The table after each cell, and after one that Ctrl-C interrupted."""
+    timed: list[Timed] = []
+    todo = [(index, cell) for index, cell in enumerate(table.cells) if cell.row.groups is not None]
+    trials = [Trial("method", cell.method, cell.row.n_views) for _, cell in todo]
+    begin = now()
+    for n, (index, cell) in enumerate(todo):
+        eta, rate = seconds_left(timed, trials[n:]), 60 * n / max(now() - begin, 1e-9)
+        place = {"n": n, "of": len(todo), "label": cell.label}
+        say("progress", {"stage": "study", **place, "eta_s": eta, "per_min": rate})
+        started = now()
+        try:
+            volume, outcome = rig.reconstructed(cell.row, cell.method)
+            figures = {} if volume is None else judge.figures(volume)
+        except KeyboardInterrupt:
+            yield table.with_cell(index, replace(cell, status="interrupted", message="ended before it was done"))
+            raise
+        if volume is not None and cell.row.family not in slices.families:
+            slices.add(cell.label, volume, cell.row.family)
+        cell = replace(
+            cell, status=outcome.status, figures=figures, seconds=outcome.seconds, cpu_seconds=outcome.cpu_seconds,
+            message=outcome.message,
+        )  # fmt: skip
+        timed.append(Timed.of(outcome, now() - started))
+        table = table.with_cell(index, cell)
+        yield table
+        quality = {"quality_db": figures.get("psnr_fbp", math.nan), "peak_bytes": outcome.peak_bytes}
+        state = {"status": cell.status, "seconds": cell.seconds, "message": cell.message}
+        say("trial", {**place, "n": n + 1, "method": cell.method, **state, **quality, **figures})

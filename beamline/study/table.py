@@ -1,0 +1,170 @@
+"""What a study found: a value for each row and method, as text, CSV and JSON, with the means of repeated draws."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from textwrap import fill
+
+import numpy as np
+
+from beamline.core.files import named_on_failure, whole_file
+from beamline.core.machine import machine_line
+from beamline.core.version import version
+from beamline.study.studies import Row, Study
+from beamline.tradeoff.report import finite
+from beamline.tradeoff.trials import Status
+
+_WIDTH = 120  # characters
+
+DIGITS = {"psnr_fbp": 2, "ssim_fbp": 4, "psnr_truth": 2, "ssim_truth": 4, "snr": 2, "cnr": 2}
+HEADINGS = {
+    "psnr_fbp": "PSNR", "ssim_fbp": "SSIM", "psnr_truth": "PSNR truth", "ssim_truth": "SSIM truth", "snr": "SNR",
+    "cnr": "CNR",
+}  # fmt: skip
+"""Figures by name and as tables head them; PSNR, SNR and CNR in dB."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One row of a study by one method.
+
+    Attributes:
+        row: which views.
+        method: its name in `recon.methods`.
+        status: only "done" comes with figures; "not run" with a message: the row was left out.
+        figures: by the names of HEADINGS.
+        seconds, cpu_seconds: of the reconstruction.
+        message: why there are no figures.
+    """
+
+    row: Row
+    method: str
+    status: Status = "not run"
+    figures: Mapping[str, float] = field(default_factory=dict)
+    seconds: float = math.nan
+    cpu_seconds: float = math.nan
+    message: str = ""
+
+    @property
+    def label(self) -> str:
+        return f"{self.row.label}: {self.method}"
+
+    @property
+    def said(self) -> str:
+        """What stands in place of figures."""
+        return f"{'left out' if self.row.groups is None else self.status}: {self.message}".rstrip(": ")
+
+
+@dataclass(frozen=True)
+class StudyTable:
+    """All cells of a study.
+
+    Attributes:
+        study: what was asked.
+        cells: in the order of the rows, each by all methods.
+        scan: facts for people, by name.
+        machine: of `beamline.core.machine.machine`.
+        command: the command that repeats the study.
+        notes: sentences on what the figures mean.
+        stopped: it was interrupted before all rows were done.
+    """
+
+    study: Study
+    cells: tuple[Cell, ...]
+    scan: Mapping[str, str]
+    machine: Mapping[str, str | int]
+    command: str
+    notes: Sequence[str] = ()
+    stopped: bool = False
+
+    def with_cell(self, index: int, cell: Cell) -> StudyTable:
+        return replace(self, cells=(*self.cells[:index], cell, *self.cells[index + 1 :]))
+
+    @property
+    def done(self) -> tuple[Cell, ...]:
+        return tuple(cell for cell in self.cells if cell.status == "done")
+
+    @property
+    def names(self) -> list[str]:
+        """Figures that any cell has."""
+        return [name for name in HEADINGS if any(name in cell.figures for cell in self.cells)]
+
+    @property
+    def draws(self) -> list[str]:
+        """Sentences: mean and range of the figures over the draws of one choice."""
+        out = []
+        families = dict.fromkeys((c.row.family, c.method) for c in self.done if c.row.family)
+        for family, method in families:
+            cells = [c for c in self.done if (c.row.family, c.method) == (family, method)]
+            parts = []
+            for name in self.names:
+                values = [cell.figures[name] for cell in cells]
+                low, high = formatted(name, min(values)), formatted(name, max(values))
+                parts.append(f"{HEADINGS[name]} {formatted(name, float(np.mean(values)))} ({low} to {high})")
+            out.append(f"{method}, {family}, mean of {len(cells)}: {', '.join(parts)}.")
+        return out
+
+
+def formatted(name: str, value: float) -> str:
+    """A figure with its digits; "equal" for the PSNR of two equal volumes."""
+    if math.isfinite(value):
+        return f"{value:.{DIGITS[name]}f}"
+    return "equal" if name.startswith("psnr") and value > 0 else "undefined"
+
+
+def text(table: StudyTable) -> str:
+    """The table for people."""
+    width = max(len(cell.row.label) for cell in table.cells) + 2
+    kind = max(len(cell.method) for cell in table.cells) + 2
+    head = f"{'':<{width}}{'':<{kind}}{'CPU s':>8}" + "".join(f"{HEADINGS[name]:>12}" for name in table.names)
+    lines = [table.study.question, machine_line(dict(table.machine)), "", head]
+    for cell in table.cells:
+        begin = f"{cell.row.label:<{width}}{cell.method:<{kind}}"
+        if cell.status == "done":
+            figures = (formatted(name, cell.figures[name]) for name in table.names)
+            lines.append(begin + f"{cell.cpu_seconds:>8.1f}" + "".join(f"{figure:>12}" for figure in figures))
+        else:
+            lines.append(begin + cell.said)
+    return "\n".join(
+        [*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in (*table.draws, *table.notes))]
+    )
+
+
+def write_table(folder: Path, table: StudyTable) -> None:
+    """Write study.csv and study.json, each completely, in place of earlier ones."""
+    record = {
+        "format": "splatline study 1",
+        "version": version(),
+        "study": table.study.name,
+        "command": table.command,
+        "machine": dict(table.machine),
+        "scan": dict(table.scan),
+        "notes": list(table.notes),
+        "rows": [_record(cell) for cell in table.cells],
+    }
+    write_text(folder / "study.json", json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False))
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(_record(table.cells[0])), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(finite(_record(cell)) for cell in table.cells)
+    write_text(folder / "study.csv", out.getvalue())
+
+
+def write_text(path: Path, content: str) -> None:
+    with named_on_failure(path), whole_file(path, replace=True) as partial:
+        partial.write_text(content, encoding="utf-8")
+
+
+def _record(cell: Cell) -> dict[str, str | float | None]:
+    return {
+        "row": cell.row.label, "method": cell.method, "views": cell.row.n_views, "window": cell.row.window,
+        "status": cell.status, "seconds": cell.seconds, "cpu_seconds": cell.cpu_seconds,
+        **{name: cell.figures.get(name) for name in HEADINGS},
+        "message": cell.message,
+    }  # fmt: skip

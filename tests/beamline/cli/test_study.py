@@ -1,0 +1,138 @@
+"""`beamline study`: the table and its figures, rows that are left out, what an interruption leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.study import run as study_run
+from beamline.tradeoff.data import Data
+from beamline.tradeoff.trials import Outcome, Trial
+from recon.base.volume import Grid
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 1.875)), shape=(4, 40))  # 96 views
+ERROR = 1e-3  # 1/mm, of every voxel that a row reconstructs
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["study", *arguments])
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, Data]]:
+    """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
+    found: list[tuple[Trial, Data]] = []
+
+    def trial(trial: Trial, work: Path, seed: int, *, keep: Path) -> Outcome:
+        data = Data.load(work / "data.npz")
+        truth = SCAN.truth(Grid.matching(data.geometry))
+        np.save(keep, truth + np.float32(ERROR) if found else truth)
+        found.append((trial, data))
+        return Outcome(trial, "done", 2.0, 10**8, cpu_seconds=1.0)
+
+    monkeypatch.setattr(study_run, "run_trial", trial)
+    monkeypatch.setattr(study_run, "compile_kernels", lambda *_: None)
+    return found
+
+
+def _rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "study.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    truth = SCAN.truth(Grid((4, 40, 40)))
+    np.save(folder / "truth.npy", truth)
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "--truth", "truth.npy", "-m", "fbp")
+    assert result.exit_code == 0, result.output
+    rows = _rows(folder / "many_fixed-views")
+    assert [(row["views"], row["status"]) for row in rows] == [
+        ("0", "not run"), ("0", "not run"), ("90", "done"), ("45", "done"),
+    ]  # fmt: skip
+    assert "asks for 360 views" in rows[0]["message"] and "fixed, 360 views is left out" in result.stderr
+    peak = 20 * np.log10(truth.max() / ERROR)
+    inside = truth[:, 8:32, 8:32]  # the square in the circle, less a tenth on each side
+    dense, empty = inside[inside > 0.01], inside[inside <= 0.01]  # the body, and what is around it
+    for row in rows[2:]:
+        figures = {
+            name: float(row[name]) for name in ("psnr_fbp", "psnr_truth", "ssim_fbp", "ssim_truth", "snr", "cnr")
+        }
+        assert figures["psnr_fbp"] == pytest.approx(peak, abs=1e-3) == figures["psnr_truth"]
+        assert figures["ssim_fbp"] == pytest.approx(figures["ssim_truth"]) and 0 < figures["ssim_truth"] < 1
+        assert figures["snr"] == pytest.approx(20 * np.log10((dense.mean() + ERROR) / empty.std()), abs=1e-3)
+        assert figures["cnr"] == pytest.approx(20 * np.log10((dense.mean() - empty.mean()) / empty.std()), abs=1e-3)
+    first, *others = seen
+    assert first[0].settings == {"filter": "shepp-logan"} and first[1].geometry.n_views == 96
+    assert [data.geometry.n_views for _, data in others] == [90, 45]
+    left = {path.name for path in (folder / "many_fixed-views").iterdir()}
+    assert left == {"study.csv", "study.json", "report.html", "figures.png", "slices_fbp.png"}
+
+
+def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 0.5)), shape=(2, 40)))
+    result = _beamline("window-average", "many.h5", "--axis", "20.7", "-m", "fbp", "--json")
+    assert result.exit_code == 0, result.output
+    whole, *rows = (data for _, data in seen)
+    mean = rows[3]  # after three of single views: two views side by side
+    assert mean.geometry.n_views == 180
+    light = np.exp(-whole.projections.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
+    np.testing.assert_allclose(mean.projections, -np.log(light), atol=1e-5)
+    np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("study_started", "done", len(rows))
+
+
+def test_ctrl_c_leaves_the_rows_done_and_says_so(
+    folder: Path, seen: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    trial = study_run.run_trial
+
+    def interrupted(*arguments: Any, **named: Any) -> Outcome:
+        if len(seen) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return trial(*arguments, **named)
+
+    monkeypatch.setattr(study_run, "run_trial", interrupted)
+    result = _beamline("random", "many.h5", "--axis", "20.7", "-m", "fbp", "--draws", "2", "-o", "out")
+    assert result.exit_code == 4, result.output
+    assert "stopped after 2 of 6 rows" in result.stderr and "interrupted" in result.stdout
+    done = [row["row"] for row in _rows(folder / "out") if row["status"] == "done"]
+    assert done == ["fixed, 90 views", "random, 90 views, draw 1"]
+    assert (folder / "out" / "report.html").is_file() and not (folder / "out" / "work").exists()
+
+
+def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    monkeypatch.setattr(study_run, "run_trial", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    result = _beamline("random", "many.h5", "--axis", "20.7", "-o", "out")
+    assert result.exit_code == 130, result.output
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("magic", "scan.h5"), 2, "magic"),
+        (("sector", "scan.h5", "-m", "magic"), 2, "magic"),
+        (("sector", "scan.h5", "--truth", "missing.npz"), 2, "missing.npz"),
+        (("sector", "scan.h5", "-o", "."), 5, "never overwritten"),
+        (("fixed-views", "scan.h5"), 5, "30 views are too few"),
+    ],
+)
+def test_bad_input_leaves_nothing(folder: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
+    result = _beamline(*arguments)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr and result.stdout == ""
+    assert {p.name for p in folder.iterdir()} == {"scan.h5"}
