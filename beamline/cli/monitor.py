@@ -113,12 +113,12 @@ def monitor(
             sink(Event("warning", clock.now(), {"message": fault}))
         flags = [flag for each in found for flag in each]
         kinds = by_kind(flags)
-        alarmed = {row for flag in flags if flag.level is Level.ALARM for row in flag.rows} - again
+        alarmed = {row for flag in flags if flag.level is Level.ALARM for row in flag.frames} - again
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
             "flags": counts_of(kinds), "references": references,
             "aside": aside.said(),
-            "kinds": [{**asdict(kind.worst), "rows": kind.rows} for kind in kinds],
+            "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in kinds],
         }  # fmt: skip
         for json_sink in json_sinks:
             json_sink(Event("done", clock.now(), done))
@@ -144,8 +144,8 @@ def table(kinds: Iterable[Kind]) -> list[str]:
             top, bottom, left, right = worst.region
             where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
         lines += [
-            f"{kind.level:<6}{kind.check:<12}{len(kind.rows)} frames: {spans(kind.rows)}",
-            f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {UNITS[kind.check]}, in frame {worst.view}{where}",
+            f"{kind.level:<6}{kind.check:<12}{len(kind.frames)} frames: {spans(kind.frames)}",
+            f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {UNITS[kind.check]}, in frame {worst.frame}{where}",
             f"{'':<18}{worst.advice}",
         ]
     return lines

@@ -26,7 +26,7 @@ def sentence(event: Event) -> str | None:
         case "block_done":
             return _missing(data)
         case "flag":
-            return f"{str(data['level']).capitalize()} ({data['check']}, frame {data['view']}): {data['advice']}"
+            return f"{str(data['level']).capitalize()} ({data['check']}, frame {data['frame']}): {data['advice']}"
         case "recon_started":
             again = " again, from the start" if data.get("again") else ""
             axis = f"rotation axis at column {data['axis_col']:.2f}"

@@ -73,10 +73,8 @@ class Beam:
     meaning: ClassVar[str] = "the light differs from that of the flats, or dipped against the views before"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="fraction by which the light may drift, either way")] = 0.02
-    alarm: Annotated[float, Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")] = (
-        0.10
-    )
+    drift: Annotated[float, Field(ge=0, description="fraction by which the light may drift, either way")] = 0.02
+    dip: Annotated[float, Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")] = 0.10
 
     def start(self) -> BeamState:
         return BeamState()
@@ -94,22 +92,22 @@ class Beam:
         return self._drift(state, frame.index, context.view, context.grid)
 
     def _flat(self, row: int, score: float) -> Flag | None:
-        if abs(score) <= self.warn:
+        if abs(score) <= self.drift:
             return None
-        level, limit = (Level.ALARM, self.alarm) if abs(score) > self.alarm else (Level.WARN, self.warn)
+        level, limit = (Level.ALARM, self.dip) if abs(score) > self.dip else (Level.WARN, self.drift)
         advice = f"{_size(score)} light than in the flats before. Take flats more often."
         return Flag(self.name, level, row, score, limit, advice)
 
     def _dip(self, state: BeamState, row: int, change: Change | None, whole: float) -> tuple[BeamState, Flag | None]:
-        """A dip or a flash of more than `alarm` is flagged in every view, until it is over or has become normal."""
+        """A dip or a flash of more than `dip` is flagged in every view, until it is over or has become normal."""
         moved, state = whole - state.whole, replace(state, whole=whole)
         if change is None:
             return state, None
         brighter = math.log1p(change.gain)
         level = state.level + (brighter if brighter * moved > CONFIRMED * brighter**2 else 0.0)
         score = -math.expm1(level - state.usual)
-        limit = max(self.alarm, SIGMAS * state.changes.sigma)
-        most = self.alarm / 2
+        limit = max(self.dip, SIGMAS * state.changes.sigma)
+        most = self.dip / 2
         state = replace(state, level=level, changes=state.changes.with_figure(min(max(brighter, -most), most)))
         if abs(score) <= limit or state.dipping >= PATIENCE:
             usual = level if state.dipping >= PATIENCE else state.usual + MEMORY * (level - state.usual)
@@ -129,7 +127,7 @@ class Beam:
                 "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
-        away = abs(score) > (GONE * self.warn if state.said else self.warn)
+        away = abs(score) > (GONE * self.drift if state.said else self.drift)
         drifting = 0 if away is state.said else state.drifting + 1
         if drifting < LASTS:
             return Look(replace(state, drifting=drifting))
@@ -137,7 +135,7 @@ class Beam:
         if not state.said:
             return Look(state)
         advice = f"{_size(score)} light than in the flats, where there is air. Take flats more often."
-        return Look(state, Flag(self.name, Level.WARN, row, score, self.warn, advice))
+        return Look(state, Flag(self.name, Level.WARN, row, score, self.drift, advice))
 
 
 def _size(score: float) -> str:

@@ -46,18 +46,18 @@ class Flag:
     Attributes:
         check: name of the check.
         level: how bad.
-        view: the frame: its number in the file, from 0; darks and flats count.
+        frame: its number in the file, from 0; darks and flats count.
         score: the measured figure, in the check's unit.
         limit: the figure that it exceeds.
         advice: what it means and what to do.
         region: where in the frame; None: everywhere, or nowhere in particular.
-        first: the first frame that it holds for, where that is not `view`: some findings need several views. All are of
-            the frame's kind, without another between.
+        first: the first frame that it holds for, where that is not `frame`: some findings need several views. All are
+            of its kind, without another between.
     """
 
     check: str
     level: Level
-    view: int
+    frame: int
     score: float
     limit: float
     advice: str
@@ -65,9 +65,9 @@ class Flag:
     first: int | None = None
 
     @property
-    def rows(self) -> range:
+    def frames(self) -> range:
         """Frames of the file that it holds for."""
-        return range(self.view if self.first is None else self.first, self.view + 1)
+        return range(self.frame if self.first is None else self.first, self.frame + 1)
 
 
 @dataclass(frozen=True, eq=False)

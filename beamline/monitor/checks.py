@@ -55,11 +55,11 @@ CHECKS: tuple[Check, ...] = _distinct(
 _BITS = {check.name: check.bit for check in CHECKS}
 
 
-def flagged_rows(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
-    """Rows of a file by check and level; a row with a warning and an alarm of a check counts by its alarm."""
+def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
+    """Frames of a file by check and level; one with a warning and an alarm of a check counts by its alarm."""
     rows: dict[tuple[str, Level], set[int]] = {}
     for flag in flags:
-        rows.setdefault((flag.check, flag.level), set()).update(flag.rows)
+        rows.setdefault((flag.check, flag.level), set()).update(flag.frames)
     for check, level in rows:
         if level is Level.WARN:
             rows[check, level] -= rows.get((check, Level.ALARM), set())

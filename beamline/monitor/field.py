@@ -43,7 +43,7 @@ class FieldOfView:
     meaning: ClassVar[str] = "a part of the frame gets no light even without a sample"
     policy: ClassVar[Policy] = Policy.LOG
 
-    dark: Annotated[float, Field(ge=0, lt=1, description="share of the frame that may be without light")] = 0.02
+    unlit: Annotated[float, Field(ge=0, lt=1, description="share of the frame that may be without light")] = 0.02
     edge: Annotated[float, Field(ge=0, description="line integral at the edges up to which the sample is inside")] = 0.1
 
     def start(self) -> FieldState:
@@ -67,10 +67,10 @@ class FieldOfView:
         rows, cols = frame.counts.shape
         if bright <= NO_BEAM * _noise(light):
             advice = "No part of this flat has light that the darks have not: is the beam on, and the shutter open?"
-            return Flag(self.name, Level.WARN, frame.index, 1.0, self.dark, advice, (0, rows, 0, cols))
+            return Flag(self.name, Level.WARN, frame.index, 1.0, self.unlit, advice, (0, rows, 0, cols))
         unlit = light < UNLIT * bright
         share = float(unlit.mean())
-        if share <= self.dark:
+        if share <= self.unlit:
             return None
         step = frame.counts.shape[0] / light.shape[0]
         strips = [
@@ -85,7 +85,7 @@ class FieldOfView:
             f"{share:.0%} of the frame gets no light, without a sample ({named or 'here and there'}): a slit or an "
             "aperture shadows it. Open it, or choose a smaller region of the camera."
         )
-        return Flag(self.name, Level.WARN, frame.index, share, self.dark, advice, region)
+        return Flag(self.name, Level.WARN, frame.index, share, self.unlit, advice, region)
 
     def _cut(self, row: int, view: View, grid: Grid) -> Flag:
         left, right = view.edges

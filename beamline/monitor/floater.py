@@ -81,7 +81,7 @@ class Floater:
     meaning: ClassVar[str] = "matter crosses the field faster than the turning sample carries anything"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="standard deviations of a peak that may be part of a trail")] = 4.5
+    peak: Annotated[float, Field(ge=0, description="standard deviations of a peak that may be part of a trail")] = 4.5
 
     def start(self) -> FloaterState:
         return FloaterState()
@@ -110,7 +110,7 @@ class Floater:
         usual = np.zeros(grid.shape, np.float32) if state.usual is None else state.usual.copy()
         peaks = np.empty((CROWD + 1, 4))
         n = _peaks(
-            outputs, view.weight, state.light, usual, MEMORY if state.usual is not None else 1.0, self.warn, peaks
+            outputs, view.weight, state.light, usual, MEMORY if state.usual is not None else 1.0, self.peak, peaks
         )
         state = replace(state, usual=usual)
         if n > CROWD:
@@ -132,7 +132,7 @@ class Floater:
             f"turning carries anything there (seen in frames {trail.first:.0f} ... {trail.last:.0f}): a floating "
             "particle in the beam or on the holder. Look for it, blow it off, and repeat these views."
         )
-        flag = Flag(self.name, Level.WARN, now, trail.score, self.warn, advice, region, int(trail.first))
+        flag = Flag(self.name, Level.WARN, now, trail.score, self.peak, advice, region, int(trail.first))
         return Look(state, flag)
 
 

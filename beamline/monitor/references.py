@@ -45,11 +45,15 @@ class ReferenceLimits:
     """
 
     saturated: Annotated[float, Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")] = 1e-3
-    beam: Annotated[float, Field(ge=0, description="light of a flat over the noise of a pixel of the darks")] = 3.0
-    lost: Annotated[float, Field(gt=0, lt=1, description="light that is gone, of the brightest group of flats")] = 0.5
+    light_over_noise: Annotated[float, Field(ge=0, description="light of a flat over the noise of a dark's pixel")] = (
+        3.0
+    )
+    light_gone: Annotated[float, Field(gt=0, lt=1, description="light that is gone, of the brightest flats")] = 0.5
     uneven: Annotated[float, Field(gt=0, description="relative change of the light between flats of a group")] = 0.1
     unlit: Annotated[float, Field(gt=0, le=1, description="fraction of the frame that flats leave dark")] = 0.5
-    lit: Annotated[float, Field(gt=0, lt=1, description="level and variance of darks over those of flats")] = 0.2
+    light_in_darks: Annotated[
+        float, Field(gt=0, lt=1, description="level and variance of darks over those of flats")
+    ] = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,17 +187,17 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
         light, noise = _level(flats) - _level(darks), max(_noise(darks), LEAST_NOISE)
         said = (
             f"there is no beam in them: their level {_level(flats):.6g} is {light:.3g} above the darks' "
-            f"{_level(darks):.6g}, and a pixel has a noise of {noise:.2g} (limit {limits.beam:g} times that). Was the "
-            "shutter open for them, and closed for the darks?"
+            f"{_level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
+            "Was the shutter open for them, and closed for the darks?"
         )
-        return Fault(FaultKind.NO_BEAM, light / noise, limits.beam, said)
+        return Fault(FaultKind.NO_BEAM, light / noise, limits.light_over_noise, said)
     most = _light(bright, darks)
     gone = 1 - _light(flats, darks) / most
-    if gone <= limits.lost:
+    if gone <= limits.light_gone:
         return None
     where = spans([reference.row for reference in bright])
-    said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.lost:.0%}): the beam was lost."
-    return Fault(FaultKind.BEAM_LOST, gone, limits.lost, said)
+    said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.light_gone:.0%}): the beam was lost."
+    return Fault(FaultKind.BEAM_LOST, gone, limits.light_gone, said)
 
 
 def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> Fault | None:
@@ -202,14 +206,14 @@ def _outshone(flats: Group, darks: Group | None, views: Group, limits: Reference
     if not views or not all(frame.exposure > 0 for frame in (*flats, *views)):
         return None
     there, most = _light(flats, darks), _light(views, darks)
-    if there >= (1 - limits.lost) * most:
+    if there >= (1 - limits.light_gone) * most:
         return None
     share = there / most
     said = (
-        f"they have {share:.2%} of the light of the views (limit {1 - limits.lost:.0%}), though a sample only takes "
-        "light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
+        f"they have {share:.2%} of the light of the views (limit {1 - limits.light_gone:.0%}), though a sample only "
+        "takes light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
     )
-    return Fault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.lost, said)
+    return Fault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, said)
 
 
 def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
@@ -261,7 +265,7 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fa
     known = of_flats > 0  # else the frames have no noise, which only simulated ones have not
     variance = (noise / of_flats) ** 2 if known else level
     score = min(level, variance)
-    limit = limits.lit if known else max(limits.lit, 0.5)
+    limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)
     if known and noise < READOUT and _level(flats) - _level(darks) < FEW * noise:
         return None
     if score <= limit or _level(darks) <= 0:
@@ -275,7 +279,7 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fa
 
 
 def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
-    return _level(flats) - _level(darks) > limits.beam * max(_noise(darks), LEAST_NOISE)
+    return _level(flats) - _level(darks) > limits.light_over_noise * max(_noise(darks), LEAST_NOISE)
 
 
 def _level(group: Group) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.monitor.aside import Aside
 from beamline.monitor.check import Check, Flag, Level, ScanContext
-from beamline.monitor.checks import CHECKS, flagged_rows
+from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import digest
 from beamline.monitor.references import full_scale
 from beamline.monitor.watch import look, start
@@ -53,13 +53,13 @@ class Kind:
     """All flags of a check at one level.
 
     Attributes:
-        rows: of the frames, ascending.
+        frames: their numbers in the file, ascending.
         worst: the flag with the largest score over its limit.
     """
 
     check: str
     level: Level
-    rows: tuple[int, ...]
+    frames: tuple[int, ...]
     worst: Flag
 
 
@@ -123,18 +123,18 @@ def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
     for flag in flags:
         found.setdefault((flag.check, flag.level), []).append(flag)
     kinds = [
-        Kind(*key, tuple(sorted(rows)), max(found[key], key=_excess))
-        for key, rows in flagged_rows(chain.from_iterable(found.values())).items()
+        Kind(*key, tuple(sorted(frames)), max(found[key], key=_excess))
+        for key, frames in flagged_frames(chain.from_iterable(found.values())).items()
     ]
     levels = (Level.ALARM, Level.WARN, Level.INFO)
-    return tuple(sorted(kinds, key=lambda kind: (levels.index(kind.level), -len(kind.rows))))
+    return tuple(sorted(kinds, key=lambda kind: (levels.index(kind.level), -len(kind.frames))))
 
 
 def counts_of(kinds: Iterable[Kind]) -> Mapping[str, Mapping[str, int]]:
     """Number of frames by check, then by level."""
     counts: dict[str, dict[str, int]] = {}
     for kind in kinds:
-        counts.setdefault(kind.check, {})[str(kind.level)] = len(kind.rows)
+        counts.setdefault(kind.check, {})[str(kind.level)] = len(kind.frames)
     return counts
 
 

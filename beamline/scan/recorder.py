@@ -16,7 +16,7 @@ import numpy as np
 from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import Emit
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import flagged_rows
+from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
@@ -125,7 +125,7 @@ class Recorder:
     def flags(self) -> dict[str, dict[str, int]]:
         """Frames flagged so far: their number by check, then by level."""
         found: dict[str, dict[str, int]] = {}
-        for (check, level), rows in sorted(flagged_rows(self._found).items()):
+        for (check, level), rows in sorted(flagged_frames(self._found).items()):
             found.setdefault(check, {})[str(level)] = len(rows)
         return found
 
@@ -146,7 +146,7 @@ class Recorder:
 
     @property
     def _alarmed(self) -> set[int]:
-        return {row for flag in self._found if flag.level is Level.ALARM for row in flag.rows} - self._replaced
+        return {row for flag in self._found if flag.level is Level.ALARM for row in flag.frames} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Frames beside the timeline's come next; may be called while no frame waits."""

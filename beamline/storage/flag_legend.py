@@ -107,7 +107,7 @@ class FrameFlags:
         """[row] what the checks found in each frame of a file; a flag that holds for rows before its own marks them."""
         flags = cls.of_marks([mark_of(each) for each in found])
         for flag in chain.from_iterable(found):
-            rows = flag.rows
+            rows = flag.frames
             flags.bits[rows.start : rows.stop] |= np.uint64(bitmask([flag]))
         return flags
 

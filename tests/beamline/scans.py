@@ -111,5 +111,5 @@ def write_flagged(
             said = (
                 [Flag(CHECKS[0].name, levels[frame.index], frame.index, 1.0, 0.0, "")] if frame.index in levels else []
             )
-            writer.append(frame, digest(frame.counts), said + [flag for flag in flags if flag.view == frame.index])
+            writer.append(frame, digest(frame.counts), said + [flag for flag in flags if flag.frame == frame.index])
     return path

@@ -100,7 +100,7 @@ class Event:
 
     def latency(self, check: str) -> int | None:
         """Views from the first one that shows it to the first flag of the check; None where there is none."""
-        rows = [f.view for f in self.flags if f.check == check and self.first <= f.view <= self.last + WINDOW]
+        rows = [f.frame for f in self.flags if f.check == check and self.first <= f.frame <= self.last + WINDOW]
         return rows[0] - self.first if rows else None
 
 
@@ -147,7 +147,7 @@ def test_recall_and_latency(name: str, capsys: pytest.CaptureFixture[str]) -> No
     check = STRENGTHS[name][0]
     events = [_event(name, number) for number in range(EVENTS)]
     late = [latency for event in events if (latency := event.latency(check)) is not None]
-    early = Counter(flag.check for event in events for flag in event.flags if flag.view < event.first)
+    early = Counter(flag.check for event in events for flag in event.flags if flag.frame < event.first)
     middle, most = (f"{np.percentile(late, q):.0f}" if late else "-" for q in (50, 95))
     with capsys.disabled():
         recall, others = len(late) / EVENTS, _others(check, events)

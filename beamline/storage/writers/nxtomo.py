@@ -118,8 +118,8 @@ class NXtomoWriter:
         try:
             self._table.write(self._rows, frame.counts, digest, record)
             for flag in flags:
-                if len(flag.rows) > 1:
-                    self._table.add_flags(flag.rows, bitmask([flag]))
+                if len(flag.frames) > 1:
+                    self._table.add_flags(flag.frames, bitmask([flag]))
             self._rows += 1
             if self._rows - self._committed >= self._flush_every:
                 self.flush()

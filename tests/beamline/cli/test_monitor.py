@@ -51,12 +51,12 @@ def test_json_has_an_event_where_a_check_begins_and_all_frames_at_the_end(here: 
     result = beamline("monitor", "scan.h5", "--json", "--follow")
     assert result.exit_code == 7
     events = [json.loads(line) for line in result.stdout.splitlines()]
-    assert [(e["check"], e["view"]) for e in events if e["event"] == "flag"] == [("stuck", 8)]
+    assert [(e["check"], e["frame"]) for e in events if e["event"] == "flag"] == [("stuck", 8)]
     done = events[-1]
     assert (done["event"], done["n_frames"], done["alarmed_frames"]) == ("done", 34, 2)
     assert done["flags"] == {"stuck": {"alarm": 2}}
     (kind,) = done["kinds"]
-    assert (kind["check"], kind["level"], kind["rows"], kind["score"]) == ("stuck", "alarm", [8, 9], 2)
+    assert (kind["check"], kind["level"], kind["frames"], kind["score"]) == ("stuck", "alarm", [8, 9], 2)
 
 
 def test_bad_references_are_told_and_limits_may_be_given(here: Path) -> None:
@@ -68,12 +68,12 @@ def test_bad_references_are_told_and_limits_may_be_given(here: Path) -> None:
         "--config",
         str(config_folder() / "demo.yaml"),
         "--set",
-        "references.lit=0.9",
+        "references.light_in_darks=0.9",
         "--set",
         "monitor.dark.light=0.9",
     )
     assert "there is light" not in beamline("monitor", "lit.h5", *limits).stdout
-    assert beamline("monitor", "lit.h5", "--set", "references.lit=0.9").exit_code == 2
+    assert beamline("monitor", "lit.h5", "--set", "references.light_in_darks=0.9").exit_code == 2
 
 
 @pytest.mark.parametrize("name", ["missing.h5", "text.h5"])

@@ -158,7 +158,7 @@ EVENTS = [
     ("block_done", {"n": 9, "kind": "flat", "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
     ("frame", FRAME, None),
     ("progress", {}, None),
-    ("flag", {"check": "beam", "level": "alarm", "view": 7, "advice": "The beam is lost."}, "Alarm (beam, frame 7)"),
+    ("flag", {"check": "beam", "level": "alarm", "frame": 7, "advice": "The beam is lost."}, "Alarm (beam, frame 7)"),
     ("warning", {"message": "hot"}, "Warning: hot"),
     (
         "recon_started",

@@ -22,8 +22,8 @@ def test_the_shipped_files_have_the_defaults_of_the_checks(name: str) -> None:
 
 
 def test_limits_reach_their_check_and_no_other() -> None:
-    words = ["monitor.beam.warn=0.08", "monitor.mass={frames: 5}"]
-    changed = {"beam": Beam(warn=0.08), "mass": Mass(frames=5)}
+    words = ["monitor.beam.drift=0.08", "monitor.mass={frames: 5}"]
+    changed = {"beam": Beam(drift=0.08), "mass": Mass(frames=5)}
     expected = [changed.get(check.name, check) for check in CHECKS]
     assert list(configured_checks(load(config_folder() / "demo.yaml", words, {}).monitor)) == expected
 
@@ -31,16 +31,16 @@ def test_limits_reach_their_check_and_no_other() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("monitor.beam.warn=-0.1", r"monitor\.beam\.warn is -0\.1; expected a number >= 0"),
-        ("monitor.beam.warn=much", r"monitor\.beam\.warn is 'much'; expected a number >= 0"),
-        ("monitor.beam.warn=.nan", r"monitor\.beam\.warn is \.nan; expected a number >= 0"),
+        ("monitor.beam.drift=-0.1", r"monitor\.beam\.drift is -0\.1; expected a number >= 0"),
+        ("monitor.beam.drift=much", r"monitor\.beam\.drift is 'much'; expected a number >= 0"),
+        ("monitor.beam.drift=.nan", r"monitor\.beam\.drift is \.nan; expected a number >= 0"),
         ("monitor.mass.frames=2.5", r"monitor\.mass\.frames is 2\.5; expected a whole number >= 1"),
         (
-            "monitor.beam.wran=0.1",
-            r"is not a known key \(did you mean warn\?\); legal keys there: warn, alarm",
+            "monitor.beam.drfit=0.1",
+            r"is not a known key \(did you mean drift\?\); legal keys there: drift, dip",
         ),
         (
-            "monitor.bean={warn: 0.1}",
+            "monitor.bean={drift: 0.1}",
             r"monitor\.bean is not .*beam.*legal keys there: act_after, retake, retake_share, policy",
         ),
         ("monitor.timing=0.3", r"monitor\.timing is 0\.3; expected a group of keys: warn"),
@@ -70,9 +70,9 @@ def test_files_of_earlier_versions_are_read_or_refused_with_the_new_key(tmp_path
         ConfigError, match=r"monitor: on_alarm is not a key any longer; write policy: \{<check>: stop\}"
     ):
         load(path, (), {})
-    path.write_text(f"{text}monitor:\n  thresholds: {{beam: {{warn: 0.08}}}}\n", encoding="utf-8")
+    path.write_text(f"{text}monitor:\n  thresholds: {{gain: {{warn: 0.08}}}}\n", encoding="utf-8")
     line = text.count("\n") + 1
-    with pytest.raises(ConfigError, match=rf"old\.yaml:{line}: monitor: .* write monitor\.beam\.warn instead of"):
+    with pytest.raises(ConfigError, match=rf"old\.yaml:{line}: monitor: .* write monitor\.gain\.warn instead of"):
         load(path, (), {})
 
 

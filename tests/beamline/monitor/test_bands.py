@@ -24,7 +24,7 @@ def test_black_rows_are_flagged_with_their_place(fake: Any, n: int, loss: float)
     frames = fake.references() + fake.views(10)
     black(frames[18], 20, n)
     flags = only(fake.flags(frames))
-    assert [(f.view, f.level) for f in flags] == [(18, Level.ALARM)]
+    assert [(f.frame, f.level) for f in flags] == [(18, Level.ALARM)]
     assert flags[0].score == pytest.approx(loss, abs=0.02)
     assert flags[0].region == (20, 20 + max(n, 4), 0, 96)
 
@@ -34,13 +34,13 @@ def test_a_band_that_covers_its_outer_blocks_by_a_part_is_one(fake: Any, first: 
     frames = fake.references() + fake.views(20)
     for view in frames[20:25]:
         black(view, first, 8)
-    assert [f.view for f in only(fake.flags(frames))] == list(range(20, 25))
+    assert [f.frame for f in only(fake.flags(frames))] == list(range(20, 25))
 
 
 def test_a_band_in_a_flat(fake: Any) -> None:
     frames = fake.darks() + fake.flats(8)
     black(frames[11], 0, 4)
-    assert [f.view for f in only(fake.flags(frames))] == [11]
+    assert [f.frame for f in only(fake.flags(frames))] == [11]
 
 
 def test_a_band_that_stays_is_flagged_until_it_is_old_news(fake: Any) -> None:
@@ -48,7 +48,7 @@ def test_a_band_that_stays_is_flagged_until_it_is_old_news(fake: Any) -> None:
     for view in frames[20:]:
         black(view, 8, 4)
     flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == list(range(20, 40))
+    assert [f.frame for f in flags] == list(range(20, 40))
 
 
 def test_a_dimming_beam_is_no_band(fake: Any) -> None:
@@ -64,7 +64,7 @@ def test_a_sample_with_an_upper_and_a_lower_edge_is_no_band(fake: Any, band: boo
         view.counts[32:] = 200 + (view.counts[32:].clip(200) - 200) // 5
     if band:
         black(frames[25], 40, 4)
-    assert [f.view for f in only(fake.flags(frames))] == [25] * band
+    assert [f.frame for f in only(fake.flags(frames))] == [25] * band
 
 
 def test_a_sample_seen_from_the_other_side_is_no_band(fake: Any) -> None:
@@ -80,7 +80,7 @@ def test_black_columns_are_flagged_as_long_as_they_last_with_their_place(fake: A
     for view in frames[25:32]:
         view.counts[:, first : first + 2] = 200
     flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == list(range(25, 32))
+    assert [f.frame for f in flags] == list(range(25, 32))
     assert all(f.region is not None and f.region[2] <= first < f.region[3] <= first + 8 for f in flags)
     assert "columns" in flags[0].advice
 
@@ -89,7 +89,7 @@ def test_a_bright_band_is_one_too(fake: Any) -> None:
     frames = fake.references() + fake.views(20)
     frames[25].counts[12:16] *= 2
     flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == [25]
+    assert [f.frame for f in flags] == [25]
     assert flags[0].score < 0
 
 

@@ -29,8 +29,8 @@ def drifting(light: Any, views: int = 120, **more: Any) -> list[Flag]:
 def test_a_drift_against_the_flats_is_said_once_when_it_reaches_the_limit(rate: float) -> None:
     flags = drifting(lambda view: 1 + rate * view)
     assert [(f.level, f.limit) for f in flags] == [(Level.WARN, 0.02)]
-    assert flags[0].view - 10 == pytest.approx(0.02 / abs(rate), abs=10)
-    assert flags[0].score == pytest.approx(-rate * (flags[0].view - 10), abs=0.003)
+    assert flags[0].frame - 10 == pytest.approx(0.02 / abs(rate), abs=10)
+    assert flags[0].score == pytest.approx(-rate * (flags[0].frame - 10), abs=0.003)
     assert f"{'less' if rate < 0 else 'more'} light than in the flats" in flags[0].advice
 
 
@@ -50,19 +50,19 @@ def test_a_percent_is_no_finding() -> None:
 
 def test_a_dip_is_an_alarm_in_each_of_its_views_and_not_after_it() -> None:
     flags = drifting(lambda view: 0.8 if 40 <= view < 47 else 1.0)
-    assert [(f.view - 10, f.level) for f in flags] == [(view, Level.ALARM) for view in range(40, 47)]
+    assert [(f.frame - 10, f.level) for f in flags] == [(view, Level.ALARM) for view in range(40, 47)]
     assert flags[0].score == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_dip_that_stays_becomes_normal() -> None:
     flags = drifting(lambda view: 1.0 if view < 40 else 0.8)
-    assert [f.view - 10 for f in flags if f.level is Level.ALARM] == list(range(40, 40 + PATIENCE))
-    assert [f.level for f in flags if f.view > 50 + PATIENCE] in ([], [Level.INFO])
+    assert [f.frame - 10 for f in flags if f.level is Level.ALARM] == list(range(40, 40 + PATIENCE))
+    assert [f.level for f in flags if f.frame > 50 + PATIENCE] in ([], [Level.INFO])
 
 
 def test_a_sample_that_covers_all_is_said_once_and_dips_are_still_seen() -> None:
     flags = drifting(lambda view: 1.0 if view < 60 else 0.8, 70, depth=lambda view, image: image + 0.5)
-    assert [(f.level, f.view - 10) for f in flags] == [(Level.INFO, 0)] + [(Level.ALARM, i) for i in range(60, 70)]
+    assert [(f.level, f.frame - 10) for f in flags] == [(Level.INFO, 0)] + [(Level.ALARM, i) for i in range(60, 70)]
     assert "covers all of it" in flags[0].advice
 
 
@@ -75,18 +75,18 @@ def test_a_sample_that_covers_the_edges_does_not_hide_air_above_it() -> None:
 
 def test_flats_are_compared_with_the_flats_before(fake: Any) -> None:
     flags = only(fake.flags(fake.references() + fake.views(10) + fake.flats(2, light=0.9)))
-    assert [f.view for f in flags] == [20]  # the second of the new group is like the first
+    assert [f.frame for f in flags] == [20]  # the second of the new group is like the first
     assert flags[0].score == pytest.approx(0.1, abs=0.01)
 
 
 def test_without_flats_dips_are_seen(fake: Any) -> None:
     flags = only(fake.flags(fake.darks() + fake.views(20) + fake.views(1, first=20, light=0.8)))
-    assert [f.view for f in flags] == [25]
+    assert [f.frame for f in flags] == [25]
 
 
 def test_limits_can_be_set() -> None:
     scan = Blobs(80, counts=lambda view, light: light * (1 - 5e-4 * view))
-    assert scan.flags([Beam(warn=0.08)]) == []
+    assert scan.flags([Beam(drift=0.08)]) == []
 
 
 def told(gains: Iterable[float], light: Iterable[float]) -> list[int]:

@@ -80,21 +80,21 @@ def blurred(first: int, last: int, sigma: float | tuple[float, float]) -> Change
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0])
 def test_views_out_of_focus_are_flagged_and_no_others(sigma: float) -> None:
     flags = scan(blurred(40, 45, sigma))
-    assert [flag.view for flag in flags] == [46, 47, 48, 49, 50]
+    assert [flag.frame for flag in flags] == [46, 47, 48, 49, 50]
     assert all(flag.level is Level.WARN and "focus" in flag.advice for flag in flags)
 
 
 @pytest.mark.parametrize(("sigma", "named"), [((0.0, 1.5), "along the rows"), ((1.5, 0.0), "along the columns")])
 def test_motion_during_an_exposure_has_a_direction(sigma: tuple[float, float], named: str) -> None:
     flags = scan(blurred(40, 41, sigma))
-    assert [flag.view for flag in flags] == [46]
+    assert [flag.frame for flag in flags] == [46]
     assert named in flags[0].advice
 
 
 def test_a_slow_loss_of_focus_is_said_once_as_a_fact() -> None:
     flags = scan(lambda view, light: gaussian_filter(light, max(view - 20, 0) / 60), 150)
     facts = [flag for flag in flags if flag.level is Level.INFO]
-    assert len(facts) == 1 and "drifts" in facts[0].advice and facts[0].view > 26
+    assert len(facts) == 1 and "drifts" in facts[0].advice and facts[0].frame > 26
 
 
 def test_a_sharp_scan_with_many_or_few_photons_raises_no_flag() -> None:

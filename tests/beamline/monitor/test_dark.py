@@ -20,14 +20,14 @@ def only(flags: list[Flag]) -> list[Flag]:
 
 def test_an_open_shutter_shows_at_the_first_flat(fake: Any) -> None:
     flags = only(fake.flags(fake.darks(light=1.0) + fake.flats()))
-    assert [(f.view, f.level) for f in flags] == [(5, Level.ALARM)]
+    assert [(f.frame, f.level) for f in flags] == [(5, Level.ALARM)]
     assert flags[0].score == pytest.approx(1.0, abs=0.01)
     assert "shutter" in flags[0].advice
 
 
 def test_an_open_shutter_shows_in_darks_at_the_end(fake: Any) -> None:
     flags = only(fake.flags(fake.flats() + fake.views(3) + fake.darks(2, light=0.9)))
-    assert [f.view for f in flags] == [8, 9]
+    assert [f.frame for f in flags] == [8, 9]
 
 
 @pytest.mark.parametrize(("drift", "found"), [(4, 0), (-4, 0), (6, 2), (-20, 2)])
@@ -71,7 +71,7 @@ def test_light_on_a_part_of_the_dark_is_still_seen(rng: np.random.Generator, pre
     frames = small_darks(6, rng)
     frames[4].counts[:, :16] += 40  # a third of the frame
     (flag,) = flags_of(frames, preview_bin)
-    assert (flag.view, flag.level) == (4, Level.WARN)
+    assert (flag.frame, flag.level) == (4, Level.WARN)
     assert 5 < flag.score < 40 / 3
 
 

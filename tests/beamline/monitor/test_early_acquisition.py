@@ -47,15 +47,15 @@ def test_each_fault_is_found_by_its_own_check(
 ) -> None:
     flags, labels = found
     shown = labels[label]
-    marked = sorted({flag.view for flag in flags if flag.check == check and flag.view in shown})
+    marked = sorted({flag.frame for flag in flags if flag.check == check and flag.frame in shown})
     assert marked and marked[0] - shown[0] <= latency
 
 
 def test_nothing_else_is_flagged_but_a_few_hot_pixels(found: tuple[list[Flag], dict[str, list[int]]]) -> None:
     flags, labels = found
     assert {flag.check for flag in flags} <= {"floater", "ghost", "lost", "motion", "field", "opposite"}
-    lost = {flag.view for flag in flags if flag.check == "lost"}
+    lost = {flag.frame for flag in flags if flag.check == "lost"}
     assert lost == set(labels["lost_beam 0"])
     crumbs = set(labels["floaters 0"] + labels["floaters 1"])
-    late = {row for flag in flags if flag.check == "floater" for row in flag.rows} - crumbs
+    late = {row for flag in flags if flag.check == "floater" for row in flag.frames} - crumbs
     assert len(late) <= 4  # a view is judged when three later ones are there

@@ -32,7 +32,7 @@ def test_a_shadow_in_the_flats_is_said_once_with_its_place(fake: Any, shadow: An
     light[shadow] = 0
     flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
     (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfView()])
-    assert (flag.level, flag.view, flag.region) == (Level.WARN, flats[0].index, region)
+    assert (flag.level, flag.frame, flag.region) == (Level.WARN, flats[0].index, region)
     assert flag.score == pytest.approx(light[light == 0].size / light.size)
     assert named in flag.advice
 

@@ -36,22 +36,22 @@ def test_a_sample_that_turns_has_none() -> None:
 def test_a_faint_crumb_that_crosses_is_found_within_ten_views_and_where_it_is(speed: float) -> None:
     flags = only(Blobs(90, depth=crossing(speed)))
     assert flags
-    first = flags[0].view - 10
+    first = flags[0].frame - 10
     assert first - BEGINS <= 10 + 2 / speed
     for flag in flags[:5]:
         assert flag.level is Level.WARN and flag.score > flag.limit
-        assert flag.first is not None and 10 + BEGINS - 6 <= flag.first < flag.view
+        assert flag.first is not None and 10 + BEGINS - 6 <= flag.first < flag.frame
         assert flag.region is not None
         top, below, left, right = flag.region
         assert top <= 12.5 * BLOCK < below
-        judged = flag.view - 10 - 4  # the view that four later ones have confirmed
+        judged = flag.frame - 10 - 4  # the view that four later ones have confirmed
         assert left <= (speed * (judged - BEGINS) + 0.5) * BLOCK <= right
     assert "floating particle" in flags[0].advice
 
 
 def test_it_is_flagged_in_most_of_the_views_that_show_it() -> None:
     flags = only(Blobs(120, depth=crossing(2.0)))
-    marked = {row for flag in flags for row in range(flag.first or flag.view, flag.view + 1)}
+    marked = {row for flag in flags for row in range(flag.first or flag.frame, flag.frame + 1)}
     shown = range(10 + BEGINS + 2, 10 + BEGINS + COLS // 2)
     assert len(marked.intersection(shown)) > 0.9 * len(shown)
 

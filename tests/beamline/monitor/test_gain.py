@@ -17,13 +17,13 @@ def only(scan: Blobs) -> list[Flag]:
 @pytest.mark.parametrize(("share", "level"), [(0.02, Level.WARN), (-0.02, Level.WARN), (0.3, Level.ALARM)])
 def test_a_step_is_flagged_once_with_its_size(share: float, level: Level) -> None:
     flags = only(Blobs(60, counts=lambda view, light: light * (1 + share * (view >= 30))))
-    assert [(flag.view, flag.level) for flag in flags] == [(40, level)]
+    assert [(flag.frame, flag.level) for flag in flags] == [(40, level)]
     assert flags[0].score == pytest.approx(share, rel=0.05)
 
 
 def test_a_single_dim_view_is_two_steps() -> None:
     flags = only(Blobs(60, counts=lambda view, light: light * (1 - 0.05 * (view == 30))))
-    assert [(flag.view, round(flag.score, 2)) for flag in flags] == [(40, -0.05), (41, 0.05)]
+    assert [(flag.frame, round(flag.score, 2)) for flag in flags] == [(40, -0.05), (41, 0.05)]
 
 
 def test_drift_top_up_and_half_a_percent_are_no_step() -> None:

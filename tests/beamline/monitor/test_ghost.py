@@ -38,7 +38,7 @@ def test_a_sample_that_turns_has_none() -> None:
 def test_faint_fog_is_found_within_ten_views(gain: float, speed: float) -> None:
     flags = only(Blobs(100, counts=fog(gain, speed)))
     assert flags
-    assert flags[0].view - 10 - BEGINS <= 10
+    assert flags[0].frame - 10 - BEGINS <= 10
     assert flags[0].level is Level.WARN
     assert flags[0].score == pytest.approx(abs(gain), rel=0.6)
     assert flags[0].region is not None and flags[0].region[:2] == (0, 32 * BLOCK)

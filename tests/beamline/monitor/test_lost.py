@@ -17,7 +17,7 @@ def only(scan: Blobs) -> list[Flag]:
 @pytest.mark.parametrize("left", [0.0, 0.02, 0.4])
 def test_every_view_without_light_is_flagged_and_none_after(left: float) -> None:
     flags = only(Blobs(40, counts=lambda view, light: light * (left if 20 <= view < 33 else 1.0)))
-    assert [flag.view for flag in flags] == list(range(30, 43))
+    assert [flag.frame for flag in flags] == list(range(30, 43))
     assert all(flag.level is Level.ALARM for flag in flags)
     assert flags[0].score == pytest.approx(1 - left, abs=0.05)
 

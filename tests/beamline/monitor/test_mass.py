@@ -26,7 +26,7 @@ def test_a_floater_is_flagged_from_its_third_view_with_its_mass(fake: Any) -> No
     with_floater = (*SAMPLE, floater)
     frames = fake.references() + fake.views(20) + fake.views(6, first=20, discs=with_floater)
     flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == [32, 33, 34, 35]
+    assert [f.frame for f in flags] == [32, 33, 34, 35]
     assert flags[0].level is Level.WARN
     assert flags[0].score == pytest.approx(total([floater]) / total(SAMPLE), rel=0.15)
     assert "entered" in flags[0].advice
@@ -35,7 +35,7 @@ def test_a_floater_is_flagged_from_its_third_view_with_its_mass(fake: Any) -> No
 def test_a_sample_that_falls_off_its_holder(fake: Any) -> None:
     frames = fake.references() + fake.views(20) + fake.views(4, first=20, discs=())
     flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == [32, 33]
+    assert [f.frame for f in flags] == [32, 33]
     assert flags[0].score == pytest.approx(-1, abs=0.05)
     assert "left" in flags[0].advice
 

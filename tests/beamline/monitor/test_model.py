@@ -33,7 +33,7 @@ def test_a_view_like_its_render_raises_no_flag() -> None:
 def test_what_is_in_some_views_only_is_flagged_with_its_place() -> None:
     there = blob(20, 50, 1.5, 0.1)
     found = flags(Blobs(60, depth=lambda view, image: image + there * (40 <= view < 43)))
-    assert [flag.view for flag in found] == [50, 51, 52]
+    assert [flag.frame for flag in found] == [50, 51, 52]
     for flag in found:
         assert flag.level is Level.WARN and flag.score > 0 and flag.region is not None
         top, below, first, last = flag.region
@@ -43,7 +43,7 @@ def test_what_is_in_some_views_only_is_flagged_with_its_place() -> None:
 def test_less_absorption_is_said_as_such() -> None:
     gone = blob(20, 64, 1.5, 0.08)
     found = flags(Blobs(50, depth=lambda view, image: image - gone * (view == 30)))
-    assert [flag.view for flag in found] == [40]
+    assert [flag.frame for flag in found] == [40]
     assert found[0].score < 0 and "absorb less" in found[0].advice
 
 

@@ -27,7 +27,7 @@ def jumping(down: float, across: float, slip: int = 0) -> Blobs:
 @pytest.mark.parametrize(("down", "across"), [(1.0, 0.0), (0.0, -1.0), (-3.0, 2.0)])
 def test_a_jump_is_flagged_once_with_its_size(down: float, across: float) -> None:
     flags = only(jumping(down, across))
-    assert [(flag.view, flag.level) for flag in flags] == [(50, Level.ALARM)]
+    assert [(flag.frame, flag.level) for flag in flags] == [(50, Level.ALARM)]
     assert flags[0].score == pytest.approx(np.hypot(down, across), rel=0.15)
     signs = re.search(r"by ([+-]).* px across and ([+-]).* px down", flags[0].advice)
     assert signs is not None
@@ -37,7 +37,7 @@ def test_a_jump_is_flagged_once_with_its_size(down: float, across: float) -> Non
 
 def test_a_slip_of_the_stage_is_counted_in_steps() -> None:
     flags = only(jumping(0, 0, slip=5))
-    assert [flag.view for flag in flags] == [50]
+    assert [flag.frame for flag in flags] == [50]
     assert flags[0].score == pytest.approx(5, abs=0.7)
     assert "steps more than its step" in flags[0].advice
 

@@ -44,13 +44,13 @@ def test_the_axis_of_a_sample_that_only_turns_is_found_and_said_where_it_is_stat
     assert only(scan) == []
     assert only(Moved(100, lambda view: (0, axis)), axis_col=MIDDLE + axis + 0.5) == []
     (flag,) = only(Moved(100, lambda view: (0, axis)), axis_col=MIDDLE + axis - 5)
-    assert (flag.level, flag.view) == (Level.INFO, 10 + 90)
+    assert (flag.level, flag.frame) == (Level.INFO, 10 + 90)
     assert flag.score == pytest.approx(5, abs=0.1)
 
 
 def test_a_sample_that_sank_is_flagged_by_its_view_from_the_other_side() -> None:
     flags = only(Moved(96, lambda view: (1.2 * (view > 50), 0)))
-    assert [flag.view for flag in flags] == [100, 103]  # 5 degrees are between the views that are kept
+    assert [flag.frame for flag in flags] == [100, 103]  # 5 degrees are between the views that are kept
     assert all(flag.level is Level.WARN for flag in flags)
     assert [flag.score for flag in flags] == pytest.approx([1.2, 1.2], abs=0.15)
     assert "px down" in flags[0].advice
@@ -58,20 +58,20 @@ def test_a_sample_that_sank_is_flagged_by_its_view_from_the_other_side() -> None
 
 def test_a_shift_across_shows_between_two_pairs() -> None:
     flags = only(Moved(110, lambda view: (0, 2.0 * (view >= 100))))
-    assert flags and flags[0].view == 10 + 102
+    assert flags and flags[0].frame == 10 + 102
     assert flags[0].score == pytest.approx(2, abs=0.2)
 
 
 def test_a_sample_that_shrank_is_flagged() -> None:
     flags = only(Moved(96, size=lambda view: 1 - 0.03 * (view > 50)))
-    assert {flag.view for flag in flags} == {100, 103}
+    assert {flag.frame for flag in flags} == {100, 103}
     assert "shrank" in flags[0].advice
 
 
 def test_a_view_taken_again_shows_a_shift() -> None:
     scan = Moved(190, lambda view: (0, 1.5 * (view > 150)))
-    flags = [flag for flag in only(scan) if flag.view >= 190]
-    assert flags and "taken again" in flags[0].advice and flags[0].view == 10 + 180
+    flags = [flag for flag in only(scan) if flag.frame >= 190]
+    assert flags and "taken again" in flags[0].advice and flags[0].frame == 10 + 180
     assert flags[0].score == pytest.approx(1.5, abs=0.2)
 
 
@@ -81,4 +81,4 @@ def test_a_steady_scan_of_a_turn_and_more_raises_no_flag() -> None:
 
 def test_in_a_cone_it_stands_aside_and_says_so_once() -> None:
     (flag,) = only(Moved(100), cone=True)
-    assert (flag.level, flag.view) == (Level.INFO, 10) and "cone" in flag.advice
+    assert (flag.level, flag.frame) == (Level.INFO, 10) and "cone" in flag.advice

@@ -28,7 +28,7 @@ def scan(fake: Any, dead: list[tuple[int, int]], flats: int = 5) -> list[Frame]:
 @pytest.mark.parametrize("flats", [1, 5])
 def test_a_few_dead_pixels_are_a_fact_that_is_said_once_with_their_places(fake: Any, flats: int) -> None:
     (flag,) = only(fake, scan(fake, [(0, 0), (33, 95)], flats))
-    assert (flag.level, flag.view, flag.region) == (Level.INFO, 5 + flats, (0, 34, 0, 96))
+    assert (flag.level, flag.frame, flag.region) == (Level.INFO, 5 + flats, (0, 34, 0, 96))
     assert flag.score == pytest.approx(2 / (64 * 96))
     assert "some: 2, at (row, column) (0, 0), (33, 95)." in flag.advice
 
@@ -56,7 +56,7 @@ def test_views_with_pixels_that_hold_no_number_are_flagged_unless_the_darks_have
     frames = fake.references() + fake.views(6)
     frames[12] = with_hole(frames[12], np.nan, slice(None))
     frames[14] = with_hole(frames[14], np.inf, slice(3, 4))
-    assert [(f.view, f.level, f.score) for f in only(fake, frames)] == [
+    assert [(f.frame, f.level, f.score) for f in only(fake, frames)] == [
         (12, Level.ALARM, 1.0),
         (14, Level.WARN, pytest.approx(1 / 96)),
     ]

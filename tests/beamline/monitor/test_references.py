@@ -150,7 +150,8 @@ def test_a_group_that_lost_the_beam_is_judged_by_the_others() -> None:
 def test_limits_are_what_they_say() -> None:
     flickers = flats(flickering(frames(5, PHOTONS, 2)))
     assert faults(judge([darks(), flickers], ReferenceLimits(uneven=0.3))) == [[], []]
-    assert faults(judge([darks(0.25 * PHOTONS), flats(frames(5, PHOTONS, 2))], ReferenceLimits(lit=0.5))) == [[], []]
+    lit = [darks(0.25 * PHOTONS), flats(frames(5, PHOTONS, 2))]
+    assert faults(judge(lit, ReferenceLimits(light_in_darks=0.5))) == [[], []]
 
 
 @given(st.integers(0, 65535))

@@ -19,7 +19,7 @@ def test_a_repeated_buffer_is_flagged_each_time_and_counted(fake: Any) -> None:
     frames[13] = replace(frames[13], counts=frames[12].counts.copy())
     frames[14] = replace(frames[14], counts=frames[12].counts.copy())
     flags = only(fake.flags(frames))
-    assert [(f.view, f.score, f.level) for f in flags] == [(13, 1, Level.ALARM), (14, 2, Level.ALARM)]
+    assert [(f.frame, f.score, f.level) for f in flags] == [(13, 1, Level.ALARM), (14, 2, Level.ALARM)]
     assert "repeats a buffer" in flags[0].advice
 
 
@@ -38,4 +38,4 @@ def test_darks_without_noise_are_all_equal_and_say_nothing(fake: Any) -> None:
 def test_views_of_a_single_value_are_stuck_all_the_same(fake: Any) -> None:
     references = fake.references()
     views = [replace(frame, counts=np.full_like(frame.counts, 5000)) for frame in fake.views(4)]
-    assert [(f.view, f.score) for f in only(fake.flags(references + views))] == [(11, 1), (12, 2), (13, 3)]
+    assert [(f.frame, f.score) for f in only(fake.flags(references + views))] == [(11, 1), (12, 2), (13, 3)]

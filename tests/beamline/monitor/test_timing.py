@@ -23,7 +23,7 @@ def test_a_frame_off_its_time(fake: Any, shift: float, views: list[int]) -> None
     frames = fake.views(8)
     frames[4] = replace(frames[4], time=frames[4].time + shift * PERIOD)
     flags = only(fake.flags(frames))
-    assert [f.view for f in flags] == views
+    assert [f.frame for f in flags] == views
     if flags:
         assert flags[0].score == pytest.approx(shift)
         assert flags[0].level is Level.WARN
@@ -33,7 +33,7 @@ def test_a_missing_trigger_is_an_alarm_on_the_frame_after_it(fake: Any) -> None:
     frames = fake.views(8)
     del frames[3:5]
     flags = only(fake.flags(frames))
-    assert [(f.view, f.score, f.level) for f in flags] == [(5, 2, Level.ALARM)]
+    assert [(f.frame, f.score, f.level) for f in flags] == [(5, 2, Level.ALARM)]
 
 
 def test_a_step_scan_has_no_rhythm(fake: Any) -> None:

@@ -39,7 +39,7 @@ def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(fake: Any
     assert fake.flags(clean) == []
     dimmed = fake.darks() + flats() + fake.views(20) + fake.views(2, first=20, light=0.93) + flats()
     found = fake.flags(dimmed)
-    assert [(flag.check, flag.view) for flag in found] == [("gain", len(clean) + 30)]
+    assert [(flag.check, flag.frame) for flag in found] == [("gain", len(clean) + 30)]
     assert found[0].score == pytest.approx(-0.07, abs=0.01)
 
 
@@ -79,7 +79,7 @@ class Early:
 
 def test_a_finding_reaches_back_to_the_first_of_the_frames_of_its_kind(fake: Any) -> None:
     flags = fake.flags(fake.references() + fake.views(5) + fake.flats(1), checks=[Early()])
-    assert [list(flag.rows) for flag in flags[10:]] == [
+    assert [list(flag.frames) for flag in flags[10:]] == [
         [10], [10, 11], [10, 11, 12], [10, 11, 12, 13], [11, 12, 13, 14], [15],
     ]  # fmt: skip
 

@@ -66,7 +66,7 @@ def test_they_are_said_once_and_warned_of_where_there_are_many_and_never_saturat
     frames = fake.references() + fake.views(VIEWS + 3)
     struck(frames[-2], 30, 60_000, rng)
     flags = only(fake, frames)
-    assert [(flag.check, flag.level, flag.view) for flag in flags] == [("zingers", Level.WARN, len(frames) - 2)]
+    assert [(flag.check, flag.level, flag.frame) for flag in flags] == [("zingers", Level.WARN, len(frames) - 2)]
     assert flags[0].score == pytest.approx(30 / (64 * 96)) and limit < 1
 
 
@@ -75,5 +75,5 @@ def test_a_few_are_a_fact(fake: Any, rng: np.random.Generator) -> None:
     struck(frames[14], 2, 20_000, rng)
     struck(frames[19], 3, 20_000, rng)
     flags = fake.flags(frames, checks=[Zingers(warn=1.0)])
-    assert [(flag.level, flag.view) for flag in flags] == [(Level.INFO, 9 + VIEWS)]
+    assert [(flag.level, flag.frame) for flag in flags] == [(Level.INFO, 9 + VIEWS)]
     assert flags[0].score == pytest.approx(5 / VIEWS / (64 * 96)) and "have 5 bright spots" in flags[0].advice

@@ -27,7 +27,7 @@ def flag(view: int, region: tuple[int, int, int, int] | None, level: Level = Lev
 
 
 def found(*flags: Flag, frames: int = 12) -> FrameFlags:
-    return FrameFlags.of_flags([[f for f in flags if f.view == row] for row in range(frames)])
+    return FrameFlags.of_flags([[f for f in flags if f.frame == row] for row in range(frames)])
 
 
 def test_a_region_and_its_margin_weigh_less_of_an_alarm_nothing() -> None:

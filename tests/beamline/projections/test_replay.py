@@ -127,10 +127,10 @@ def test_flags_are_gathered_by_check_and_level() -> None:
         + [flag("a", Level.ALARM, 9, 4.0)]
         + [flag("c", Level.INFO, 1, 4.0)]
     )
-    assert [(kind.check, kind.level, kind.rows) for kind in found] == [
+    assert [(kind.check, kind.level, kind.frames) for kind in found] == [
         ("a", Level.ALARM, (9,)), ("a", Level.WARN, (0, 1, 2, 3, 4)), ("b", Level.WARN, (7,)), ("c", Level.INFO, (1,)),
     ]  # fmt: skip
-    assert found[1].worst.view == 4
+    assert found[1].worst.frame == 4
     assert counts_of(found) == {"a": {"alarm": 1, "warn": 5}, "b": {"warn": 1}, "c": {"info": 1}}
 
 

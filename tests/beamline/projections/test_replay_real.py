@@ -81,7 +81,7 @@ def band(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
 def test_what_is_put_into_a_real_scan_is_found(shared_data: Path, share: Share, check: str) -> None:
     found = [flag for flag in flags(shared_data / DIAMOND, share) if flag.level is not Level.INFO]
     assert check in {flag.check for flag in found}
-    assert all(42 <= flag.view <= 42 + 35 for flag in found)
+    assert all(42 <= flag.frame <= 42 + 35 for flag in found)
 
 
 def speck(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
@@ -97,7 +97,7 @@ def test_a_view_that_the_volume_does_not_explain_is_flagged_with_its_place(share
         changed = Changed(source, speck)
         for scan, expected in ((source, []), (changed, [52, 53, 54])):
             found = [flag for judged in replay(scan, [Model()], model=model) for flag in judged.flags]  # type: ignore[arg-type]
-            assert [flag.view for flag in found] == expected
+            assert [flag.frame for flag in found] == expected
         for flag in found:
             assert flag.region is not None
             top, below, first, last = flag.region

@@ -56,7 +56,7 @@ def test_the_operator_may_want_the_scan_all_the_same(tmp_path: Path, monkeypatch
 
 def test_a_limit_of_the_configuration_is_the_one_that_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(fakes.LEVEL, False, 15000)
-    ran = Ran(tmp_path, FakeInstrument(), "references.lit=0.9")
+    ran = Ran(tmp_path, FakeInstrument(), "references.light_in_darks=0.9")
     assert ran.error is None and ran.of("warning") == []
 
 
@@ -107,9 +107,11 @@ def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> Non
 def test_limits_are_typed_and_have_the_defaults_of_the_judge() -> None:
     path = config_folder() / "demo.yaml"
     assert reference_limits(load(path, (), {}).references) == ReferenceLimits()
-    assert reference_limits(load(path, ["references.lit=0.5"], {}).references) == ReferenceLimits(lit=0.5)
+    assert reference_limits(load(path, ["references.light_in_darks=0.5"], {}).references) == ReferenceLimits(
+        light_in_darks=0.5
+    )
     for word, message in (
-        ("references.lit=2", r"references\.lit is 2; expected a number > 0 and < 1"),
+        ("references.light_in_darks=2", r"references\.light_in_darks is 2; expected a number > 0 and < 1"),
         ("references.on_fault=go", r"references\.on_fault is 'go'.*expected stop \| log"),
     ):
         with pytest.raises(ConfigError, match=message):

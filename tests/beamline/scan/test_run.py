@@ -249,7 +249,7 @@ def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
     assert ran.folder is not None
     assert ran.result.flags == {"stuck": {"alarm": 3}}
     assert ran.result.alarmed_frames == ran.of("scan_done")[0].data["alarmed_frames"] == 3
-    assert [(e.data["check"], e.data["view"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
+    assert [(e.data["check"], e.data["frame"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
     with h5py.File(ran.folder / "scan.h5") as file:
         flags = file["entry/frame_log/flags"][()]
     assert np.flatnonzero(flags).tolist() == [9, 10, 11]
