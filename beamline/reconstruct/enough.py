@@ -3,15 +3,48 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.projections.selection import Selection, cone_of, geometry_of
+from beamline.storage.readers.base import ScanSource
+from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
+from recon.base.views import parse_views
 from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
 
 GROWTH = 1.25  # of the views from look to look
 _FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
+
+
+class NotPlannedError(Exception):
+    """What the views to come are is not known; its text says why."""
+
+
+def planned_views(
+    source: ScanSource, selection: Selection, axis_col: float | None, taken: Sequence[NDArray[np.int64]]
+) -> Geometry:
+    """Geometry of the views so far and of those that the plan still holds.
+
+    Args:
+        taken: frames of the views so far, in batches.
+
+    Raises:
+        NotPlannedError: the beam is a cone, or the file says no plan.
+    """
+    if cone_of(source, selection) is not None:
+        raise NotPlannedError("its beam is a cone")
+    angles = source.plan.get("angles_deg")
+    if angles is None or axis_col is None:
+        raise NotPlannedError("its file does not say which views are planned")
+    places = parse_views(selection.views, np.zeros(len(angles)))
+    last = max(int(ids[-1]) for ids in taken)
+    n_taken = int(np.isin(source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
+    to_come = np.radians(np.asarray(angles, np.float64)[places[places >= n_taken]])
+    so_far = [source.angles[ids] for ids in taken]
+    return geometry_of(source, selection, axis_col, np.concatenate([*so_far, to_come]))
 
 
 class EnoughViews:

@@ -80,7 +80,7 @@ def follow(
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = ReportContext(facts, options.selection, options.command, options.seed, warn.messages, started)
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
-    growing.remove_snapshot()
+    growing.snapshots.remove()
     return metrics
 
 

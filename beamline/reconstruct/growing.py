@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.files import named_on_failure, whole_file
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
@@ -24,30 +20,24 @@ from beamline.projections.prepare import (
     assemble,
     checked_views,
     correction_blockers,
-    locate_axis,
     refuse,
-    stated_axis,
 )
-from beamline.projections.selection import check_axis, cone_of, geometry_of
-from beamline.reconstruct.enough import EnoughViews
+from beamline.projections.selection import check_axis, geometry_of
+from beamline.reconstruct.axis_search import AxisSearch
+from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import ReconOutcome
-from beamline.report.live_picture import LivePicture
+from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.clock import Clock
 from drivers.frame import FrameKind
-from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Progress, ReconProblem
 from recon.base.views import parse_views
-from recon.base.volume import Volume
-from recon.prep.align import AxisEstimate
-from recon.prep.correct import Projections, concatenated
+from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
 from recon.splatting.stream import StreamingFit
 
-_FIRST_AXIS_VIEWS = 12  # fewer do not tell an axis
 _BATCH = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
 _AXIS_MOVES = 0.3  # px by which a better axis makes the fit begin anew
@@ -57,24 +47,24 @@ class ScanFollower:
     """A scan's file and the volume that grows with it. Who follows it says when to look, to fit and to finish."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
-        given = options.selection.axis_col
-        self.source, self.axis_col = source, source.axis_col if given is None else given
+        self.source = source
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
-        self.axis: AxisEstimate | None = None  # how the axis was found; None where it was given or stated
+        self._axis = AxisSearch(source, options.selection, warn)
         self._correction: ScanCorrection | None = None
         self._parts: list[Projections] = []  # line integrals of the views taken: what the volume grows from
         self._late = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
         self._taken = 0  # frames that were corrected, or that are no views
-        self._axis_settled = self.axis_col is not None
-        self._next_axis = _FIRST_AXIS_VIEWS
         self._history: list[Progress] = []
         self._begin = clock.now()
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
-        output = options.target.output
-        self.snapshot_path: Path = output.with_name(f"{output.stem}.snapshot.h5")
-        self.picture_path: Path = output.with_name(f"{output.stem}.live.png")
+        self.snapshots = Snapshots(options, source, sink, clock, warn)
+
+    @property
+    def axis_col(self) -> float | None:
+        """The rotation axis in pixels of the file; None as long as it is not known."""
+        return self._axis.col
 
     @property
     def n_views(self) -> int:
@@ -97,7 +87,7 @@ class ScanFollower:
             self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
             if noise := self._correction.noise:
                 self._sink(Event("state", self._clock.now(), {"state": "noise", "message": noise}))
-        if not self._axis_settled:
+        if not self._axis.settled:
             self._settle_axis(self._correction, views, ended)
         if self.axis_col is None:
             return grown
@@ -135,31 +125,15 @@ class ScanFollower:
         self._late = True
 
     def _settle_axis(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Look for the axis each time the views have grown by half, and once more when all are there.
-
-        While views come only a clear optimum counts. Where it moves by much, the fit begins anew with all views; by
-        little, it goes on.
-        """
-        if cone_of(self.source, self._options.selection) is not None:
-            self.axis_col, self._axis_settled = stated_axis(self.source), True
+        """Look for the axis. Where it moves by much, the fit begins anew with all views; by little, it goes on."""
+        before = self.axis_col
+        self._axis.look(correction, views, ended)
+        if self._fit is None or before is None or self.axis_col is None or self.axis_col == before:
             return
-        if views.size < self._next_axis and not ended:
-            return
-        self._next_axis, self._axis_settled = views.size + views.size // 2, ended
-        last_chance = ended and self.axis_col is None
-        try:
-            found, estimate = locate_axis(self.source, correction, views, self._warn if last_chance else _quiet)
-        except DataError:
-            if last_chance:
-                raise
-            return  # the views do not cover enough angles yet
-        if not (estimate.confident or last_chance):
-            return
-        if self.axis_col is None or abs(found - self.axis_col) > _AXIS_MOVES:
+        if abs(self.axis_col - before) > _AXIS_MOVES:
             self._fit = None
-        elif self._fit is not None:
-            self._fit.move_axis(self._binned(found))
-        self.axis_col, self.axis = found, estimate
+        else:
+            self._fit.move_axis(self._binned(self.axis_col))
 
     def _binned(self, axis_col: float) -> float:
         return geometry_of(self.source, self._options.selection, axis_col, np.zeros(1)).axis_col
@@ -225,8 +199,12 @@ class ScanFollower:
         """Where there is a goal, say what the views to come would add, and once that the views so far are enough."""
         if self._enough is None or self._fit is None or self._fit.n_views < self._enough.next_look:
             return
-        planned = self._planned()
-        if planned is None:
+        try:
+            taken = [part.view_ids for part in self._parts]
+            planned = planned_views(self.source, self._options.selection, self.axis_col, taken)
+        except NotPlannedError as error:
+            self._warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
+            self._enough = None
             return
         gain = self._enough.look(self._joined().data, planned)
         if gain is None:
@@ -240,67 +218,10 @@ class ScanFollower:
         message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
         self._sink(Event("state", self._clock.now(), {"state": "gain", "message": message, **data}))
 
-    def _planned(self) -> Geometry | None:
-        """Geometry of the views so far and of those that the plan still holds; None where that is not known."""
-        angles, reason = self.source.plan.get("angles_deg"), "its file does not say which views are planned"
-        if cone_of(self.source, self._options.selection) is not None:
-            angles, reason = None, "its beam is a cone"
-        if angles is None or self.axis_col is None:
-            self._warn(f"What more views of this scan would add is not known: {reason}. It is not stopped early.")
-            self._enough = None
-            return None
-        places = parse_views(self._options.selection.views, np.zeros(len(angles)))
-        last = max(int(part.view_ids[-1]) for part in self._parts)
-        taken = int(np.isin(self.source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
-        to_come = np.radians(np.asarray(angles, np.float64)[places[places >= taken]])
-        so_far = [self.source.angles[part.view_ids] for part in self._parts]
-        return geometry_of(self.source, self._options.selection, self.axis_col, np.concatenate([*so_far, to_come]))
-
     def write_snapshot(self) -> None:
         """The volume as it stands, and its picture, in place of the last ones."""
         assert self._fit is not None
-        unit = "mm" if self.source.pixel_size_mm or self._options.selection.pixel_size_mm else "px"
-        record = ReconRecord(
-            volume=self._fit.snapshot(),
-            length_unit=unit,
-            raw_file=str(self.source.path.resolve()),
-            title=f"Snapshot from {self._fit.n_views} views",
-            sample=str(self.source.attributes.get("sample", "not stated")),
-            time=self._clock.now(),
-            parameters={"axis_col": float(self.axis_col or 0.0), "n_views": self._fit.n_views},
-        )
-        try:
-            write_reconstruction(self.snapshot_path, record, replace=True)
-            self._write_picture(self._fit, record.volume, unit)
-        except DataError as error:
-            # Windows does not replace a file that a viewer holds open: the next snapshot will.
-            self._warn(f"A snapshot was left out: {error}")
-            return
-        seconds = self._clock.now() - self._begin
-        data = {
-            "path": self.snapshot_path,
-            "picture": self.picture_path,
-            "n_views": self._fit.n_views,
-            "seconds": seconds,
-            "unlearnt": self._fit.unlearnt,
-        }
-        self._sink(Event("snapshot", self._clock.now(), data))
-
-    def _write_picture(self, fit: StreamingFit, volume: Volume, unit: str) -> None:
-        new = f"residual of new views {fit.unlearnt:.3f}, " if math.isfinite(fit.unlearnt) else ""
-        title = (
-            f"{fit.n_views} views so far, {new}{fit.progress().n_gaussians} Gaussians, "
-            f"{self._clock.now() - self._begin:.0f} s after the first look"
-        )
-        picture = LivePicture(volume, *fit.newest_view(), title, unit)
-        with whole_file(self.picture_path, replace=True) as partial, named_on_failure(self.picture_path):
-            partial.write_bytes(picture.png())
-
-    def remove_snapshot(self) -> None:
-        """The volume is delivered: what stood in for it goes."""
-        for path in (self.snapshot_path, self.picture_path):
-            with suppress(PermissionError):  # Windows removes no file that a viewer holds open
-                path.unlink(missing_ok=True)
+        self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
     def finish(
         self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]
@@ -364,15 +285,13 @@ class ScanFollower:
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""
         if len(self._parts) > 1:
-            self._parts = [concatenated(self._parts)]
+            self._parts = [merge_and_empty(self._parts)]
         return self._parts[0]
 
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         projections = self._joined()
         assert self._correction is not None
-        found = assemble(self.source, self._options.selection, projections, (axis_col, self.axis), usable, self._warn)
+        found = assemble(
+            self.source, self._options.selection, projections, (axis_col, self._axis.estimate), usable, self._warn
+        )
         return replace(found, noise=self._correction.noise)
-
-
-def _quiet(text: str) -> None:
-    """For an axis that will be looked for again."""

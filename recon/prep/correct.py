@@ -336,8 +336,8 @@ def correct(
     return correction.line_integrals(views)
 
 
-def concatenated(parts: list[Projections]) -> Projections:
-    """Batches of one scan's views as one; the list is emptied on the way, so that no view is in memory twice for long.
+def merge_and_empty(parts: list[Projections]) -> Projections:
+    """Batches of one scan's views as one. The list is emptied on the way, so that no view is in memory twice for long.
 
     The air columns and the mask are those of the last batch.
     """

@@ -9,7 +9,7 @@ import pytest
 
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.selection import Selection
-from recon.prep.correct import CorrectionSettings, concatenated
+from recon.prep.correct import CorrectionSettings, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
@@ -44,7 +44,7 @@ def test_batches_are_the_views_at_once_also_where_the_end_comes_later(
     fed = [correction.feed(batch, last=ended != "later" and batch[-1] == 46) for batch in batches]
     if ended == "later":
         fed.append(correction.feed(np.arange(0), last=True))
-    parts = concatenated([part for part in fed if part is not None])
+    parts = merge_and_empty([part for part in fed if part is not None])
     whole = correction.renewed().at_once(np.arange(2, 47))
     if not correction.outdated:
         np.testing.assert_array_equal(parts.data, whole.data)
@@ -58,5 +58,5 @@ def test_line_integrals_need_no_neighbour() -> None:
     correction = ScanCorrection(source, Selection(), pytest.fail)  # type: ignore[arg-type]
     parts = [correction.feed(np.arange(0, 20), last=False), correction.feed(np.arange(20, 45), last=False)]
     assert correction.feed(np.arange(0), last=True) is None and not correction.outdated
-    whole = concatenated([part for part in parts if part is not None])
+    whole = merge_and_empty([part for part in parts if part is not None])
     np.testing.assert_array_equal(whole.data, correction.at_once(np.arange(45)).data)

@@ -20,6 +20,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.reconstruct import axis_search, snapshots
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct import growing as module
 from beamline.reconstruct.follow import FollowTiming, follow
@@ -400,7 +401,7 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
         value = 18.0 if frames.size < 20 else 20.7
         return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
 
-    monkeypatch.setattr(module, "locate_axis", locate)
+    monkeypatch.setattr(axis_search, "locate_axis", locate)
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     metrics = follow(
@@ -500,14 +501,14 @@ def test_an_existing_result_stays(tmp_path: Path) -> None:
 
 
 def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = module.write_reconstruction
+    real = snapshots.write_reconstruction
 
     def write(path: Path, record: object, *, replace: bool = False) -> None:
         if "snapshot" in path.name:
             raise DataError("the file is in use")
         real(path, record, replace=replace)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module, "write_reconstruction", write)
+    monkeypatch.setattr(snapshots, "write_reconstruction", write)
     clock, events = ScanClock(), list[Event]()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     follow(_options(tmp_path), events.append, clock, RHYTHM)

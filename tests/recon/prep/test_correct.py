@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.prep.air import air_columns, edge_profiles
-from recon.prep.correct import Correction, CorrectionSettings, Projections, References, concatenated, correct
+from recon.prep.correct import Correction, CorrectionSettings, Projections, References, correct, merge_and_empty
 from recon.prep.defects import dead_pixels
 
 PLAIN = CorrectionSettings(hot_threshold=np.inf, zinger_threshold=np.inf, air="none")
@@ -278,7 +278,7 @@ def in_batches(
         views = correction.transmission(counts[batch], at[batch], np.arange(first, end))
         parts.append(correction.line_integrals(views, last=end == len(counts)))
     assert not correction.waiting
-    return concatenated(parts)
+    return merge_and_empty(parts)
 
 
 @given(
@@ -317,7 +317,7 @@ def test_a_scan_may_end_after_its_last_view_was_fed(rng: np.random.Generator, ai
     parts = [correction.line_integrals(views, last=False), correction.line_integrals(None)]
     assert [part.view_ids.tolist() for part in parts] == [[0, 1, 2, 3], [4]]
     whole = correct(counts, positions(counts), references, options)
-    np.testing.assert_array_equal(concatenated(parts).data, whole.data)
+    np.testing.assert_array_equal(merge_and_empty(parts).data, whole.data)
 
 
 def test_a_view_waits_for_the_one_after_it(rng: np.random.Generator) -> None:
