@@ -38,6 +38,7 @@ _COMMANDS = {
     "recon": _Entry("recon", "Reconstruct a scan, finished or still running."),
     "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
     "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
+    "segment": _Entry("segment", "Segment the particles of a volume: labels, sizes, places."),
     "bench": _Entry("bench", "Measure this machine: kernels, fits, and quality against time."),
     "info": _Entry("files", "Describe a scan file."),
     "validate": _Entry("files", "Check a scan file against the rules of its format."),

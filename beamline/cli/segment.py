@@ -1,0 +1,127 @@
+"""`beamline segment`: particles of a volume, their sizes and places."""
+
+from __future__ import annotations
+
+import importlib.util
+import shlex
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_option
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event
+from beamline.segment.run import Segmented, SegmentOptions, settings_of
+from beamline.segment.run import segment as segment_volume
+from drivers.clock import SystemClock
+from recon.post.particles import NECK
+
+_PERCENT = FiniteRange(min=0, max=100)
+
+
+@click.command()
+@click.argument("volume", type=click.Path(path_type=Path))
+@click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
+@click.option("--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as the file says, else lengths are voxels.")
+@click.option(
+    "--crop",
+    type=click.Choice(["square", "none"]),
+    default="square",
+    show_default=True,
+    help="square: the one inside the circle of the sample, without its wall; none: the whole volume.",
+)
+@click.option("--margin", type=FiniteRange(min=0, max=0.5, max_open=True), default=0.05, show_default=True,
+              help="Share of the square's side taken off at each end.")  # fmt: skip
+@click.option("--percentiles", type=_PERCENT, nargs=2, default=(0.5, 99.5), show_default=True, metavar="LOW HIGH",
+              help="Grey values below and above are cut.")  # fmt: skip
+@click.option("--gamma", type=POSITIVE, default=1.0, show_default=True, help="Power of the grey values, from 0 to 1.")
+@click.option("--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Of the Gaussian filter, voxels.")
+@click.option("--clusters", type=click.IntRange(2, 12), help="Of grey values (k-means). Default: by the elbow rule.")
+@click.option("--radius", type=click.IntRange(0, 20), default=1, show_default=True,
+              help="Of opening and closing, voxels; 0: neither.")  # fmt: skip
+@click.option("--smallest", type=click.IntRange(min=0), default=27, show_default=True,
+              help="Voxels of the smallest particle that is kept.")  # fmt: skip
+@click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
+              help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "
+              "always.")  # fmt: skip
+@click.option("--napari", "view", is_flag=True, help="Then open volume and labels in napari, if it is installed.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the clusters' starts.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="HDF5 file of the labels; .csv and .png lie beside it. Default: VOLUME's stem + _particles.h5, here.",
+)
+@json_option
+def segment(
+    volume: Path,
+    voxel_um: float | None,
+    crop: str,
+    margin: float,
+    clusters: int | None,
+    view: bool,
+    output: Path | None,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    """Segment the dense particles of VOLUME: a reconstruction, or any HDF5, TIFF, NumPy or NIfTI volume.
+
+    The grey values are rescaled between percentiles and smoothed, and parted by k-means. Particles are what is above
+    half-way between the brightest cluster and the largest other one; opened, closed, filled, parted where they touch.
+
+    Writes the labels as HDF5, a table of particles (volume, equivalent diameter, centroid) as CSV, and a picture of
+    slices with labels. Look at the picture before you count. Nothing is overwritten.
+    """
+    if view and importlib.util.find_spec("napari") is None:
+        raise ConfigError("--napari: napari is not installed. Install it with: pip install 'napari[all]'")
+    output = output or Path(f"{volume.name.split('.')[0]}_particles.h5")
+    if output.suffix.lower() in (".csv", ".png"):
+        raise click.UsageError(f"--output {output} is the HDF5 file of the labels; name it .h5")
+    options = SegmentOptions(
+        volume=volume,
+        output=output,
+        voxel_mm=None if voxel_um is None else voxel_um * 1e-3,
+        margin=margin if crop == "square" else None,
+        n_clusters=clusters,
+        command=shlex.join(["beamline", *sys.argv[1:]]),
+        **values,
+    )
+    with terminated_like_interrupted(), json_events(as_json) as sinks:
+        found = segment_volume(options)
+        files = {"output": output, "table": options.table, "picture": options.picture}
+        for sink in sinks:
+            sink(Event("done", SystemClock().now(), {**files, **settings_of(found, options)}))
+    if not as_json:
+        click.echo(summary(found, options))
+    if view:
+        show(found)
+
+
+def summary(found: Segmented, options: SegmentOptions) -> str:
+    """The result for people."""
+    figures, unit = found.particles.statistics(), found.unit
+    lines = [
+        f"{'labels':<12}{options.output}",
+        f"{'table':<12}{options.table}",
+        f"{'picture':<12}{options.picture}",
+        f"{'box':<12}{' x '.join(map(str, found.labels.shape))} voxels of {found.volume.grid.voxel_size:g} {unit}",
+        f"{'clusters':<12}{found.clusters.centres.size}, threshold {found.clusters.threshold:.3f} of the range",
+        f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
+    ]
+    if "d50" in figures:
+        sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
+        lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")
+    return "\n".join(lines)
+
+
+def show(found: Segmented) -> None:
+    """Open volume and labels in napari, until its window is closed."""
+    napari = import_module("napari")
+    viewer, spacing = napari.Viewer(), found.volume.grid.spacing
+    viewer.add_image(found.volume.data, scale=spacing, name="volume")
+    viewer.add_labels(found.labels, scale=spacing, name="particles")
+    napari.run()

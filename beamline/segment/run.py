@@ -1,0 +1,231 @@
+"""A volume file in; labels, a table of particles and a picture out."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.version import version
+from beamline.segment.picture import picture_of
+from beamline.storage import hdf5
+from beamline.storage.volume_file import read_volume
+from recon.base.volume import Grid, Volume
+from recon.post.clusters import Clusters, clusters
+from recon.post.enhance import enhanced, inscribed_box, sample_circle
+from recon.post.particles import NECK, Particles, cleaned, measured, parted
+
+_SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """What to segment and how; the steps are those of recon.post.
+
+    Attributes:
+        volume, dataset: the file, and the array in it; None: the one of a reconstruction, or the only one.
+        output: HDF5 file of the labels; the table and the picture lie beside it.
+        voxel_mm: edge of a voxel where the file does not say it; None: as the file says, or 1 px.
+        margin: of the square inside the sample's circle; None: the whole volume.
+        percentiles, gamma, sigma: of the enhancement.
+        n_clusters: of grey values; None: by the elbow rule.
+        radius, smallest: of the cleaning.
+        neck: where touching particles are parted; 0: nowhere.
+        seed: of the clusters' starts.
+        command: that repeats this, for the record.
+    """
+
+    volume: Path
+    dataset: str | None
+    output: Path
+    voxel_mm: float | None = None
+    margin: float | None = 0.05
+    percentiles: tuple[float, float] = (0.5, 99.5)
+    gamma: float = 1.0
+    sigma: float = 0.7
+    n_clusters: int | None = None
+    radius: int = 1
+    smallest: int = 27
+    neck: float = NECK
+    seed: int = 0
+    command: str = ""
+
+    @property
+    def table(self) -> Path:
+        return self.output.with_suffix(".csv")
+
+    @property
+    def picture(self) -> Path:
+        return self.output.with_suffix(".png")
+
+
+@dataclass(frozen=True, eq=False)
+class Segmented:
+    """What was found.
+
+    Attributes:
+        volume: the part that was segmented, as it is in the file, on its grid.
+        unit: "mm", or "px" where nobody knows the size of a voxel.
+        labels: int32 [z, y, x] of the same shape; 0: no particle.
+        clusters: of the enhanced grey values.
+        particles: of the labels.
+    """
+
+    volume: Volume
+    unit: str
+    labels: NDArray[np.int32]
+    clusters: Clusters
+    particles: Particles
+
+
+def segment(options: SegmentOptions) -> Segmented:
+    """Segment the volume, and write labels, table and picture; all of them or none.
+
+    Raises:
+        ConfigError, DataError: nothing was written.
+    """
+    for path in (options.output, options.table, options.picture):
+        refuse_existing(path)
+    volume, unit = _read(options)
+    try:
+        found = _segmented(volume, unit, options)
+    except ValueError as error:
+        raise DataError(f"{options.volume} cannot be segmented: {error}. Nothing was written.") from error
+    written = []
+    try:
+        for path, write in (
+            (options.output, lambda partial: _write_labels(partial, found, options)),
+            (options.table, lambda partial: partial.write_text(table_of(found), encoding="utf-8")),
+            (
+                options.picture,
+                lambda partial: partial.write_bytes(
+                    picture_of(found.volume, found.unit, found.labels, found.particles)
+                ),
+            ),
+        ):
+            with named_on_failure(path), whole_file(path) as partial:
+                write(partial)
+            written.append(path)
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
+    return found
+
+
+def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
+    if options.margin is not None:
+        box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
+        volume = _cut(volume, box)
+    grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
+    found = clusters(grey, options.n_clusters, options.seed)
+    labels = parted(cleaned(grey > found.threshold, options.radius, options.smallest), options.neck)
+    first = tuple(float(axis[0]) for axis in volume.grid.coordinates())
+    particles = measured(labels, volume.grid.spacing, first)  # type: ignore[arg-type]
+    return Segmented(volume, unit, labels, found, particles)
+
+
+def _cut(volume: Volume, box: tuple[slice, slice, slice]) -> Volume:
+    axes = [axis[part] for axis, part in zip(volume.grid.coordinates(), box, strict=True)]
+    z, y, x = ((float(axis[0]) + float(axis[-1])) / 2 for axis in axes)
+    shape = len(axes[0]), len(axes[1]), len(axes[2])
+    grid = Grid(shape, volume.grid.voxel_size, (z, y, x), volume.grid.slice_pitch)
+    return Volume(np.ascontiguousarray(volume.data[box]), grid)
+
+
+def _read(options: SegmentOptions) -> tuple[Volume, str]:
+    """The volume on its grid, and the unit of length.
+
+    Raises:
+        ConfigError, DataError: it cannot be read, or is no volume of finite numbers.
+    """
+    path, dataset = options.volume, options.dataset
+    spacing: tuple[float, ...] | None = None
+    first: tuple[float, ...] | None = None
+    if path.is_file() and h5py.is_hdf5(path):
+        with hdf5.open_hdf5(path) as file:
+            if dataset is None and isinstance(file.get(_SIGNAL), h5py.Dataset):
+                dataset = _SIGNAL
+            spacing, first = _axes_of(file, dataset)
+    data, stated = read_volume(path, dataset)
+    if data.ndim != 3 or data.dtype.kind not in "fiub" or min(data.shape) < 3:
+        raise DataError(f"{path} holds {data.dtype} of shape {data.shape}; expected real numbers [z, y, x], 3 or more.")
+    values = np.ascontiguousarray(data, np.float32)
+    if not np.isfinite(values).all():
+        raise DataError(f"{path} has values that are not finite; nothing was written.")
+    if options.voxel_mm is not None:
+        spacing, first = (options.voxel_mm,) * 3, None
+    spacing = spacing or stated
+    z, y, x = spacing or (1.0, 1.0, 1.0)
+    if abs(y - x) > 1e-3 * x:
+        raise ConfigError(f"{path} has voxels of {y:g} by {x:g} mm in a slice; square ones are expected.")
+    grid = Grid(values.shape, x, slice_pitch=z)
+    if first is not None:
+        centre = tuple(low + (n - 1) / 2 * edge for low, n, edge in zip(first, values.shape, (z, y, x), strict=True))
+        grid = Grid(values.shape, x, centre, z)
+    return Volume(values, grid), "px" if spacing is None else "mm"
+
+
+def _axes_of(file: h5py.File, dataset: str | None) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    """Spacing and first coordinates (z, y, x) in mm by the arrays z, y, x beside a dataset; None without them."""
+    node = None if dataset is None else file.get(dataset)
+    axes = [] if node is None else [node.parent.get(name) for name in "zyx"]
+    if not axes or any(not isinstance(axis, h5py.Dataset) or axis.size < 2 for axis in axes):
+        return None, None
+    if any(axis.attrs.get("units") != "mm" for axis in axes):
+        return None, None
+    ends = [(float(axis[0]), float(axis[-1]), axis.size) for axis in axes]
+    return tuple((last - low) / (n - 1) for low, last, n in ends), tuple(low for low, _, _ in ends)
+
+
+def table_of(found: Segmented) -> str:
+    """One line a particle, largest first."""
+    unit, particles, out = found.unit, found.particles, io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    heading = [f"volume_{unit}3", f"equivalent_diameter_{unit}", f"z_{unit}", f"y_{unit}", f"x_{unit}", "cut"]
+    writer.writerow(["label", *heading])
+    for i in np.argsort(-particles.volume, kind="stable").tolist():
+        sizes = (particles.volume[i], particles.diameter[i], *particles.centroid[i])
+        writer.writerow([particles.label[i], *(f"{value:.6g}" for value in sizes), int(particles.cut[i])])
+    return out.getvalue()
+
+
+def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
+    """Everything that the labels depend on, and the figures of all particles, by name."""
+    low, high = options.percentiles
+    return {
+        "margin": "none" if options.margin is None else options.margin,
+        "percentile_low": low, "percentile_high": high, "gamma": options.gamma, "sigma": options.sigma,
+        "clusters": found.clusters.centres.size, "threshold": found.clusters.threshold, "radius": options.radius,
+        "smallest": options.smallest, "neck": options.neck, "seed": options.seed,
+        **found.particles.statistics(), "unit": found.unit,
+    }  # fmt: skip
+
+
+def _write_labels(partial: Path, found: Segmented, options: SegmentOptions) -> None:
+    with hdf5.created(partial) as file:
+        file.attrs["default"] = "entry"
+        entry = file.create_group("entry")
+        entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"
+        process = entry.create_group("process")
+        process.attrs["NX_class"] = "NXprocess"
+        process["program"], process["version"], process["command"] = "splatline", version(), options.command
+        process["volume"] = str(options.volume.resolve())
+        for name, value in settings_of(found, options).items():
+            process[name] = value
+        data = entry.create_group("data")
+        data.attrs["NX_class"], data.attrs["signal"], data.attrs["axes"] = "NXdata", "labels", ["z", "y", "x"]
+        chunks = (1, *found.labels.shape[1:])
+        data.create_dataset("labels", data=found.labels, chunks=chunks, compression="gzip", compression_opts=1)
+        for name, centres in zip(("z", "y", "x"), found.volume.grid.coordinates(), strict=True):
+            data[name] = centres
+            data[name].attrs["units"] = found.unit

@@ -1,0 +1,1 @@
+"""After reconstruction: enhancement, clusters of grey values, and particles with their sizes."""

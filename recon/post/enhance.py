@@ -1,0 +1,98 @@
+"""Enhancement of a volume before it is segmented: a box without the can, rescaled and smoothed grey values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.post.clusters import k_means
+
+F32 = NDArray[np.float32]
+Box = tuple[slice, slice, slice]
+
+_SAMPLE = 4_000_000  # voxels from which percentiles are computed
+
+
+def sample_circle(volume: F32) -> tuple[float, float, float]:
+    """Centre (y, x) and radius of the sample seen along z, in voxels.
+
+    The mean over z is parted by k-means in two; the circle is that of the largest connected part's extent.
+
+    Args:
+        volume: [z, y, x], finite.
+
+    Raises:
+        ValueError: the mean is the same everywhere.
+    """
+    mean = volume.mean(axis=0, dtype=np.float64)
+    parts, _ = ndimage.label(ndimage.binary_fill_holes(mean > k_means(mean.ravel(), 2).mean()))
+    largest = np.bincount(parts.ravel())[1:].argmax() + 1
+    rows, cols = np.nonzero(parts == largest)
+    radius = (np.ptp(rows) + np.ptp(cols) + 2) / 4
+    return float(rows.min() + rows.max()) / 2, float(cols.min() + cols.max()) / 2, float(radius)
+
+
+def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float], margin: float = 0.05) -> Box:
+    """All slices of the square inside a circle, of side 2 r cos 45° less a margin, cut to the volume.
+
+    Args:
+        shape: (nz, ny, nx).
+        circle: centre (y, x) and radius in voxels.
+        margin: share of the side taken off at each of its ends, 0 to 0.5.
+
+    Raises:
+        ValueError: for another margin, or a box that is empty.
+    """
+    if not 0 <= margin < 0.5:
+        raise ValueError(f"the margin is a share of the side, 0 to 0.5, got {margin}")
+    *centre, radius = circle
+    half = radius * math.cos(math.pi / 4) * (1 - 2 * margin)
+    y, x = (
+        slice(max(0, math.ceil(c - half)), min(n, math.floor(c + half) + 1))
+        for c, n in zip(centre, shape[1:], strict=True)
+    )
+    if y.start >= y.stop or x.start >= x.stop:
+        raise ValueError(f"the square in a circle of radius {radius:.3g} voxels at {centre} holds no voxel of {shape}")
+    return slice(0, shape[0]), y, x
+
+
+def rescaled(volume: F32, low: float = 0.5, high: float = 99.5) -> F32:
+    """Grey values from 0 at the `low` to 1 at the `high` percentile, cut at both.
+
+    Raises:
+        ValueError: the percentiles are no range, or their values are equal.
+    """
+    if not 0 <= low < high <= 100:
+        raise ValueError(f"percentiles must rise within 0 to 100, got {low} and {high}")
+    values = volume.ravel()
+    bottom, top = np.percentile(values[:: max(1, values.size // _SAMPLE)], [low, high])
+    if not top > bottom:
+        raise ValueError(f"grey values are {bottom:g} at both percentiles ({low:g} and {high:g}): nothing to rescale")
+    return np.clip((volume - np.float32(bottom)) / np.float32(top - bottom), 0, 1)
+
+
+def enhanced(
+    volume: F32, percentiles: tuple[float, float] = (0.5, 99.5), gamma: float = 1.0, sigma: float = 0.7
+) -> F32:
+    """Rescaled, raised to the power `gamma`, then smoothed by a Gaussian.
+
+    With another gamma than 1 half of the grey value is no longer half of the attenuation, which moves edges.
+
+    Args:
+        volume: [z, y, x].
+        percentiles: see `rescaled`.
+        gamma: above 0.
+        sigma: of the Gaussian, voxels; 0: none.
+
+    Raises:
+        ValueError: for other settings.
+    """
+    if not (gamma > 0 and sigma >= 0):
+        raise ValueError(f"gamma must be above 0 and sigma 0 or more, got {gamma} and {sigma}")
+    out = rescaled(volume, *percentiles)
+    if gamma != 1:
+        out **= np.float32(gamma)
+    return ndimage.gaussian_filter(out, sigma) if sigma > 0 else out

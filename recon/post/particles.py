@@ -1,0 +1,184 @@
+"""Particles: a mask cleaned, parted where particles touch, and each with its size and place."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Mask = NDArray[np.bool_]
+Labels = NDArray[np.int32]
+F32 = NDArray[np.float32]
+
+NECK = 0.8
+"""Two parts are one particle where the neck between them is at least so wide as the narrower part, as a share."""
+_GRID = 0.5
+"""Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars and octahedra
+are parted, with it 1; of 40 pairs of touching balls 38 are parted, for 40."""
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """Sizes and places, one entry a particle.
+
+    Attributes:
+        label: int32 [particle], in the labelled volume.
+        volume: float64, of a voxel's unit of length cubed.
+        centroid: float64 [particle, 3], (z, y, x).
+        cut: bool, it touches a face of the volume, so that it may be larger than it is here.
+    """
+
+    label: Labels
+    volume: NDArray[np.float64]
+    centroid: NDArray[np.float64]
+    cut: Mask
+
+    @property
+    def diameter(self) -> NDArray[np.float64]:
+        """Of the ball of the same volume, (6 V / π)^(1/3)."""
+        return np.cbrt(6 * self.volume / np.pi)
+
+    def statistics(self) -> dict[str, float]:
+        """Number, how many are cut; mean and 10th, 50th and 90th percentile of the diameters of the others."""
+        whole = self.diameter[~self.cut]
+        found = {"particles": float(self.label.size), "cut": float(self.cut.sum())}
+        if whole.size:
+            d10, d50, d90 = np.percentile(whole, [10, 50, 90])
+            found |= {"mean_diameter": float(whole.mean()), "d10": float(d10), "d50": float(d50), "d90": float(d90)}
+        return found
+
+
+def ball(radius: int) -> Mask:
+    """A structuring element: voxels at most `radius` from the middle."""
+    squares = np.arange(-radius, radius + 1) ** 2
+    return squares[:, None, None] + squares[:, None] + squares <= radius**2
+
+
+def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
+    """Opened, closed, holes filled, and parts of fewer than `smallest` voxels removed.
+
+    The faces of the volume count as if it went on beyond them, so that a particle there loses nothing.
+
+    Args:
+        mask: [z, y, x].
+        radius: of opening and closing by a ball, voxels; 0: neither.
+        smallest: voxels.
+
+    Raises:
+        ValueError: for a negative number.
+    """
+    if radius < 0 or smallest < 0:
+        raise ValueError(f"radius and smallest must be 0 or more voxels, got {radius} and {smallest}")
+    out = mask
+    if radius:
+        out = np.pad(out, 2 * radius, mode="edge")
+        out = ndimage.binary_closing(ndimage.binary_opening(out, ball(radius)), ball(radius))
+        out = out[(slice(2 * radius, -2 * radius),) * 3]
+    out = ndimage.binary_fill_holes(out)
+    parts, n = ndimage.label(out)
+    kept = np.bincount(parts.ravel(), minlength=n + 1) >= smallest
+    kept[0] = False
+    return np.asarray(kept[parts])
+
+
+def parted(mask: Mask, neck: float = NECK) -> Labels:
+    """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, parted where they are only joined by a neck.
+
+    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979); two basins are joined again
+    where the distance on the neck between them is at least `neck` of the smaller of their maxima, widest necks first.
+
+    Args:
+        neck: 0: connected parts as they are; above 1: every maximum is a particle.
+    """
+    connected, _ = ndimage.label(mask)
+    if neck <= 0:
+        return connected.astype(np.int32)
+    labels, last = np.zeros(mask.shape, np.int32), 0
+    for number, box in enumerate(ndimage.find_objects(connected), 1):
+        inside = np.pad(connected[box] == number, 1)
+        basins = _joined(*_basins(inside), neck)[1:-1, 1:-1, 1:-1]
+        labels[box] = np.where(basins > 0, basins + last, labels[box])
+        last += int(basins.max())
+    return labels
+
+
+def measured(
+    labels: Labels, spacing: tuple[float, float, float] = (1, 1, 1), origin: tuple[float, float, float] = (0, 0, 0)
+) -> Particles:
+    """Sizes and places of the particles in a labelled volume.
+
+    Args:
+        labels: int [z, y, x], 0 outside.
+        spacing: edges of a voxel (z, y, x).
+        origin: centre of the first voxel (z, y, x).
+    """
+    counts = np.bincount(labels.ravel())
+    found = np.flatnonzero(counts[1:]) + 1
+    sums = np.zeros((counts.size, 3))
+    for axis in range(3):
+        # Per slice, so that no array of coordinates is as large as the volume.
+        for place, plane in enumerate(np.moveaxis(labels, axis, 0)):
+            here, n = np.unique(plane, return_counts=True)
+            sums[here, axis] += place * n
+    faces = [
+        labels[face] for axis in range(3) for face in ((slice(None),) * axis + (0,), (slice(None),) * axis + (-1,))
+    ]
+    touched = np.unique(np.concatenate([face.ravel() for face in faces]))
+    centroid = np.asarray(origin) + sums[found] / counts[found, None] * np.asarray(spacing)
+    return Particles(
+        found.astype(np.int32), counts[found] * np.float64(np.prod(spacing)), centroid, np.isin(found, touched)
+    )
+
+
+def _basins(inside: Mask) -> tuple[Labels, F32]:
+    """The basin of each maximum of the distance to the outside, and that distance; False on all faces of `inside`.
+
+    Every voxel belongs to the maximum that the steepest way up leads to. (`scipy.ndimage.watershed_ift` grows by the
+    differences of neighbours, not by their values, and does not find the necks of a smooth distance.)
+    """
+    distance = ndimage.distance_transform_edt(inside).astype(np.float32)
+    height = np.where(inside, ndimage.gaussian_filter(distance, 0.7), -1)
+    own = np.arange(height.size).reshape(height.shape)
+    best, up = height.copy(), own.copy()
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        there = np.roll(height, step, (0, 1, 2))
+        higher = there > best
+        best[higher] = there[higher]
+        up[higher] = np.roll(own, step, (0, 1, 2))[higher]
+    top = up.ravel()
+    while not np.array_equal(top, higher_up := top[top]):
+        top = higher_up
+    _, basins = np.unique(np.where(inside, top.reshape(inside.shape), -1), return_inverse=True)
+    return basins.reshape(inside.shape).astype(np.int32), distance
+
+
+def _joined(basins: Labels, distance: F32, neck: float) -> Labels:
+    """The basins numbered anew, 1, 2, ..., after those with a wide neck between them were joined."""
+    n = int(basins.max())
+    peak = np.zeros(n + 1)
+    np.maximum.at(peak, basins.ravel(), distance.ravel())
+    necks: dict[int, float] = {}
+    for axis in range(3):
+        low, high = (
+            tuple(slice(*ends) if a == axis else slice(None) for a in range(3)) for ends in ((0, -1), (1, None))
+        )
+        meet = (basins[low] != basins[high]) & (basins[low] > 0) & (basins[high] > 0)
+        one, other = basins[low][meet].astype(np.int64), basins[high][meet]
+        pair = np.minimum(one, other) * (n + 1) + np.maximum(one, other)
+        width = np.minimum(distance[low][meet], distance[high][meet])
+        keys, place = np.unique(pair, return_inverse=True)
+        widest = np.zeros(keys.size)
+        np.maximum.at(widest, place, width)
+        for key, value in zip(keys.tolist(), widest.tolist(), strict=True):
+            necks[key] = max(necks.get(key, 0.0), value)
+    root = np.arange(n + 1)
+    for key in sorted(necks, key=lambda key: -necks[key]):
+        a, b = root[key // (n + 1)], root[key % (n + 1)]
+        if a != b and necks[key] >= neck * min(peak[a], peak[b]) - _GRID:
+            peak[a] = max(peak[a], peak[b])
+            root[root == b] = a
+    _, numbered = np.unique(root, return_inverse=True)
+    return numbered[basins].astype(np.int32)

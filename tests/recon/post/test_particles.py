@@ -1,0 +1,99 @@
+"""Particles: those of a phantom are found, each with its volume and its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from skimage.measure import regionprops
+
+from recon.post.clusters import clusters
+from recon.post.enhance import enhanced, inscribed_box
+from recon.post.particles import ball, cleaned, measured, parted
+from tests.recon.post.phantom import BALLS, CIRCLE, SHAPE, can, inside
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.25])
+def test_balls_in_a_can_are_found_with_number_volume_and_place(noise: float) -> None:
+    box = inscribed_box(SHAPE, CIRCLE, margin=0.08)
+    grey = enhanced(can(noise)[box])
+    labels = parted(cleaned(grey > clusters(grey).threshold, smallest=27))
+    found = measured(labels, origin=tuple(float(part.start) for part in box))  # type: ignore[arg-type]
+    expected = [(centre, radius) for centre, radius in BALLS if centre[2] < 55]
+    assert found.label.size == len(expected) and not found.cut.any()
+    for centre, radius in expected:
+        nearest = int(np.linalg.norm(found.centroid - centre, axis=1).argmin())
+        np.testing.assert_allclose(found.centroid[nearest], centre, atol=0.3)
+        # The level of half the contrast moves inwards by the mean curvature: σ² / r, σ² of phantom and filter together.
+        inwards = (0.6**2 + 0.7**2) / radius
+        assert -0.1 <= radius - found.diameter[nearest] / 2 <= inwards + 0.1
+
+
+def test_sizes_and_places_are_those_of_another_library(rng: np.random.Generator) -> None:
+    labels = np.zeros(SHAPE, np.int32)
+    for number, (centre, radius) in enumerate(BALLS, 3):
+        labels[inside(centre, radius)] = number
+    labels[0, :4, :5] = 1
+    spacing, origin = (0.5, 0.2, 0.2), (-3.0, 1.0, 2.0)
+    found = measured(labels, spacing, origin)
+    for i, region in enumerate(regionprops(labels, spacing=spacing)):
+        assert found.label[i] == region.label
+        assert found.volume[i] == pytest.approx(region.area)
+        assert found.diameter[i] == pytest.approx(region.equivalent_diameter_area)
+        np.testing.assert_allclose(found.centroid[i], np.add(region.centroid, origin))
+    assert found.cut.tolist() == [True] + [False] * len(BALLS)
+    whole = found.diameter[1:]
+    assert found.statistics()["d50"] == pytest.approx(np.median(whole))
+    assert found.statistics()["particles"] == len(BALLS) + 1
+
+
+@pytest.mark.parametrize(("radius", "apart"), [(5, 1.0), (5, 0.85), (8, 0.8), (12, 0.75)])
+def test_two_balls_that_touch_are_two(radius: float, apart: float) -> None:
+    shape = (40, 40, 70)
+    one = inside((20, 20, 22), radius, shape)
+    other = inside((20, 21, 22 + 2 * radius * apart), radius, shape)
+    labels = parted(one | other)
+    assert labels.max() == 2
+    np.testing.assert_array_equal(labels > 0, one | other)
+    shares = np.bincount(labels.ravel())[1:] / (one | other).sum()
+    assert shares == pytest.approx([0.5, 0.5], abs=0.05)
+    assert parted(one | other, neck=0).max() == 1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_an_ellipsoid_and_a_plate_are_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turned = (np.stack(np.mgrid[:32, :32, :32], axis=-1) - 15.3) @ Rotation.random(rng=rng).as_matrix()
+    ellipsoid = ((turned / rng.uniform(4, 12, 3)) ** 2).sum(axis=-1) <= 1
+    plate = (np.abs(turned) <= (3, 8, 9)).all(axis=-1)
+    assert parted(ellipsoid).max() == parted(plate).max() == 1
+
+
+def test_cleaning_removes_specks_and_whiskers_and_fills_holes() -> None:
+    body = inside((20, 30, 30), 9)
+    dirty = body.copy()
+    dirty[20, 30, 30] = False  # a hole
+    dirty[20, 30, 40:60] = True  # a whisker
+    dirty[5, 60, 60] = dirty[5, 60, 62] = True  # specks
+    np.testing.assert_array_equal(cleaned(dirty, 1, 8), cleaned(body, 1, 8))
+    assert cleaned(body, 1, 8).sum() == pytest.approx(body.sum(), rel=0.01)
+    assert not cleaned(body, 0, int(body.sum()) + 1).any()
+    assert cleaned(body, 0, int(body.sum())).sum() == body.sum()
+
+
+def test_a_particle_at_a_face_loses_nothing_there() -> None:
+    half = inside((0, 30, 30), 8)
+    whole = cleaned(np.concatenate((half[:0:-1], half)))
+    np.testing.assert_array_equal(cleaned(half), whole[SHAPE[0] - 1 :])
+    assert measured(parted(cleaned(half))).cut.tolist() == [True]
+
+
+def test_no_particles_are_no_error() -> None:
+    found = measured(parted(np.zeros((4, 5, 6), bool)))
+    assert found.label.size == 0 and found.statistics() == {"particles": 0.0, "cut": 0.0}
+
+
+def test_the_structuring_element_is_round() -> None:
+    assert [int(ball(radius).sum()) for radius in (0, 1, 2)] == [1, 7, 33]
+    with pytest.raises(ValueError, match="0 or more"):
+        cleaned(np.ones((3, 3, 3), bool), -1)
