@@ -46,20 +46,41 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
     problems = []
+    being_written, missing = _state(path)
     # A follower takes no lock, so as not to stop the writer from adding the /exchange view at the end; but a writer in
     # this same process shares its file with us, and then HDF5 wants the same locking of both.
     growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
     for swmr, locking in (growing, whole, shared) if follow else (whole, growing, shared):
+        if swmr and (missing or not (follow or being_written)):
+            continue  # HDF5 would wait for ever for a writer that mends what is missing or damaged
         try:
             return h5py.File(path, "r", swmr=swmr, locking=locking)
         except (OSError, ValueError) as error:
             problems.append(str(error))
     if follow:
         raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
+    if missing:
+        raise DataError(
+            f"{path} is cut off: {missing} bytes are missing at its end, as its head says. Copy it again, or use the "
+            "original. Nothing was read."
+        )
     raise DataError(
         f"{path} cannot be read as HDF5 ({problems[0]}). If a scan just begins, try again; "
         "if its writer died before the first frame, there is nothing in it."
     )
+
+
+def _state(path: Path) -> tuple[bool, int]:
+    """Whether its head says that it is being written, and how many bytes it is shorter than its head says.
+
+    Of superblocks of versions 2 and 3 at the beginning (HDF5 file format specification 3.0, II.A); others cannot be
+    written under SWMR: False, 0.
+    """
+    with path.open("rb") as file:
+        head = file.read(36)
+    if len(head) < 36 or head[:8] != b"\x89HDF\r\n\x1a\n" or head[8] not in (2, 3) or head[9] != 8:
+        return False, 0
+    return head[11] != 0, max(0, int.from_bytes(head[28:36], "little") - path.stat().st_size)
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:

@@ -10,9 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.ingest import ingest
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import NotReadyError, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
 from drivers.frame import Frame
@@ -125,3 +126,22 @@ def test_another_programs_lock_costs_the_view_and_nothing_else(
     assert "no /exchange view (another program holds it open" in writer.remarks[0]
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "complete")
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("missing", [1, 1000])
+def test_a_file_that_is_cut_off_is_refused_at_once(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], missing: int, closed: bool
+) -> None:
+    """Under SWMR, which opens a file whose writer died, HDF5 would wait for the missing bytes for hours."""
+    with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
+        for frame in frames:
+            writer.append(frame, digest(frame.counts))
+        if not closed:
+            (tmp_path / "cut.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:-missing])
+    if closed:
+        (tmp_path / "cut.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:-missing])
+    with pytest.raises(DataError, match=rf"cut\.h5 is cut off: {missing} bytes are missing"):
+        open_scan(tmp_path / "cut.h5")
+    with pytest.raises(NotReadyError, match=r"cut\.h5 cannot be followed yet"):
+        open_scan(tmp_path / "cut.h5", follow=True)
