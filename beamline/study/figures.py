@@ -82,10 +82,7 @@ def write_page(folder: Path, table: StudyTable, slices: Slices) -> None:
     """Write the pictures and report.html."""
     pictures = []
     if table.done:
-        caption = "PSNR and SSIM against the FBP of all views" + (
-            ", and against the truth" if "psnr_truth" in table.names else ""
-        )
-        caption += "; SNR and CNR of the dense and the empty region. More is better."
+        caption = "What each figure is of is said below the table. A smoother volume has more SNR and CNR."
         pictures.append(("figures.png", Picture("Figures of all rows", caption, figures_of_rows(table))))
     for method in dict.fromkeys(cell.method for cell in table.done):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."

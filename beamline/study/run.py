@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Emit, Event, Sink, Warnings
-from beamline.core.files import named_on_failure
+from beamline.core.files import named_on_failure, refuse_existing
 from beamline.core.machine import machine
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
@@ -104,10 +104,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
         KeyboardInterrupt: before the first row was done; nothing was written.
     """
     folder, started = options.folder, clock.now()
-    if folder.exists():
-        raise DataError(f"{folder} exists and results are never overwritten. Name another folder, or move it away.")
-    if not folder.parent.is_dir():
-        raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
+    refuse_existing(folder)
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:

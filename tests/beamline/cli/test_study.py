@@ -18,6 +18,7 @@ from beamline.study import run as study_run
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.trials import Outcome, Trial
 from recon.base.volume import Grid
+from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 1.875)), shape=(4, 40))  # 96 views
@@ -77,6 +78,8 @@ def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: 
     assert [data.geometry.n_views for _, data in others] == [90, 45]
     left = {path.name for path in (folder / "many_fixed-views").iterdir()}
     assert left == {"study.csv", "study.json", "report.html", "figures.png", "slices_fbp.png"}
+    page = parsed_page((folder / "many_fixed-views" / "report.html").read_text(encoding="utf-8"))
+    assert f"{peak:.2f}" in page.text and any("asks for 360 views" in text for text in page.text)
 
 
 def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:
