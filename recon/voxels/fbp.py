@@ -1,28 +1,40 @@
 """Filtered back-projection for parallel beam: the fast baseline, in 1/mm.
 
 f(x, y) = ∫₀^π q_θ(x cos θ + y sin θ) dθ, where q_θ is a view convolved with the band-limited ramp
-(Kak & Slaney 1988, eq. 3.61 and 3.69). Rows are independent, so the work runs in slabs of rows with the row
-index fastest: one interpolation in the plane serves a whole slab of slices.
+(Kak & Slaney 1988, eq. 3.61 and 3.69). Rows are independent, so the work runs in blocks of sixteen slices, counted from
+the volume's first: whoever asks for blocks one by one gets the volume of all of them, to the bit.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy import fft
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.kernels.cpu.activation import OPTIONS
+from recon.voxels.back_project import (
+    SLICES,
+    by_gridding,
+    columns_of,
+    gridding,
+    gridding_pays,
+    ray_by_ray,
+)
 from recon.voxels.view_weights import ray_weights
 
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 
-_SLAB_BYTES = 128 * 2**20  # filtered views held at a time
+_VIEWS = 32  # filtered at a time
 
 
 def _transfer(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
@@ -58,8 +70,7 @@ def filter_projections(
     Raises:
         ValueError: for an unknown filter.
     """
-    if filter not in get_args(Filter):
-        raise ValueError(f"unknown filter {filter!r}; use one of {', '.join(get_args(Filter))}")
+    _known(filter)
     cols = projections.shape[-1]
     n = fft.next_fast_len(2 * cols, real=True)  # no wrap-around for kernels as long as the row
     spectrum = fft.rfft(np.asarray(projections, np.float32), n, axis=-1, workers=get_num_threads())
@@ -67,76 +78,139 @@ def filter_projections(
     return fft.irfft(spectrum, n, axis=-1, workers=get_num_threads())[..., :cols]
 
 
-@njit(**OPTIONS)
-def _back_project(filtered, cosines, sines, axis_cols, x, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """out[z, y, x] = Σ_view filtered[view, u(x, y), z] by linear interpolation; x and y in pixels."""
-    views, cols, nz = filtered.shape
-    nx, ny = x.size, y.size
-    block = 32  # x by z accumulators of one job stay in the first cache
-    blocks = (nx + block - 1) // block
-    for job in prange(ny * blocks):
-        j = job // blocks
-        i0 = (job - j * blocks) * block
-        i1 = min(i0 + block, nx)
-        acc = np.zeros((block, nz), np.float32)
-        for v in range(views):
-            c = cosines[v]
-            offset = y[j] * sines[v] + axis_cols[v]
-            for i in range(i0, i1):
-                t = x[i] * c + offset
-                if t < -0.5 or t > cols - 0.5:
-                    continue
-                t = min(max(t, 0.0), cols - 1.0)
-                col = math.floor(t)
-                upper = min(col + 1, cols - 1)
-                w1 = np.float32(t - col)
-                w0 = np.float32(1) - w1
-                a = acc[i - i0]
-                p0 = filtered[v, col]
-                p1 = filtered[v, upper]
-                for k in range(nz):
-                    a[k] += w0 * p0[k] + w1 * p1[k]
-        for k in range(nz):
-            for i in range(i0, i1):
-                out[k, j, i] = acc[i - i0, k]
+def _known(filter: str) -> None:
+    if filter not in get_args(Filter):
+        raise ValueError(f"unknown filter {filter!r}; use one of {', '.join(get_args(Filter))}")
 
 
-def _rows_at(projections: NDArray[np.float32], rows: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Views [view, len(rows), col] at fractional rows by linear interpolation; rows off the detector are zero."""
-    n = projections.shape[1]
-    inside = (rows >= -0.5) & (rows <= n - 0.5)
-    clamped = np.clip(rows, 0, n - 1)
+@dataclass(frozen=True, eq=False)
+class FbpPlan:
+    """FBP of a scan, ready to reconstruct any block of slices.
+
+    Attributes:
+        geometry, grid, filter: as given.
+        share: float32 [view, 1, col], quadrature weight of each ray.
+        zeros: columns of zeros wanted before and after these.
+        rows: [z], detector rows at which an unshifted view sees the slices.
+        back_project: (columns [view, 1 + col + 1, 16], out [z, y, x]).
+    """
+
+    geometry: Geometry
+    grid: Grid
+    filter: Filter
+    share: F32
+    zeros: tuple[int, int]
+    rows: F64
+    back_project: Callable[[F32, F32], None]
+
+    @property
+    def blocks(self) -> list[slice]:
+        """Slices of the volume that are reconstructed together."""
+        return [slice(first, min(first + SLICES, self.rows.size)) for first in range(0, self.rows.size, SLICES)]
+
+    def rows_of(self, part: slice) -> tuple[int, int]:
+        """First and end of the detector rows that show these slices in any view; one row at least."""
+        rows, shifts = self.rows[part], self.geometry.shifts[:, 1]
+        last = self.geometry.detector_shape[0] - 1
+        low = np.clip(math.floor(rows.min() + shifts.min()), 0, last)
+        return int(low), int(np.clip(math.floor(rows.max() + shifts.max()) + 1, low, last)) + 1
+
+
+def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
+    """What `fbp` does before it looks at the data.
+
+    Raises:
+        ValueError: as `fbp`, for the filter and the geometry.
+    """
+    _known(filter)
+    if geometry.is_cone:
+        raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
+    if not geometry.is_straight:
+        raise ValueError("FBP takes straight views only; these are rolled or tilted: rotate the images first")
+    z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
+    weights, zeros = ray_weights(geometry)
+    axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
+    cols = geometry.detector_shape[1] + sum(zeros)
+    back_project = partial(ray_by_ray, geometry.angles, axis_cols, x, y)
+    response = partial(_transfer, pixel_pitch=1.0, filter=filter)
+    if gridding_pays(geometry.n_views, cols, (y.size, x.size), z.size, response):
+        back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
+    share = weights.astype(np.float32)[:, None]
+    return FbpPlan(geometry, grid, filter, share, zeros, z + geometry.axis_row, back_project)
+
+
+def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32) -> None:
+    """Reconstruct the slices of a block.
+
+    Args:
+        projections: float32 [view, row, col]: the detector rows `plan.rows_of(part)`, or more.
+        first: number of the first of these rows.
+        part: one of `plan.blocks`.
+        out: float32 [z, y, x], the slices.
+
+    Raises:
+        ValueError: values are not finite.
+    """
+    geometry, rows = plan.geometry, plan.rows[part]
+    columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
+    for begin in range(0, geometry.n_views, _VIEWS):
+        views = slice(begin, begin + _VIEWS)
+        weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
+        weighed *= plan.share[views]
+        if any(plan.zeros):
+            weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
+        filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
+        if not np.isfinite(filtered).all():
+            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
+        columns[views, 1:-1, : rows.size] = filtered.transpose(0, 2, 1)
+    columns[:, 0], columns[:, -1] = columns[:, 1], columns[:, -2]
+    plan.back_project(columns, out)
+
+
+def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
+    """Views [view, len(rows), col] at fractional rows by linear interpolation; rows off the detector are zero.
+
+    `projections` holds the rows from `first` on of a detector of `height` rows.
+    """
+    inside = (rows >= -0.5) & (rows <= height - 0.5)
+    clamped = np.clip(rows, 0, height - 1)
     lower = np.floor(clamped).astype(np.intp)
     weight = (clamped - lower).astype(np.float32)
     if np.array_equal(rows, lower):
-        return projections[:, lower]
-    upper = np.minimum(lower + 1, n - 1)
-    low_part = projections[:, lower] * np.where(inside, 1 - weight, 0).astype(np.float32)[:, None]
-    return low_part + projections[:, upper] * np.where(inside, weight, 0).astype(np.float32)[:, None]
+        return projections[:, lower - first]
+    upper = np.minimum(lower + 1, height - 1)
+    low_part = projections[:, lower - first] * np.where(inside, 1 - weight, 0).astype(np.float32)[:, None]
+    return low_part + projections[:, upper - first] * np.where(inside, weight, 0).astype(np.float32)[:, None]
 
 
-def _slab(projections: NDArray[np.float32], geometry: Geometry, rows: NDArray[np.float64]) -> NDArray[np.float32]:
-    """All views at the detector rows that show the same heights, each where it was shifted to."""
-    if not geometry.shifts[:, 1].any():
-        return _rows_at(projections, rows)
-    moved = zip(projections, geometry.shifts[:, 1], strict=True)
-    return np.concatenate([_rows_at(view[None], rows + shift) for view, shift in moved])
+def _slab(projections: F32, shifts: F64, rows: F64, first: int, height: int) -> F32:
+    """Views at the detector rows that show the same heights, each where it was shifted to."""
+    if not shifts.any():
+        return _rows_at(projections, rows, first, height)
+    moved = zip(projections, shifts, strict=True)
+    return np.concatenate([_rows_at(view[None], rows + shift, first, height) for view, shift in moved])
 
 
 def fbp(
-    projections: NDArray[np.float32], geometry: Geometry, grid: Grid | None = None, filter: Filter = "ram-lak"
-) -> NDArray[np.float32]:
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid | None = None,
+    filter: Filter = "ram-lak",
+    on_block: Callable[[int, int], None] = lambda done, of: None,
+) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
-    Voxels take the filtered views by linear interpolation at their centres: for voxels larger than a pixel bin the
-    projections first. A voxel that a view does not see gets nothing from that view, unless its opposite does: a full
-    turn with the axis off the middle of the detector, or beside it, reaches as far as its far columns.
+    Voxels take the filtered views by linear interpolation at their centres, many of them by gridding, which is within
+    1e-3 of the peak (see `recon.voxels.back_project`): for voxels larger than a pixel bin the projections first. A
+    voxel that a view does not see gets nothing from that view, unless its opposite does: a full turn with the axis off
+    the middle of the detector, or beside it, reaches as far as its far columns.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: where the views' rays run.
         grid: voxels wanted; None: one a pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
+        on_block: told after each block of slices how many of how many slices are there.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
@@ -150,28 +224,9 @@ def fbp(
         raise ValueError(
             f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
         )
-    if geometry.is_cone:
-        raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
-    if not geometry.is_straight:
-        raise ValueError("FBP takes straight views only; these are rolled or tilted: rotate the images first")
-    grid = Grid.matching(geometry) if grid is None else grid
-    pitch = geometry.pixel_pitch
-    z, y, x = (axis / pitch for axis in grid.coordinates())
-    rows = z + geometry.axis_row
-    weights, zeros = ray_weights(geometry)
-    axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
-    share = weights.astype(np.float32)[:, None]
-    out = np.empty(grid.shape, np.float32)
-    views, cols = geometry.n_views, geometry.detector_shape[1] + sum(zeros)
-    slab = int(np.clip(_SLAB_BYTES // (4 * views * cols), 8, 64))
-    for start in range(0, rows.size, slab):
-        part = slice(start, start + slab)
-        weighed = _slab(projections, geometry, rows[part]) * share
-        if any(zeros):
-            weighed = np.pad(weighed, ((0, 0), (0, 0), zeros))
-        filtered = filter_projections(weighed, pitch, filter)
-        if not np.isfinite(filtered).all():
-            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
-        columns = np.ascontiguousarray(filtered.transpose(0, 2, 1))
-        _back_project(columns, np.cos(geometry.angles), np.sin(geometry.angles), axis_cols, x, y, out[part])
+    plan = plan_fbp(geometry, Grid.matching(geometry) if grid is None else grid, filter)
+    out = np.empty(plan.grid.shape, np.float32)
+    for part in plan.blocks:
+        fbp_block(plan, projections, 0, part, out[part])
+        on_block(part.stop, len(out))
     return out

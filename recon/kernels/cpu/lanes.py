@@ -174,6 +174,18 @@ def root(typing_context, lanes):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def quarter_turn(typing_context, lanes):  # type: ignore[no-untyped-def]
+    """i times eight complex numbers: (a, b) becomes (-b, a) in each pair of lanes."""
+
+    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        swapped = ir.Constant(_VI, [lane ^ 1 for lane in range(WIDTH)])
+        signs = ir.Constant(_VF, [-1.0, 1.0] * (WIDTH // 2))
+        return builder.fmul(builder.shuffle_vector(args[0], _constant(0.0), swapped), signs)
+
+    return LANES(LANES), code
+
+
+@intrinsic
 def positive(typing_context, lanes):  # type: ignore[no-untyped-def]
     """max(x, 0) a lane."""
 
