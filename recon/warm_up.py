@@ -12,12 +12,15 @@ from numba.core import event
 
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method
+from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
+from recon.voxels.back_project import compile_gridding
+from recon.voxels.fbp import is_gridded
 from recon.voxels.view_weights import covers_the_circle
 
 _SHAPE, _VIEWS = (12, 16), 4
@@ -55,6 +58,8 @@ def warm_up(
         weights[::2, 3, 4] = 0  # views with and without go different ways
     with _counted(on_kernel or (lambda n: None)):
         reconstruct(data, views, (method or R2()).toy(), device=device, use=DataUse(weights))
+        if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
+            compile_gridding()
 
 
 @contextmanager

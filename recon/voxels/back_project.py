@@ -294,6 +294,13 @@ def ray_by_ray(angles: F64, axis_cols: F64, x: F64, y: F64, columns: F32, out: F
     _ray_by_ray(columns, np.cos(angles), np.sin(angles), axis_cols, x, y, out)
 
 
+def compile_gridding() -> None:
+    """Grid a slice of nothing, so that its kernels are compiled."""
+    angles, x = np.arange(2.0), np.arange(4.0)
+    plan = gridding(angles, np.full(2, 2.0), 4, x, x, lambda n: np.ones(n // 2 + 1, np.float32))
+    by_gridding(plan, columns_of(2, 4), np.empty((1, 4, 4), np.float32))
+
+
 def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]) -> bool:
     """Whether gridding takes less time than going ray by ray, by what both took on two cores (docs/performance.md)."""
     points = views * _frequencies(max(cols, *voxels), response)[0].size

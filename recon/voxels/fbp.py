@@ -132,11 +132,20 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
     cols = geometry.detector_shape[1] + sum(zeros)
     back_project = partial(ray_by_ray, geometry.angles, axis_cols, x, y)
-    response = partial(_transfer, pixel_pitch=1.0, filter=filter)
-    if gridding_pays(geometry.n_views, cols, (y.size, x.size), z.size, response):
+    if is_gridded(geometry, grid, filter):
+        response = partial(_transfer, pixel_pitch=1.0, filter=filter)
         back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
     share = weights.astype(np.float32)[:, None]
     return FbpPlan(geometry, grid, filter, share, zeros, z + geometry.axis_row, back_project)
+
+
+def is_gridded(geometry: Geometry, grid: Grid, filter: Filter) -> bool:
+    """Whether FBP of these views grids the slices; never of a cone, or of rolled or tilted views."""
+    if geometry.is_cone or not geometry.is_straight:
+        return False
+    response = partial(_transfer, pixel_pitch=1.0, filter=filter)
+    nz, ny, nx = grid.shape
+    return gridding_pays(geometry.n_views, geometry.detector_shape[1], (ny, nx), nz, response)
 
 
 def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32) -> None:
