@@ -141,12 +141,12 @@ def trials(data: Mapping[str, Any]) -> str:
 def fit(data: Mapping[str, Any]) -> str:
     """n/N, rate, views, Gaussians (iterations have none), residuals and time left, of a `progress` event of a fit."""
     step, steps = data["step"], data["steps"]
-    word = "steps" if data["n_gaussians"] else "iterations"
+    word = data.get("unit") or ("steps" if data["n_gaussians"] else "iterations")
     parts = [f"{step}/{steps} {word}"] if steps else []
     parts += [f"{data['per_s']:.3g} {word}/s"] if data.get("per_s") else []
     parts += [f"{data['n_views']} views"]
     parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []
-    if data["residual"] is not None:
+    if data["residual"] is not None and math.isfinite(data["residual"]):
         parts.append(f"residual {data['residual']:.4f}")
     unseen = data.get("held_out")  # another process's NaN comes as None
     if unseen is not None and math.isfinite(unseen):

@@ -39,7 +39,8 @@ def reconstruct_file(
 ) -> dict[str, float]:
     """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
 
-    A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`.
+    A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`. One by a direct
+    method is interrupted like all else, with nothing written.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -71,7 +72,8 @@ def reconstruct_file(
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
-    with stop_scope() as stopped:
+    # A direct method has no volume so far: a signal interrupts it, and nothing is written.
+    with (never_stopped if options.method.traits.direct else stop_scope)() as stopped:
         job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn)
         if options.budget is not None:
             outcome, prepared, factor = _within_budget(job, options.budget)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,10 +15,14 @@ from beamline.projections.prepare import PreparedProjections
 from beamline.storage import hdf5
 from beamline.storage.volume_file import read_volume
 from recon.assess import metrics
+from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.projector import data_residual
+from recon.voxels.projector import residual_norms
+
+F32 = NDArray[np.float32]
 
 _RESIDUAL_VIEWS = 16
+_RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
 _VOLUME_PATHS = ("entry/data/data", "volume", "data")
 
 
@@ -77,11 +82,15 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a good volume (k-means), to judge others of the same sample by; None without two."""
+    """Dense and empty regions of a good volume (k-means), to judge others of the same sample by; None without two.
+
+    They are those of `metrics.sampled` of the volume.
+    """
     try:
-        return metrics.kmeans_mask(volume.data, seed)
+        found = metrics.kmeans_mask(metrics.sampled(volume.data), seed)
     except ValueError:
         return None
+    return found if (found == 0).any() and (found == 1).any() else None
 
 
 def measure(
@@ -90,28 +99,55 @@ def measure(
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
     With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. Always: the residual
-    in up to 16 of the views used, and in the views held out where there are any.
+    in up to 16 of the views used, and in the views held out where there are any; of a detector with more than 2^17
+    pixels in bands of rows that have so many.
     """
     values: dict[str, float] = {}
     if truth is not None:
         values["psnr"] = metrics.psnr(truth.data, volume.data)
         values["ssim3d"] = metrics.ssim3d(truth.data, volume.data)
         values["nrmse"] = metrics.nrmse(truth.data, volume.data)
-    if mask is not None and {0, 1} <= set(np.unique(mask).tolist()):
-        values["snr"], values["cnr"] = metrics.snr_cnr(volume.data, mask)
+    if mask is not None:
+        values["snr"], values["cnr"] = metrics.snr_cnr(metrics.sampled(volume.data), mask)
     n = prepared.geometry.n_views
     some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
     weights = prepared.ray_weights()
-    values["residual"] = data_residual(
-        volume, prepared.projections.data[some], prepared.geometry.select(some), _known(weights, some)
-    )
+    values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights)
     if prepared.held_out is not None:
         data, unseen = prepared.held_out
         weights = prepared.ray_weights(unseen.n_views)
-        values["residual_held_out"] = data_residual(volume, data, unseen, _known(weights, slice(n, None)))
+        later = None if weights is None else weights[n:]
+        values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later)
     return {name: float(value) for name, value in values.items()}
 
 
-def _known(weights: NDArray[np.float32] | None, views: NDArray[np.int64] | slice) -> NDArray[np.float32] | None:
-    """1 for rays of these views that weigh anything, 0 for those that were not measured; None: all were."""
-    return None if weights is None else (weights[views] > 0).astype(np.float32)
+def _residual(
+    volume: Volume, data: NDArray[np.float32], geometry: Geometry, views: NDArray[np.int64], weights: F32 | None
+) -> float:
+    """Of these views, rays that were not measured left out: what the volume does not explain of them."""
+    left = total = 0.0
+    some = geometry.select(views)
+    for rows in residual_bands(volume.grid, some):
+        part = some if rows == slice(0, some.detector_shape[0]) else some.rows(rows.start, rows.stop)
+        lines = volume
+        if part is not some:
+            height = (part.middle_height, *volume.grid.centre[1:])
+            grid = replace(volume.grid, shape=(part.detector_shape[0], *volume.grid.shape[1:]), centre=height)
+            lines = Volume(volume.data[rows], grid)
+        known = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
+        found, scale = residual_norms(lines, data[views, rows], part, known)
+        left, total = left + found**2, total + scale**2
+    if total == 0:
+        raise ValueError("projections are all zero, so there is nothing to explain")
+    return float(np.sqrt(left / total))
+
+
+def residual_bands(grid: Grid, geometry: Geometry) -> list[slice]:
+    """Bands of rows that stand for all: all, unless the detector is large and its rows are the volume's slices."""
+    rows, cols = geometry.detector_shape
+    bands = max(1, _RESIDUAL_RAYS // (_RESIDUAL_ROWS * cols))
+    on_rows = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
+    if rows <= bands * _RESIDUAL_ROWS or not on_rows:
+        return [slice(0, rows)]
+    starts = (np.arange(bands) + 0.5) * rows / bands - _RESIDUAL_ROWS / 2
+    return [slice(first, first + _RESIDUAL_ROWS) for first in starts.astype(int).tolist()]

@@ -22,6 +22,7 @@ from recon.base.volume import Grid, Volume
 Window = tuple[float, float]
 _DPI = 110
 _WIDTH = 8.6  # inches; the report's column
+_LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
 
@@ -241,13 +242,16 @@ def _decibels(
 
 def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
     """[z, y, x] of the centre of mass of the voxels brighter than half the grey window; the middle if none are."""
-    low, high = grey_window([data[::2, ::2, ::2]])
-    bright = np.clip(data - (low + high) / 2, 0, high - low)
+    steps = [max(1, n // _LOOKED_AT) for n in data.shape]
+    few = data[:: steps[0], :: steps[1], :: steps[2]]
+    low, high = grey_window([few[::2, ::2, ::2]])
+    bright = np.clip(few - (low + high) / 2, 0, high - low)
     total = float(bright.sum(dtype=np.float64))
     if total == 0:
         return data.shape[0] // 2, data.shape[1] // 2, data.shape[2] // 2
     marginals = (bright.sum(axis=axes, dtype=np.float64) for axes in ((1, 2), (0, 2), (0, 1)))
-    return tuple(round(float(m @ np.arange(m.size)) / total) for m in marginals)  # type: ignore[return-value]
+    centre = (step * float(m @ np.arange(m.size)) / total for step, m in zip(steps, marginals, strict=True))
+    return tuple(round(at) for at in centre)
 
 
 def _edges(centre: float, n: int, size: float) -> tuple[float, float]:

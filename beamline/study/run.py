@@ -89,7 +89,7 @@ class _Judge:
         if self.truth is not None:
             found |= {"psnr_truth": metrics.psnr(self.truth, volume), "ssim_truth": metrics.ssim3d(self.truth, volume)}
         if self.mask is not None:
-            found["snr"], found["cnr"] = metrics.snr_cnr(volume, self.mask)
+            found["snr"], found["cnr"] = metrics.snr_cnr(metrics.sampled(volume), self.mask)
         return found
 
 

@@ -10,6 +10,8 @@ from scipy.cluster.vq import kmeans2
 _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _SLAB = 32  # slices at a time
+_MOST = 2**24  # voxels that regions and their noise are judged by
+_PART = 2**22  # values whose errors are summed at a time
 
 Array = NDArray[np.floating]
 
@@ -30,17 +32,23 @@ def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
     top = float(truth.max()) if peak is None else peak
     if not top > 0:
         raise ValueError(f"the peak must be positive, got {top}; give one where the truth has no positive value")
-    error = float(np.mean(np.subtract(volume, truth, dtype=np.float64) ** 2))
+    error = _squared_error(truth, volume) / truth.size
     return float(10 * np.log10(top**2 / error)) if error else float("inf")
+
+
+def _squared_error(truth: Array, volume: Array) -> float:
+    step = max(1, _PART * len(truth) // truth.size)
+    parts = (slice(first, first + step) for first in range(0, len(truth), step))
+    return sum(float(np.sum(np.subtract(volume[p], truth[p], dtype=np.float64) ** 2)) for p in parts)
 
 
 def nrmse(truth: Array, volume: Array) -> float:
     """Root mean squared error over the root mean square of the truth: ‖volume - truth‖ / ‖truth‖."""
     _same_shape(truth, volume)
-    norm = float(np.linalg.norm(np.asarray(truth, np.float64).ravel()))
+    norm = np.sqrt(_squared_error(np.broadcast_to(truth.dtype.type(0), truth.shape), truth))
     if norm == 0:
         raise ValueError("the truth is zero everywhere: a relative error is not defined")
-    return float(np.linalg.norm(np.subtract(volume, truth, dtype=np.float64).ravel())) / norm
+    return float(np.sqrt(_squared_error(truth, volume)) / norm)
 
 
 def _data_range(truth: Array, data_range: float | None) -> float:
@@ -118,6 +126,14 @@ def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> floa
     return float(np.mean(means))
 
 
+def sampled(volume: Array) -> Array:
+    """Every k-th voxel along each axis, as a view, so that a large volume has at most 2^24 of them; else all."""
+    steps = [1, 1, 1]
+    while np.prod([-(-n // step) for n, step in zip(volume.shape, steps, strict=True)]) > _MOST:
+        steps[int(np.argmax(np.divide(volume.shape, steps)))] += 1
+    return volume[:: steps[0], :: steps[1], :: steps[2]]
+
+
 def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[slice, slice, slice]:
     """The largest box inside the cylinder that every view sees, less a margin: (z, y, x) slices.
 
@@ -151,11 +167,11 @@ def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np
         ValueError: where all voxels have the same value or some are not finite.
     """
     box = inscribed_cuboid(volume.shape, margin)
-    values = np.asarray(volume[box], np.float64).ravel()
+    values = volume[box].ravel()
     if not np.isfinite(values).all():
         raise ValueError("the volume holds NaN or infinite values")
     rng = np.random.default_rng(seed)
-    sample = values if values.size <= _SAMPLE else rng.choice(values, _SAMPLE, replace=False)
+    sample = np.asarray(values if values.size <= _SAMPLE else rng.choice(values, _SAMPLE, replace=False), np.float64)
     if np.ptp(sample) == 0:
         raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to separate")
     centres, _ = kmeans2(sample[:, None], 2, iter=30, minit="++", rng=rng)

@@ -35,6 +35,8 @@ class Progress:
         residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.
         n_gaussians, n_views: in the model and in the data.
         held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN where there are none.
+        unit: what steps are where they are no steps of a fit and no iterations, such as slices; loss and residual are
+            NaN there.
     """
 
     step: int
@@ -45,6 +47,7 @@ class Progress:
     n_gaussians: int
     n_views: int
     held_out: float = float("nan")
+    unit: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +69,9 @@ class RunControl:
     """How a caller watches, ends and continues a reconstruction.
 
     Attributes:
-        should_stop: asked between steps or iterations; True ends the reconstruction with the volume so far.
-        on_progress: called about ten times a second, or after each iteration; direct methods do not call it.
+        should_stop: asked between steps or iterations; True ends the reconstruction with the volume so far. Direct
+            methods do not ask.
+        on_progress: called about ten times a second, after each iteration, or each sixteen slices of FBP.
         on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
         checkpoint_every: s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self, get_args
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import Depth, MethodResult, Progress, ReconProblem, RunControl, Traits, TrialSettings
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import Filter, fbp
 from recon.voxels.fdk import fdk
@@ -41,7 +42,14 @@ class Fbp:
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         filled = masked(problem.projections, problem.use.weights)[0]
-        data = direct(filled, problem.geometry, problem.grid, self.filter)
+        begin, views = control.now(), problem.geometry.n_views
+
+        def told(done: int, slices: int) -> None:
+            if control.on_progress is not None:
+                nan = math.nan
+                control.on_progress(Progress(done, slices, control.now() - begin, nan, nan, 0, views, unit="slices"))
+
+        data = direct(filled, problem.geometry, problem.grid, self.filter, told)
         return MethodResult(Volume(data, problem.grid), {"filter": self.filter})
 
     def toy(self) -> Self:
@@ -55,9 +63,17 @@ class Fbp:
         return n_views / binning**3
 
 
-def direct(projections: F32, geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp` and `fdk`."""
-    return (fdk if geometry.is_cone else fbp)(projections, geometry, grid, filter)
+def direct(
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid,
+    filter: Filter = "ram-lak",
+    on_block: Callable[[int, int], None] = lambda done, of: None,
+) -> F32:
+    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone calls `on_block`, and `fdk`."""
+    if geometry.is_cone:
+        return fdk(projections, geometry, grid, filter)
+    return fbp(projections, geometry, grid, filter, on_block)
 
 
 def has_direct_method(geometry: Geometry) -> bool:

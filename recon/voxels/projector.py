@@ -173,14 +173,22 @@ def data_residual(
     Raises:
         ValueError: if `projections` does not fit `geometry`, or is all zero.
     """
+    left, scale = residual_norms(volume, projections, geometry, weights)
+    if scale == 0:
+        raise ValueError("projections are all zero, so there is nothing to explain")
+    return left / scale
+
+
+def residual_norms(
+    volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
+) -> tuple[float, float]:
+    """||A x - p|| and ||p||; see `data_residual`."""
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:
         raise ValueError(f"projections have shape {projections.shape}, their geometry says {expected}")
     root = np.float32(1) if weights is None else np.sqrt(weights)
-    scale = float(np.linalg.norm(root * projections))
-    if scale == 0:
-        raise ValueError("projections are all zero, so there is nothing to explain")
-    return float(np.linalg.norm(root * (project(volume, geometry) - projections))) / scale
+    left = float(np.linalg.norm(root * (project(volume, geometry) - projections)))
+    return left, float(np.linalg.norm(root * projections))
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:

@@ -19,7 +19,8 @@ from recon.assess.plans import Speeds
 from recon.base.method import Progress
 from recon.splatting import optimise as fit
 from recon.voxels import direct
-from recon.voxels.fbp import fbp
+from recon.voxels import fbp as fbp_module
+from recon.voxels.fbp import FbpPlan, fbp, fbp_block
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -99,9 +100,24 @@ def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, mo
     assert record.parameters["ended_early"] and record.history["step"][-1] == 5
 
 
-@pytest.mark.parametrize("options", [["-m", "fbp"], ["--budget", "20s"]])
-def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_fbp_that_is_interrupted_ends_at_once_and_leaves_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    def interrupted(plan: FbpPlan, *arguments: Any) -> None:
+        if plan.geometry.n_views == SCAN.angles.size:  # not the toy that is reconstructed before
+            signal.raise_signal(number)
+        fbp_block(plan, *arguments)
+
+    monkeypatch.setattr(fbp_module, "fbp_block", interrupted)
+    before = set(folder.iterdir())
+    result = beamline("recon", "scan.h5", "-m", "fbp", "-o", "out.h5")
+    assert result.exit_code == 130, result.output
+    assert set(folder.iterdir()) == before
+
+
+def test_an_fbp_that_is_interrupted_within_a_budget_is_complete_all_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: Any) -> Any:
         if arguments[1].n_views == SCAN.angles.size:  # not the toy that is reconstructed before
@@ -110,7 +126,7 @@ def test_an_fbp_that_is_interrupted_is_complete_all_the_same(
 
     monkeypatch.setattr(direct, "fbp", interrupted)
     monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1, 1e6))
-    result = beamline("recon", "scan.h5", *options, "-o", "out.h5", "--no-report")
+    result = beamline("recon", "scan.h5", "--budget", "20s", "-o", "out.h5", "--no-report")
     assert result.exit_code == 0, result.output
     assert "as soon as there is a volume" in result.stderr and "stopped early" not in result.output
     parameters = read_reconstruction(folder / "out.h5").parameters

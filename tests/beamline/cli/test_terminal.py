@@ -142,6 +142,14 @@ def test_iterations_are_told_as_such() -> None:
     assert fit(progress) == "3/40 iterations, 0.5 iterations/s, 60 views, residual 0.2000, 0:01:14 left"
 
 
+def test_slices_are_told_as_such() -> None:
+    progress = {
+        "step": 32, "steps": 128, "n_views": 900, "n_gaussians": 0, "residual": math.nan, "held_out": math.nan,
+        "per_s": 2.0, "eta_s": 48.0, "unit": "slices",
+    }  # fmt: skip
+    assert fit(progress) == "32/128 slices, 2 slices/s, 900 views, 0:00:48 left"
+
+
 def test_the_same_snapshot_is_said_once() -> None:
     snapshot = ("snapshot", {"n_views": 40, "path": "v.h5"})
     text = shown(io.StringIO(), snapshot, ("frame", FRAME), snapshot, ("snapshot", {"n_views": 60, "path": "v.h5"}))

@@ -10,6 +10,7 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepare import PreparedProjections
+from beamline.reconstruct import measure as module
 from beamline.reconstruct.measure import fit_truth, measure, read_truth, regions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -104,6 +105,21 @@ def test_without_a_truth_the_background_tells(rng: np.random.Generator) -> None:
     assert set(values) == {"snr", "cnr", "residual"}
     assert values["snr"] == pytest.approx(40, abs=1.5)  # 20 log10(1 / 0.01)
     assert values["cnr"] == pytest.approx(40, abs=1.5)
+
+
+def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+    """What is measured in four bands of sixteen of 200 rows, each slice alike, is what all rows give."""
+    ball = _ball_in((200, 24, 24))
+    flat = Volume(
+        np.repeat(ball.data[100:101], 200, axis=0) * rng.normal(1, 0.1, (24, 24)).astype(np.float32), ball.grid
+    )
+    prepared = _prepared(flat)
+    wrong = Volume(flat.data * np.linspace(0.8, 1.0, 24, dtype=np.float32), ball.grid)
+    whole = measure(wrong, prepared, None, None)["residual"]
+    monkeypatch.setattr(module, "_RESIDUAL_RAYS", 4 * 16 * 24)
+    bands = module.residual_bands(ball.grid, prepared.geometry)
+    assert [band.stop - band.start for band in bands] == [16] * 4 and bands[0].start > 0 and bands[-1].stop < 200
+    assert measure(wrong, prepared, None, None)["residual"] == pytest.approx(whole, rel=1e-5)
 
 
 def test_a_volume_without_two_regions_has_no_snr() -> None:

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.assess.metrics import inscribed_cuboid, kmeans_mask, nrmse, psnr, snr_cnr, ssim2d, ssim3d
+from recon.assess import metrics
+from recon.assess.metrics import inscribed_cuboid, kmeans_mask, nrmse, psnr, sampled, snr_cnr, ssim2d, ssim3d
 
 
 def blobs(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -28,12 +29,12 @@ def test_psnr_of_a_constant_error(peak: float, error: float) -> None:
 
 
 def test_psnr_and_nrmse_agree_with_skimage(rng: np.random.Generator) -> None:
-    metrics = pytest.importorskip("skimage.metrics")
+    theirs_of = pytest.importorskip("skimage.metrics")
     truth = blobs(rng, (8, 9, 10)).astype(np.float32)
     volume = (truth + rng.normal(0, 0.1, truth.shape)).astype(np.float32)
-    theirs = metrics.peak_signal_noise_ratio(truth, volume, data_range=float(truth.max()))
+    theirs = theirs_of.peak_signal_noise_ratio(truth, volume, data_range=float(truth.max()))
     assert psnr(truth, volume) == pytest.approx(theirs, abs=1e-4)
-    assert nrmse(truth, volume) == pytest.approx(metrics.normalized_root_mse(truth, volume), rel=1e-5)
+    assert nrmse(truth, volume) == pytest.approx(theirs_of.normalized_root_mse(truth, volume), rel=1e-5)
     assert psnr(truth, truth) == np.inf
     assert nrmse(truth, truth) == 0
 
@@ -43,10 +44,10 @@ def test_psnr_and_nrmse_agree_with_skimage(rng: np.random.Generator) -> None:
 def test_ssim2d_is_skimage_on_the_interior(
     rng: np.random.Generator, shape: tuple[int, int], data_range: float | None
 ) -> None:
-    metrics = pytest.importorskip("skimage.metrics")
+    theirs_of = pytest.importorskip("skimage.metrics")
     truth = blobs(rng, shape)
     image = truth + rng.normal(0, 0.2, shape)
-    theirs = metrics.structural_similarity(
+    theirs = theirs_of.structural_similarity(
         truth,
         image,
         data_range=np.ptp(truth) if data_range is None else data_range,
@@ -131,6 +132,21 @@ def test_snr_of_exact_numbers() -> None:
     flat = np.array([[[5.0, 5.0, 1.0, 1.0]]])
     assert snr_cnr(flat, mask[..., :4]) == (np.inf, np.inf)
     assert snr_cnr(-flat, mask[..., :4]) == (-np.inf, np.inf)
+
+
+@given(shape=st.tuples(*3 * [st.integers(1, 9000)]))
+def test_a_sample_of_a_large_volume_is_bounded(shape: tuple[int, int, int]) -> None:
+    volume = np.broadcast_to(np.float32(0), shape)
+    found = sampled(volume)
+    assert found.size <= 2**24
+    assert found.shape == shape or found.size > 2**24 / 8
+
+
+def test_errors_are_summed_in_parts_as_at_once(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+    truth, volume = rng.random((2, 7, 5, 3))
+    whole = psnr(truth, volume), nrmse(truth, volume)
+    monkeypatch.setattr(metrics, "_PART", 30)
+    assert (psnr(truth, volume), nrmse(truth, volume)) == pytest.approx(whole, rel=1e-12)
 
 
 @given(shape=st.tuples(st.integers(1, 40), st.integers(1, 60), st.integers(1, 60)), margin=st.floats(0, 0.49))
