@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -22,48 +22,51 @@ _COLUMNS, _WIDTH, _DPI = 4, 8.6, 110
 
 
 class Slices:
-    """The slice [y, x] of each volume through the bright parts of the first one, by label.
-
-    Attributes:
-        families: of rows, of which one is enough.
-    """
+    """The slice [y, x] of each volume through the bright parts of the first one, by label."""
 
     def __init__(self, first: F32, label: str) -> None:
         self._at = bright_centre(first)[0]
         self._shown: dict[str, F32] = {label: first[self._at].copy()}
-        self.families: set[str] = set()
+        self._drawn: set[tuple[str, str]] = set()
 
-    def add(self, label: str, volume: F32, family: str = "") -> None:
+    def add(self, label: str, volume: F32, family: str = "", method: str = "") -> None:
+        """One more; of the rows of one family by one method the first alone."""
+        if family and (family, method) in self._drawn:
+            return
+        self._drawn.add((family, method))
         self._shown[label] = volume[self._at].copy()
-        self.families |= {family} - {""}
-
-    def png(self, labels: list[str]) -> bytes:
-        """These slices, four beside one another, in the grey window of the first."""
-        window = Normalize(*grey_window([self._shown[labels[0]]]))
-        down = -(-len(labels) // _COLUMNS)
-        rows, cols = self._shown[labels[0]].shape
-        figure = Figure(
-            figsize=(_WIDTH, (_WIDTH / _COLUMNS * rows / cols + 0.25) * down), dpi=_DPI, layout="constrained"
-        )
-        panels = np.ravel(figure.subplots(down, _COLUMNS, squeeze=False))
-        for axes in panels:
-            axes.set_axis_off()
-        for axes, label in zip(panels, labels, strict=False):
-            axes.imshow(self._shown[label], cmap="gray", norm=window, origin="lower", interpolation="nearest")
-            axes.set_title(label.rpartition(": ")[0] or label, fontsize=7)
-        return png(figure)
 
     def labels(self, method: str) -> list[str]:
         """Those of a method, after those that are of no row."""
         return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
+
+    def png(self, labels: Sequence[str]) -> bytes:
+        """These slices, four beside one another, in the grey window of the first."""
+        low, high = grey_window([self._shown[labels[0]]])
+        rows, cols = self._shown[labels[0]].shape
+        head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)
+        # One image: a panel for each slice takes ten times as long to draw.
+        sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
+        size = (_WIDTH, _WIDTH * sheet.shape[0] / sheet.shape[1])
+        figure = Figure(figsize=size, dpi=_DPI)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        for i, label in enumerate(labels):
+            top, left = i // _COLUMNS * (rows + head), i % _COLUMNS * (cols + gap)
+            sheet[top + head : top + head + rows, left : left + cols] = self._shown[label][::-1]  # y grows upwards
+            axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
+        axes.imshow(sheet, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
+        return png(figure)
 
 
 def figures_of_rows(table: StudyTable) -> bytes:
     """Every figure of all rows, a line a method."""
     names, rows = table.names, list(dict.fromkeys(cell.row.label for cell in table.done))
     down = -(-len(names) // 2)
-    figure = Figure(figsize=(_WIDTH, 2.1 * down + 1.6), dpi=_DPI, layout="constrained")
+    height = 2.0 * down + 2.2
+    figure = Figure(figsize=(_WIDTH, height), dpi=_DPI)
     panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
+    figure.subplots_adjust(0.08, 2.1 / height, 0.99, 1 - 0.1 / height, wspace=0.2, hspace=0.12)
     for axes, name in zip(panels, names, strict=False):
         for method in dict.fromkeys(cell.method for cell in table.done):
             cells = [c for c in table.done if c.method == method and math.isfinite(c.figures[name])]

@@ -238,8 +238,8 @@ def _each(
         except KeyboardInterrupt:
             yield table.with_cell(index, replace(cell, status="interrupted", message="ended before it was done"))
             raise
-        if volume is not None and cell.row.family not in slices.families:
-            slices.add(cell.label, volume, cell.row.family)
+        if volume is not None:
+            slices.add(cell.label, volume, cell.row.family, cell.method)
         cell = replace(
             cell, status=outcome.status, figures=figures, seconds=outcome.seconds, cpu_seconds=outcome.cpu_seconds,
             message=outcome.message,

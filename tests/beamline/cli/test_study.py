@@ -15,6 +15,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.study import run as study_run
+from beamline.study.figures import Slices
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.trials import Outcome, Trial
 from recon.base.volume import Grid
@@ -114,6 +115,18 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
     done = [row["row"] for row in _rows(folder / "out") if row["status"] == "done"]
     assert done == ["fixed, 90 views", "random, 90 views, draw 1"]
     assert (folder / "out" / "report.html").is_file() and not (folder / "out" / "work").exists()
+
+
+def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
+    volume = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
+    slices = Slices(volume, "FBP of all views")
+    for method in ("r2", "fbp"):
+        for draw in (1, 2):
+            slices.add(f"random, draw {draw}: {method}", volume, "random", method)
+        slices.add(f"fixed: {method}", volume, "", method)
+    for method in ("r2", "fbp"):
+        assert slices.labels(method) == ["FBP of all views", f"random, draw 1: {method}", f"fixed: {method}"]
+    assert slices.png(slices.labels("r2")).startswith(b"\x89PNG")
 
 
 def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
