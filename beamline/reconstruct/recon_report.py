@@ -124,17 +124,6 @@ class ReportContext:
     scan_flags: Sequence[str] = field(default_factory=tuple)
 
 
-def hiding_text(made: ReconOutcome, left: Unexplained) -> str:
-    """The warning that a volume leaves structure in the views; empty where it does not, or is no fit to the views."""
-    if left.share <= LIMIT or by_name(made.method).traits.direct:
-        return ""
-    return (
-        f"{left.share:.1%} of the matter leaves structure in the residual of the views (at most {LIMIT:.1%} is usual): "
-        f"the {label_of(made.method)} volume may hide cracks, pores or edges. Look at 'What the volume leaves in the "
-        "views' in the report, and compare with --method fbp and fista-tv."
-    )
-
-
 def label_of(method: str) -> str:
     """A method's name for people."""
     return by_name(method).label

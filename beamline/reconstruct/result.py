@@ -13,7 +13,8 @@ from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, hiding_text, label_of
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
+from beamline.reconstruct.remarks import hiding_warning, odd_views_warning
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
@@ -68,10 +69,13 @@ def write_result(
     hiding = ""
     if left is not None:
         metrics[made.method]["unexplained"] = left.share
-        hiding = hiding_text(made, left)
+        hiding = hiding_warning(made, left)
         if hiding:
             sink(Event("warning", clock.now(), {"message": hiding}))
             context = replace(context, warnings=[*context.warnings, hiding])
+    if odd := odd_views_warning(made, prepared, context.selection):
+        sink(Event("warning", clock.now(), {"message": odd}))
+        context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
     if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
         before = clock.now()

@@ -1,0 +1,45 @@
+"""What speaks against a volume, in words: structure that it leaves in the views, parts that are in some views only."""
+
+from __future__ import annotations
+
+from beamline.core.text import count
+from beamline.projections.prepare import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.reconstruct.recon_report import ReconOutcome, label_of
+from recon.methods import by_name
+from recon.voxels import odd_views, unexplained
+
+_NAMED = 5  # odd views, at most
+
+
+def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
+    """The warning that a volume leaves structure in the views; empty where it does not, or is no fit to the views."""
+    if left.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
+        return ""
+    return (
+        f"{left.share:.1%} of the matter leaves structure in the residual of the views (at most "
+        f"{unexplained.LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
+        "at 'What the volume leaves in the views' in the report, and compare with --method fbp and fista-tv."
+    )
+
+
+def odd_views_warning(made: ReconOutcome, prepared: PreparedProjections, selection: Selection) -> str:
+    """The warning that parts of views are not in the volume; empty where there are none, and of direct methods."""
+    if by_name(made.method).traits.direct:
+        return ""
+    found = odd_views.odd_views(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_weights())
+    if not found:
+        return ""
+    first, side = (selection.rows or (0, 0))[0], selection.binning
+    places = [
+        f"frame {prepared.projections.view_ids[odd.view]}, rows {first + odd.rows[0] * side} ... "
+        f"{first + odd.rows[1] * side - 1}, columns {odd.cols[0] * side} ... {odd.cols[1] * side - 1} "
+        f"(absorbs {'more' if odd.score > 0 else 'less'})"
+        for odd in sorted(found, key=lambda odd: -abs(odd.score))[:_NAMED]
+    ]
+    more = f"; and {len(found) - len(places)} more" if len(found) > len(places) else ""
+    return (
+        f"{count(len(found), 'view')} with a part that is not in the volume, by more than {odd_views.LIMIT:g} times "
+        f"what is usual there: {'; '.join(places)}{more}. Something was in the beam, or the sample was elsewhere: look "
+        "at these frames."
+    )

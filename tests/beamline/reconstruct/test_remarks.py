@@ -1,0 +1,56 @@
+"""What speaks against a volume is said with frames and pixels of the file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.projections.prepare import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.reconstruct.recon_report import ReconOutcome
+from beamline.reconstruct.remarks import odd_views_warning
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.prep.correct import Projections
+from recon.voxels.projector import project
+
+FIRST_FRAME, FIRST_ROW = 20, 30
+
+
+def _made(rng: np.random.Generator, specks: dict[int, float], method: str) -> tuple[ReconOutcome, PreparedProjections]:
+    """A ball in views of which some have a speck in their middle, binned 2 x 2 from rows 30 to 78 of frames 20 on."""
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (24, 48))
+    grid = Grid.matching(geometry)
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    volume = Volume((0.05 * (z**2 + y**2 + x**2 < 100)).astype(np.float32), grid)
+    data = project(volume, geometry) + rng.normal(0, 0.02, (40, 24, 48)).astype(np.float32)
+    for view, height in specks.items():
+        data[view, 10:14, 22:26] += height
+    frames = FIRST_FRAME + np.arange(40)
+    projections = Projections(data, frames, 0.0, np.ones(40, np.float32), np.zeros((24, 48), bool))
+    prepared = PreparedProjections(projections, geometry, 0.0, None, None, 40, "mm", "counts")
+    return ReconOutcome(volume, method, 1.0, (), {}), prepared
+
+
+def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.random.Generator) -> None:
+    said = odd_views_warning(
+        *_made(rng, {7: 0.3, 30: -0.5}, "sirt"), Selection(rows=(FIRST_ROW, FIRST_ROW + 48), binning=2)
+    )
+    assert said.startswith("2 views with a part that is not in the volume")
+    assert "frame 27, rows" in said and "frame 50, rows" in said and said.count("(absorbs less)") == 1
+    worst = said.split("frame 50, rows ")[1].split(" (")[0].replace(", columns", " ...").split(" ... ")
+    first, last, left, right = map(int, worst)
+    assert FIRST_ROW + 2 * 10 >= first > FIRST_ROW + 2 * 6 and FIRST_ROW + 2 * 14 <= last + 1 < FIRST_ROW + 2 * 18
+    assert 2 * 22 >= left > 2 * 18 and 2 * 26 <= right + 1 < 2 * 30
+
+
+def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> None:
+    said = odd_views_warning(*_made(rng, dict.fromkeys(range(0, 40, 6), 0.5), "sirt"), Selection())
+    assert said.count("frame ") == 5 and "; and 2 more" in said
+
+
+@pytest.mark.parametrize(("method", "specks"), [("sirt", {}), ("fbp", {7: 0.5})])
+def test_views_like_the_volume_and_direct_methods_are_not_named(
+    rng: np.random.Generator, method: str, specks: dict[int, float]
+) -> None:
+    assert odd_views_warning(*_made(rng, specks, method), Selection()) == ""

@@ -1,0 +1,77 @@
+"""Views of which a part is not in the volume: a speck is named with its place, noise and misfits are not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.voxels.odd_views import LIMIT, odd_views
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+ROWS, COLS, SIGMA = 24, 64, 0.02
+TURN = np.linspace(0, math.pi, 60, endpoint=False)
+GOLDEN = (np.arange(60) * math.pi * (math.sqrt(5) - 1) / 2) % math.pi
+ROW, COL = np.meshgrid(np.arange(ROWS), np.arange(COLS), indexing="ij")
+
+
+def _sample(geometry: Geometry) -> tuple[Volume, F32]:
+    """Two balls in a cylinder, and its line integrals."""
+    grid = Grid.matching(geometry)
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    data = 0.02 * (np.hypot(x, y) < 28) + 0.05 * (z**2 + (y - 10) ** 2 + (x - 5) ** 2 < 25)
+    volume = Volume(data.astype(np.float32), grid)
+    return volume, Projector(geometry, grid).forward(volume.data)
+
+
+def _speck(row: float, col: float, height: float) -> F32:
+    return (height * np.exp(-((ROW - row) ** 2 + (COL - col) ** 2) / 8)).astype(np.float32)
+
+
+@pytest.fixture(params=[TURN, GOLDEN], ids=["sequential", "golden"])
+def geometry(request: pytest.FixtureRequest) -> Geometry:
+    return Geometry.parallel(request.param, (ROWS, COLS))
+
+
+def test_noise_light_and_a_place_that_never_fits_are_not_odd(geometry: Geometry, rng: np.random.Generator) -> None:
+    volume, clean = _sample(geometry)
+    light = rng.normal(0, 0.05, (60, 1, 1))
+    misfit = _speck(8, 20, 0.3) * rng.normal(1, 0.2, (60, 1, 1))
+    views = clean + light + misfit + rng.normal(0, SIGMA, clean.shape)
+    assert odd_views(volume, views.astype(np.float32), geometry) == ()
+
+
+@pytest.mark.parametrize("height", [0.2, -0.2])
+def test_a_speck_in_two_views_is_named_with_its_place(
+    geometry: Geometry, rng: np.random.Generator, height: float
+) -> None:
+    volume, clean = _sample(geometry)
+    views = clean + rng.normal(0, SIGMA, clean.shape).astype(np.float32)
+    views[30:32] += _speck(15, 40, height)
+    found = odd_views(volume, views, geometry)
+    assert [odd.view for odd in found] == [30, 31]
+    for odd in found:
+        assert math.copysign(1, odd.score) == math.copysign(1, height) and abs(odd.score) > LIMIT
+        assert odd.rows[0] <= 15 < odd.rows[1] <= 21 and odd.cols[0] <= 40 < odd.cols[1] <= 46
+
+
+def test_rays_that_were_not_measured_show_nothing(geometry: Geometry, rng: np.random.Generator) -> None:
+    volume, clean = _sample(geometry)
+    views = clean + rng.normal(0, SIGMA, clean.shape).astype(np.float32)
+    views[30, 10:20, 35:45] += 1
+    weights = np.ones_like(views)
+    weights[30, 10:20, 35:45] = 0
+    assert odd_views(volume, views, geometry, weights) == ()
+    assert [odd.view for odd in odd_views(volume, views, geometry)] == [30]
+
+
+def test_few_views_say_nothing() -> None:
+    geometry = Geometry.parallel(TURN[:24], (ROWS, COLS))
+    volume, clean = _sample(geometry)
+    clean[10] += _speck(15, 40, 1.0)
+    assert odd_views(volume, clean, geometry) == ()
