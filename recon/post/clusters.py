@@ -11,7 +11,7 @@ from scipy.cluster.vq import ClusterError, kmeans2
 F64 = NDArray[np.float64]
 
 _SAMPLE = 20_000  # values from which centres are computed
-_STARTS = 4
+_STARTS = 8
 MOST = 6
 
 

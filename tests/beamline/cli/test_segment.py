@@ -31,6 +31,12 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest."""
+    monkeypatch.setattr(segment_run, "picture_of", lambda *_: b"")
+
+
 def _rows(path: Path) -> list[dict[str, float]]:
     with path.open(encoding="utf-8", newline="") as file:
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
@@ -43,6 +49,7 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
     result = beamline("segment", "recon.h5", *MARGIN)
     assert result.exit_code == 0, result.output
     assert left(here) == {"recon.h5", "recon_particles.h5", "recon_particles.csv", "recon_particles.png"}
+    assert (here / "recon_particles.png").read_bytes().startswith(b"\x89PNG")
     assert f"{len(WHOLE)}, 0 of them cut" in result.stdout
     rows = _rows(here / "recon_particles.csv")
     assert [row["volume_mm3"] for row in rows] == sorted((row["volume_mm3"] for row in rows), reverse=True)
@@ -65,6 +72,7 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
         assert file["entry/process/clusters"][()] >= 2
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_lengths_are_voxels_where_nobody_knows_them(here: Path) -> None:
     np.save(here / "can.npy", can())
     result = beamline("segment", "can.npy", *MARGIN, "-o", "a.h5", "--json")
@@ -77,6 +85,7 @@ def test_lengths_are_voxels_where_nobody_knows_them(here: Path) -> None:
         assert one["volume_px3"] * 1e-6 == pytest.approx(other["volume_mm3"], rel=1e-5)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_touching_balls_are_one_without_a_neck(here: Path) -> None:
     np.save(here / "can.npy", can())
     result = beamline("segment", "can.npy", *MARGIN, "--neck", "0")
@@ -126,6 +135,7 @@ def test_napari_that_is_not_there_is_refused_before_the_work(here: Path) -> None
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_napari_gets_the_volume_and_its_labels(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     layers: dict[str, tuple[np.ndarray, tuple[float, ...]]] = {}
 
