@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -30,6 +31,9 @@ from beamline.storage.flag_legend import counted
 from drivers.clock import SystemClock
 from recon.methods import streams
 
+_ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")
+_SAID_WITHIN = 0.2  # s
+
 
 @click.command()
 @config_argument
@@ -48,8 +52,8 @@ from recon.methods import streams
 def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_json: bool, output: Path | None) -> None:
     """Run the scan in CONFIG.
 
-    Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, or SIGTERM, stops the scan
-    cleanly; the second Ctrl-C aborts it. The file is readable in either case.
+    Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, SIGTERM or a terminal that is
+    closed stops the scan cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
     Exit code: 0 done, 2 wrong configuration or violated limit, 3 device failed, 4 stopped, 5 frames missing or disk
     error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, or darks or flats a
@@ -113,23 +117,42 @@ def _live(config: Config, no_live: bool) -> LiveCommand | None:
 
 @contextmanager
 def stop_signals(stop: StopRequest) -> Iterator[None]:
-    """Within the context the first Ctrl-C requests a stop, the second an abort; SIGTERM requests a stop."""
+    """Within the context the first Ctrl-C requests a stop, the second an abort.
+
+    SIGTERM, SIGQUIT, a closed terminal (SIGHUP, unless `nohup` has it ignored) and a closed console of Windows
+    (SIGBREAK) request a stop.
+    """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if stop.stopping:
             stop.abort("Ctrl-C was pressed again")
-            click.echo("Aborting.", err=True)
+            _say("Aborting.")
         else:
             stop.stop("Ctrl-C was pressed")
-            click.echo("Stopping cleanly. Press Ctrl-C again to abort.", err=True)
+            _say("Stopping cleanly. Press Ctrl-C again to abort.")
 
     def terminate(number: int, frame: FrameType | None) -> None:
-        stop.stop("the process received SIGTERM")
+        stop.stop(f"the process received {signal.Signals(number).name}")
 
+    there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+    ending = [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
     with ExitStack() as restore:
-        for number, handler in ((signal.SIGINT, interrupt), (signal.SIGTERM, terminate)):
+        for number in (signal.SIGINT, *ending):
+            handler = interrupt if number == signal.SIGINT else terminate
             restore.callback(signal.signal, number, signal.signal(number, handler))
         yield
+
+
+def _say(text: str) -> None:
+    """Print in a thread of its own: where nobody reads the terminal, that would hold up the scan that is to stop."""
+
+    def write() -> None:
+        with suppress(OSError, ValueError):  # the terminal was closed
+            click.echo(text, err=True)
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    thread.join(_SAID_WITHIN)
 
 
 def _results(result: RunResult) -> str:

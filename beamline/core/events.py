@@ -97,10 +97,15 @@ class Warnings:
             self._sink(Event("warning", self._clock.now(), {"message": text}))
 
 
+_PATIENCE = 10.0  # s
+
+
 class Announcer:
     """Passes events to sinks in a thread of its own. Leaving the context waits until all events have been passed on.
 
-    A sink that raises (a closed pipe, a full disk) gets no further events; the others get a warning.
+    It waits for `_PATIENCE` s at most: a terminal or pipe that nobody reads takes no event, and must not keep the
+    program from ending. A sink that raises (a closed pipe, a full disk) gets no further events; the others get a
+    warning.
     """
 
     def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:
@@ -116,7 +121,7 @@ class Announcer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._queue.put(None)
-        self._thread.join()
+        self._thread.join(_PATIENCE)
 
     def __call__(self, event: str, data: Mapping[str, Any]) -> None:
         """Queue the event with the current time; returns at once."""

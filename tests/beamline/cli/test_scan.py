@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -143,7 +145,10 @@ def test_3_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Mon
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK") if hasattr(signal, name)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])
 def test_4_the_first_signal_stops_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     before = signal.getsignal(number)
     instrument = FakeInstrument(on_frame=press(number, 8))
@@ -156,6 +161,31 @@ def test_4_the_first_signal_stops_cleanly(tmp_path: Path, monkeypatch: pytest.Mo
     assert 9 <= rows(tmp_path) < 17
     assert not instrument.is_open
     assert signal.getsignal(number) is before
+
+
+def test_4_a_terminal_that_nobody_reads_does_not_keep_ctrl_c_from_stopping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full, write = threading.Event(), click.echo
+
+    def echo(text: str, **options: Any) -> None:
+        if "Stopping cleanly" in text:
+            full.wait(60)  # as a write into a pipe that is full
+        write(text, **options)
+
+    monkeypatch.setattr(click, "echo", echo)
+    on(monkeypatch, FakeInstrument(on_frame=press(signal.SIGINT, 8)))
+    result = scan("-o", str(tmp_path))
+    full.set()
+    assert result.exit_code == 4
+    assert 9 <= rows(tmp_path) < 17
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
+def test_a_scan_that_nohup_started_outlives_its_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    on(monkeypatch, FakeInstrument(on_frame=press(signal.SIGHUP, 8)))
+    assert scan("-o", str(tmp_path)).exit_code == 0
 
 
 def test_5_missing_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
