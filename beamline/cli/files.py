@@ -1,4 +1,4 @@
-"""`beamline info`, `validate`, `ingest`: describes a scan file, checks its format, converts a TIFF to a scan."""
+"""`beamline info`, `validate`, `recover`, `ingest`: describes, checks and mends a scan file, converts a TIFF to one."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.recover import recover as recover_scan
 from beamline.storage.rules.validate import validate as findings_of
 from drivers.clock import SystemClock
 
@@ -84,6 +85,23 @@ def validate(file: Path, as_json: bool, **said: Any) -> None:
         click.echo(f"{file}: {errors}, {_count(counts['warning'], 'warning')}")
     if counts["error"]:
         raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
+
+
+@click.command()
+@click.argument("file", type=_PATH)
+@json_option
+def recover(file: Path, as_json: bool) -> None:
+    """Make an ordinary scan file of FILE, whose writer died, in its place.
+
+    Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
+    program, has its /exchange view and the status `failed`. A file that is in order is left as it is.
+    """
+    with terminated_like_interrupted(), json_events(as_json) as sinks:
+        done = recover_scan(file)
+        for sink in sinks:
+            sink(Event("done", SystemClock().now(), vars(done)))
+    if not as_json:
+        click.echo(done.said())
 
 
 def _count(n: int, word: str) -> str:

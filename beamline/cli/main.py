@@ -42,6 +42,7 @@ _COMMANDS = {
     "bench": _Entry("bench", "Measure this machine: kernels, fits, and quality against time."),
     "info": _Entry("files", "Describe a scan file."),
     "validate": _Entry("files", "Check a scan file against the rules of its format."),
+    "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor."),
     "ingest": _Entry("files", "Convert a multi-page TIFF into an HDF5 scan, page by page."),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema."),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.superblock import superblock
 
 DEGREE = np.pi / 180
 ANGLE_UNITS = {
@@ -46,7 +47,9 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
     problems = []
-    being_written, missing = _state(path)
+    head = superblock(path)
+    missing = 0 if head is None else head.missing
+    being_written = head is not None and head.open_for_writing and head.intact
     # A follower takes no lock, so as not to stop the writer from adding the /exchange view at the end; but a writer in
     # this same process shares its file with us, and then HDF5 wants the same locking of both.
     growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
@@ -64,23 +67,12 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             f"{path} is cut off: {missing} bytes are missing at its end, as its head says. Copy it again, or use the "
             "original. Nothing was read."
         )
-    raise DataError(
-        f"{path} cannot be read as HDF5 ({problems[0]}). If a scan just begins, try again; "
-        "if its writer died before the first frame, there is nothing in it."
-    )
-
-
-def _state(path: Path) -> tuple[bool, int]:
-    """Whether its head says that it is being written, and how many bytes it is shorter than its head says.
-
-    Of superblocks of versions 2 and 3 at the beginning (HDF5 file format specification 3.0, II.A); others cannot be
-    written under SWMR: False, 0.
-    """
-    with path.open("rb") as file:
-        head = file.read(36)
-    if len(head) < 36 or head[:8] != b"\x89HDF\r\n\x1a\n" or head[8] not in (2, 3) or head[9] != 8:
-        return False, 0
-    return head[11] != 0, max(0, int.from_bytes(head[28:36], "little") - path.stat().st_size)
+    if being_written:
+        raise DataError(
+            f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
+            "writer died, `beamline recover` clears the mark; nothing was read."
+        )
+    raise DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:

@@ -84,6 +84,9 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 
+GROWING = (*COLUMNS, VALID, SCORES, REGIONS)
+"""What has a row for each frame, beside the pixels and their preview."""
+
 Description = Mapping[str, str | int | float]
 
 
@@ -237,8 +240,7 @@ class Rows:
     def __init__(self, file: h5py.File) -> None:
         self._data: h5py.Dataset = file[DATA]
         self._preview: h5py.Dataset = file[PREVIEW]
-        paths = (*COLUMNS, VALID, SCORES, REGIONS)
-        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in paths}
+        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in GROWING}
         self._types = {column: column.dtype for column in self._columns.values()}
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:

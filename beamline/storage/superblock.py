@@ -1,0 +1,82 @@
+"""The first 48 bytes of an HDF5 file: whether it is being written, what it lacks, and how it would be if closed.
+
+Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A): signature 8,
+version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes, little-endian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+SIZE = 48
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
+_WORD = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Superblock:
+    """What the head of a file says.
+
+    Attributes:
+        head: its bytes.
+        size: of the file.
+    """
+
+    head: bytes
+    size: int
+
+    @property
+    def open_for_writing(self) -> bool:
+        """A program is writing the file, or died while it did."""
+        return self.head[_FLAGS] != 0
+
+    @property
+    def missing(self) -> int:
+        """Bytes that the file has less than its head says."""
+        return max(0, int.from_bytes(self.head[_END], "little") - self.size)
+
+    @property
+    def intact(self) -> bool:
+        """Its checksum is right."""
+        return self.head[_CHECKSUM] == _checksum(self.head[: _CHECKSUM.start])
+
+    def closed(self) -> Superblock:
+        """The head of the same file as if it had been closed; all its bytes belong to it."""
+        head = bytearray(self.head)
+        head[_FLAGS] = 0
+        head[_END] = max(self.size, int.from_bytes(self.head[_END], "little")).to_bytes(8, "little")
+        head[_CHECKSUM] = _checksum(bytes(head[: _CHECKSUM.start]))
+        return replace(self, head=bytes(head))
+
+
+def superblock(path: Path) -> Superblock | None:
+    """Of a file; None where it has none of these versions at its beginning, with addresses of eight bytes."""
+    with path.open("rb") as file:
+        head = file.read(SIZE)
+    if len(head) < SIZE or head[:8] != _SIGNATURE or head[8] not in (2, 3) or head[9] != 8:
+        return None
+    return Superblock(head, path.stat().st_size)
+
+
+def _checksum(data: bytes) -> bytes:
+    """lookup3 (Jenkins 2006, `hashlittle` from 0), which HDF5 has for metadata; of a whole number of words."""
+    words = [int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4)]
+    state = [0xDEADBEEF + len(data) & _WORD] * 3
+    while words:
+        state = [(x + word) & _WORD for x, word in zip(state, [*words, 0, 0][:3], strict=True)]
+        words = words[3:]
+        if words:
+            for i, bits in enumerate((4, 6, 8, 16, 19, 4)):
+                here, last, after = i % 3, (i + 2) % 3, (i + 1) % 3
+                state[here] = ((state[here] - state[last]) & _WORD) ^ _turned(state[last], bits)
+                state[last] = (state[last] + state[after]) & _WORD
+    for i, bits in enumerate((14, 11, 25, 16, 4, 14, 24)):
+        here, last = (i + 2) % 3, (i + 1) % 3
+        state[here] = ((state[here] ^ state[last]) - _turned(state[last], bits)) & _WORD
+    return state[2].to_bytes(4, "little")
+
+
+def _turned(word: int, bits: int) -> int:
+    return (word << bits | word >> (32 - bits)) & _WORD

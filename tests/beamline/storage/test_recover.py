@@ -1,0 +1,134 @@
+"""A file whose writer died becomes an ordinary one: every committed frame, nothing that was not, in any program."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.monitor.digest import digest
+from beamline.storage.readers.open import open_scan
+from beamline.storage.recover import QUIET, recover
+from beamline.storage.rules.validate import validate
+from beamline.storage.superblock import superblock
+from beamline.storage.writers import layout
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.frame import Frame, FrameKind
+from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
+
+
+def _aged(path: Path) -> Path:
+    """As if its writer had died a while ago."""
+    when = path.stat().st_mtime - 2 * QUIET
+    os.utime(path, (when, when))
+    return path
+
+
+def _written(path: Path, frames: list[Frame], clock: StandingClock) -> NXtomoWriter:
+    writer = NXtomoWriter(path, INFO, SHAPE, clock=clock, flush_every=5)
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    return writer
+
+
+def _died_in_the_scan(folder: Path, frames: list[Frame], clock: StandingClock) -> Path:
+    """Two frames after the last flush."""
+    writer = _written(folder / "s.h5", frames[:12], clock)
+    shutil.copy(folder / "s.h5", folder / "died.h5")
+    writer.close()
+    return _aged(folder / "died.h5")
+
+
+def _died_at_the_end(folder: Path, frames: list[Frame], clock: StandingClock) -> Path:
+    """While the view of a complete scan was added."""
+    _written(folder / "s.h5", frames[:10], clock).close()
+    with h5py.File(folder / "s.h5", "r+", libver=layout.LIBVER) as file:
+        del file["exchange"]
+        file.create_group("exchange")
+        file.flush()
+        shutil.copy(folder / "s.h5", folder / "died.h5")
+    return _aged(folder / "died.h5")
+
+
+@pytest.mark.parametrize(("died", "status"), [(_died_in_the_scan, "failed"), (_died_at_the_end, "complete")])
+def test_every_committed_frame_is_kept(
+    tmp_path: Path,
+    clock: StandingClock,
+    frames: list[Frame],
+    died: Callable[[Path, list[Frame], StandingClock], Path],
+    status: str,
+) -> None:
+    path = died(tmp_path, frames, clock)
+    with pytest.raises(OSError, match="open for write"):
+        h5py.File(path)
+    done = recover(path)
+    assert (done.changed, done.frames) == (True, 10)
+    with h5py.File(path) as file:  # as any program opens it
+        assert {file[name].shape[0] for name in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {10}
+        assert len(file["exchange/data"]) == sum(frame.kind is FrameKind.PROJECTION for frame in frames[:10])
+    with open_scan(path) as source:
+        assert (source.finished, source.attributes["status"]) == (True, status)
+        np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames[:10]])
+    assert [found for found in validate(path) if found.severity == "error"] == []
+    again = path.read_bytes()
+    assert not recover(path).changed and path.read_bytes() == again
+
+
+def test_what_may_still_be_written_is_left_alone(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+    writer = _written(tmp_path / "s.h5", frames[:5], clock)
+    before = (tmp_path / "s.h5").read_bytes()
+    with pytest.raises(DataError, match=r"changed \d s ago and is marked as being written.*Nothing was changed"):
+        recover(tmp_path / "s.h5")
+    assert (tmp_path / "s.h5").read_bytes() == before
+    writer.close()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda data: data[:2000], "bytes are missing"),
+        (lambda data: data[:20] + bytes([data[20] ^ 1]) + data[21:], "no HDF5 file that this program wrote"),
+        (lambda data: data[:48] + bytes(400) + data[448:], "is damaged"),
+        (lambda data: b"", "no HDF5 file"),
+    ],
+)
+def test_a_damaged_file_is_refused_and_stays_as_it_is(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], damage: Callable[[bytes], bytes], said: str
+) -> None:
+    path = _died_in_the_scan(tmp_path, frames, clock)
+    path.write_bytes(damage(path.read_bytes()))
+    before = _aged(path).read_bytes()
+    with pytest.raises(DataError, match=rf"{said}.*Nothing was changed"):
+        recover(path)
+    assert path.read_bytes() == before
+
+
+def test_another_programs_file_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "other.h5", "w", libver=layout.LIBVER) as file:
+        file["data"] = np.zeros(3)
+    with pytest.raises(DataError, match="no scan of this program"):
+        recover(tmp_path / "other.h5")
+
+
+def test_the_head_is_read_and_written_as_hdf5_does(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "s.h5", "w", libver=layout.LIBVER) as file:
+        file["data"] = np.arange(5)
+    with h5py.File(tmp_path / "s.h5", "r+", libver=layout.LIBVER):
+        opened = superblock(tmp_path / "s.h5")
+    closed = superblock(tmp_path / "s.h5")
+    assert opened is not None and closed is not None
+    assert opened.intact and opened.open_for_writing
+    assert closed.intact and not closed.open_for_writing and closed.missing == 0
+    assert opened.closed().head == closed.head
+    assert not superblock_of(closed.head[:20] + b"\x01" + closed.head[21:], tmp_path / "flipped.h5").intact
+
+
+def superblock_of(head: bytes, path: Path):  # type: ignore[no-untyped-def]
+    path.write_bytes(head)
+    return superblock(path)
