@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import shlex
 import sys
 from collections.abc import Mapping
@@ -34,6 +35,7 @@ from drivers.clock import SystemClock
 from recon.assess.plans import Quality
 from recon.auto import Auto
 from recon.methods import DEFAULT, names
+from recon.voxels.direct import Fbp
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
@@ -43,6 +45,16 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
     if value is not None and (not value.name or value.suffix.lower() in (".html", ".htm")):
         raise click.BadParameter(f"{str(value)!r} cannot hold a volume; name an HDF5 file, such as volume.h5")
     return value
+
+
+def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
+    """Bytes of a size such as 8G, 500M or 1.5GB (decimal units)."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", value.strip(), re.IGNORECASE)
+    if match is None or not float(match[1]) > 0:
+        raise click.BadParameter(f"{value!r} is no size; expected a number and K, M, G or T, such as 8G")
+    return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
 
 
 @click.command()
@@ -99,6 +111,13 @@ def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None)
 @click.option(
     "--unfinished", is_flag=True, help="Accept an unfinished scan, one that failed or still runs, and use its frames."
 )
+@click.option(
+    "--memory",
+    metavar="SIZE",
+    callback=memory_size,
+    help="Memory that -m fbp may use, such as 8G or 500M; more lies on the disk of the output meanwhile. Default: 70 % "
+    "of what is free, within a container's limit.",
+)
 @json_option
 def recon(
     file: Path,
@@ -118,6 +137,7 @@ def recon(
     enough_loss: float | None,
     enough_gain: float | None,
     unfinished: bool,
+    memory: int | None,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -137,6 +157,8 @@ def recon(
     enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
     if enough is not None and not follow:
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")
+    if memory is not None and method != Fbp.name:
+        raise click.UsageError("--memory is for -m fbp; the other methods hold views and volume in memory.")
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})
@@ -155,6 +177,7 @@ def recon(
         truth=truth,
         unfinished=unfinished,
         enough=enough,
+        memory=memory,
         command=repeated(sys.argv[1:]),
     )
     clock = SystemClock()

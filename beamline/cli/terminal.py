@@ -76,7 +76,7 @@ class Terminal:
     def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
-        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs", "monitor"):
+        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs", "monitor", "correction"):
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
         elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study"):
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from drivers.frame import FrameKind
-from recon.prep.correct import Correction, Projections, References, UnlitViewsError
+from recon.prep.correct import Correction, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
 
 Warn = Callable[[str], None]
@@ -69,6 +70,53 @@ class ScanCorrection:
         if self._references is None:
             return _as_given(data, frames)
         return self._corrected(self._correction(rows), data, frames, last=True)
+
+    def in_batches(
+        self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, told: Callable[[int, int], None]
+    ) -> Projections:
+        """As `at_once`, to the bit, with no more than `batch` frames in memory; the scan is read twice.
+
+        Args:
+            out: float32 [frame, row, col], at least so many: takes the line integrals.
+            told: how many of how many frames were read.
+
+        Raises:
+            DataError: as `at_once`; photons are counted: their weights would have to be in memory.
+        """
+        if self.photons is not None:
+            raise DataError(f"{self._source.path}: photons are counted, which needs all views in memory.")
+        parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._references is None else 2
+        stream, columns, alive = None, (0, 0), []
+        if self._references is not None:
+            survey = self._correction(None)
+            for done, part in enumerate(parts):
+                data, found = self._read(part, None)
+                alive.append(found)
+                if found.size:
+                    survey.survey(self._transmission(survey, data, found))
+                told(min((done + 1) * batch, frames.size), passes * frames.size)
+            columns = survey.air_columns
+            settings = replace(self._selection.correction, air=columns if any(columns) else "none")
+            stream = Correction(self._references, settings, masked=survey.masked)
+            parts = [found for found in alive if found.size]
+        at, kept, begun = 0, [], (passes - 1) * frames.size
+        for done, part in enumerate(parts):
+            last = done == len(parts) - 1
+            data, found = self._read(part, None)
+            if stream is not None:
+                corrected = self._corrected(stream, data, found, last)
+            elif found.size:
+                corrected = _as_given(data, found)
+            else:
+                continue
+            n = len(corrected.data)
+            out[at : at + n] = corrected.data
+            at += n
+            kept.append(replace(corrected, data=np.empty((0, *out.shape[1:]), np.float32)))
+            told(begun + min((done + 1) * batch, frames.size), passes * frames.size)
+        if not at:
+            raise DataError(f"{self._source.path}: none of the pixels of the views chosen is a finite number.")
+        return _joined(kept, out[:at])
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
         """Line integrals of the next frames; None where there are none yet, since the newest view waits for the next.
@@ -154,6 +202,12 @@ class ScanCorrection:
         except ValueError as error:
             raise self._refusal(error) from error
 
+    def _transmission(self, correction: Correction, data: NDArray[Any], frames: NDArray[np.int64]) -> Transmission:
+        try:
+            return correction.transmission(data, frames.astype(np.float64), frames)
+        except ValueError as error:
+            raise self._refusal(error) from error
+
     def _refusal(self, error: ValueError) -> DataError:
         return DataError(f"{self._source.path} cannot be corrected: {error}")
 
@@ -164,6 +218,16 @@ def _count_references(source: ScanSource) -> int:
 
 def _narrowed(references: References, rows: slice) -> References:
     return References(references.dark[rows], tuple((position, flat[rows]) for position, flat in references.flats))
+
+
+def _joined(parts: list[Projections], data: NDArray[np.float32]) -> Projections:
+    """Batches as one, with their line integrals in `data`; a pixel is masked where it is in all of them."""
+    n = np.array([part.view_ids.size for part in parts], np.float64)
+    share = n / n.sum()
+    floored, replaced = (float(share @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
+    ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
+    masked = np.logical_and.reduce([part.masked for part in parts])
+    return Projections(data, ids, floored, air, masked, parts[-1].air_columns, replaced)
 
 
 def _as_given(data: NDArray[Any], frames: NDArray[np.int64]) -> Projections:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, Warn
+from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.jumps import find_jumps, longest_part
 from beamline.projections.replay import judged_flags
@@ -33,7 +34,7 @@ from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
-from recon.base.masks import areas
+from recon.base.masks import areas, masked
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate, find_axis
 from recon.prep.correct import Projections
@@ -106,13 +107,32 @@ class PreparedProjections:
         return np.broadcast_to(functools.reduce(np.multiply, factors), shape)
 
 
-def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) -> PreparedProjections:
+@dataclass(frozen=True, eq=False)
+class Spill:
+    """Line integrals on disk instead of in memory, for a direct method.
+
+    Attributes:
+        views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
+        batch: views that are corrected at a time.
+        told: how many of how many frames were read.
+    """
+
+    views: NDArray[np.float32]
+    batch: int
+    told: Callable[[int, int], None]
+
+
+def prepare_projections(
+    source: ScanSource, selection: Selection, warn: Warn, spill: Spill | None = None
+) -> PreparedProjections:
     """Read, correct and align what `selection` asks for.
 
     Args:
         source: a finished scan.
         selection: what to use.
         warn: is told, in a sentence, of everything that is not as it should be though work goes on.
+        spill: where line integrals lie. Rays that were not measured, or weigh nothing by the flags, are filled there as
+            a direct method does it, and `shares` is None.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
@@ -137,7 +157,13 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
     scan_frames = jumps.frames
     period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
     chosen = choose_views(source, scan_frames, selection, period)
-    projections = correction.at_once(scan_frames[chosen])
+    if spill is None:
+        projections = correction.at_once(scan_frames[chosen])
+    else:
+        projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
+    regions = usable.regions
+    if spill is not None:
+        usable = replace(usable, regions=Regions())
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     held_out = None
     if rest.size:
@@ -145,9 +171,28 @@ def prepare_projections(source: ScanSource, selection: Selection, warn: Warn) ->
         unseen = geometry_of(source, selection, axis_col, source.angles[others.view_ids])
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
     found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
-    return replace(
+    found = replace(
         found, geometry=jumps.corrected(found.geometry, projections.view_ids), jumps=jumps.said, noise=correction.noise
     )
+    if spill is not None:
+        _fill_unknown(found, regions, rows_of(source, selection), selection.binning)
+    return found
+
+
+def _fill_unknown(found: PreparedProjections, regions: Regions, rows: slice, binning: int) -> None:
+    """Fill, view by view, what `ray_weights` says weighs nothing, as `masked` does for all views."""
+    data, ids, geometry = found.projections.data, found.projections.view_ids, found.geometry
+    seen = seen_rays(geometry, Grid.matching(geometry)) if np.ptp(geometry.shifts[:, 1]) > 0 else None
+    for view in range(len(data)):
+        known = np.ones(geometry.detector_shape, np.float32)
+        if found.measured is not None:
+            known *= found.measured
+        if (shares := regions.weights(ids[view : view + 1], rows, binning, geometry.detector_shape)) is not None:
+            known *= shares[0]
+        if seen is not None:
+            known *= seen[view][:, None]
+        if not known.all():
+            data[view] = masked(data[view : view + 1], known[None])[0][0]
 
 
 def _axis_beside_jumps(

@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import fit_origin
 from beamline.reconstruct.measure import fit_truth, read_truth
@@ -21,6 +21,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.result import write_result
+from beamline.reconstruct.slabs import fbp_on_disk, prepare_within
 from drivers.clock import Clock
 from recon.auto import Auto
 from recon.base.method import DataUse, Method, Progress, RunControl
@@ -29,6 +30,7 @@ from recon.methods import with_trait
 from recon.splatting.backend import backend_for
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
+from recon.voxels.direct import Fbp
 from recon.warm_up import warm_up
 
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
@@ -62,7 +64,7 @@ def reconstruct_file(
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
         facts = facts_of(source)
-        prepared = prepare_projections(source, options.selection, warn)
+        prepared, on_disk = prepare_within(source, options, sink, clock, warn)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
@@ -79,7 +81,10 @@ def reconstruct_file(
             outcome, prepared, factor = _within_budget(job, options.budget)
             selection = replace(selection, binning=selection.binning * factor)
         else:
-            outcome = _by_fit(job, options.method) if isinstance(options.method, R2) else _by_method(job)
+            outcome = _by_fit(job, options.method) if isinstance(options.method, R2) else _by_method(job, on_disk)
+    if on_disk and prepared.view_weights is not None:  # for the record: FBP takes all rays alike, and so do its figures
+        outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
+        prepared = replace(prepared, view_weights=None)
     truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
     context = ReportContext(facts, selection, options.command, options.seed, warn.messages, started)
     return write_result(outcome, prepared, truth, options.target, context, sink, clock)
@@ -179,9 +184,15 @@ class _Job:
         )
 
 
-def _by_method(job: _Job) -> ReconOutcome:
+def _by_method(job: _Job, on_disk: bool) -> ReconOutcome:
     """Run a method that has no presets and no checkpoints."""
-    result = job.run(job.options.method, RunControl(on_progress=job.listener()))
+    method = job.options.method
+    if on_disk and isinstance(method, Fbp):
+        with job.refused(f" by {method.name}"):
+            warm_up(method, job.prepared.geometry)
+            result = fbp_on_disk(method, job.options, job.prepared, job.listener(), job.clock)
+    else:
+        result = job.run(method, RunControl(on_progress=job.listener()))
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
     chosen = ""
     if "chosen_because" in result.settings:

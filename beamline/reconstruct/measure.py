@@ -90,7 +90,7 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
         found = metrics.kmeans_mask(metrics.sampled(volume.data), seed)
     except ValueError:
         return None
-    return found if (found == 0).any() and (found == 1).any() else None
+    return found if all(any((part == kind).any() for part in found) for kind in (0, 1)) else None
 
 
 def measure(
@@ -143,11 +143,13 @@ def _residual(
 
 
 def residual_bands(grid: Grid, geometry: Geometry) -> list[slice]:
-    """Bands of rows that stand for all: all, unless the detector is large and its rows are the volume's slices."""
+    """Bands of rows that stand for all: all rows, unless the detector is large; one band where rows are no slices."""
     rows, cols = geometry.detector_shape
     bands = max(1, _RESIDUAL_RAYS // (_RESIDUAL_ROWS * cols))
     on_rows = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
-    if rows <= bands * _RESIDUAL_ROWS or not on_rows:
+    if not on_rows:
         return [slice(0, rows)]
+    if rows <= bands * _RESIDUAL_ROWS:
+        return [slice(first, min(first + _RESIDUAL_ROWS, rows)) for first in range(0, rows, _RESIDUAL_ROWS)]
     starts = (np.arange(bands) + 0.5) * rows / bands - _RESIDUAL_ROWS / 2
     return [slice(first, first + _RESIDUAL_ROWS) for first in starts.astype(int).tolist()]

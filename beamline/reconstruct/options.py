@@ -36,6 +36,7 @@ class ReconOptions:
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the frames that there are, where the scan still runs or died.
         enough: of a followed scan: when its views are enough; None: nobody asks.
+        memory: bytes that FBP may use; None: 70 % of what is free.
         command: that repeats this, for the record.
     """
 
@@ -52,6 +53,7 @@ class ReconOptions:
     truth: str | None = None
     unfinished: bool = False
     enough: Goal | None = None
+    memory: int | None = None
     command: str = ""
 
     @property

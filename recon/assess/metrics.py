@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -167,16 +169,18 @@ def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np
         ValueError: where all voxels have the same value or some are not finite.
     """
     box = inscribed_cuboid(volume.shape, margin)
-    values = volume[box].ravel()
-    if not np.isfinite(values).all():
+    values = volume[box]
+    if not all(np.isfinite(image).all() for image in values):
         raise ValueError("the volume holds NaN or infinite values")
     rng = np.random.default_rng(seed)
-    sample = np.asarray(values if values.size <= _SAMPLE else rng.choice(values, _SAMPLE, replace=False), np.float64)
+    some = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
+    sample = np.asarray(values[some], np.float64).ravel()
     if np.ptp(sample) == 0:
         raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to separate")
     centres, _ = kmeans2(sample[:, None], 2, iter=30, minit="++", rng=rng)
     mask = np.full(volume.shape, -1, np.int8)
-    mask[box] = volume[box] > centres.mean()
+    for part, image in zip(mask[box], values, strict=True):
+        part[...] = image > centres.mean()
     return mask
 
 
@@ -195,16 +199,37 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
     """
     if volume.shape != mask.shape:
         raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
-    dense, empty = np.asarray(volume[mask == 1], np.float64), np.asarray(volume[mask == 0], np.float64)
-    if not dense.size or not empty.size:
-        raise ValueError(f"the mask marks {dense.size} dense and {empty.size} empty voxels; both are needed")
-    if not (np.isfinite(dense).all() and np.isfinite(empty).all()):
+    dense, empty = _Moments(), _Moments()
+    for image, part in zip(volume, mask, strict=True):
+        dense, empty = dense.joined(image[part == 1]), empty.joined(image[part == 0])
+    if not dense.n or not empty.n:
+        raise ValueError(f"the mask marks {dense.n} dense and {empty.n} empty voxels; both are needed")
+    if not (np.isfinite(dense.mean) and np.isfinite(empty.squares)):
         raise ValueError("the volume holds NaN or infinite values")
-    spread = float(empty.std())
+    spread = float(np.sqrt(empty.squares / empty.n))
 
     def decibel(signal: float) -> float:
         if not signal > 0:
             return float("-inf")
         return float(20 * np.log10(signal / spread)) if spread else float("inf")
 
-    return decibel(float(dense.mean())), decibel(abs(float(dense.mean() - empty.mean())))
+    return decibel(dense.mean), decibel(abs(dense.mean - empty.mean))
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """Number, mean and sum of squared deviations of values, joined slice by slice (Chan, Golub & LeVeque 1979)."""
+
+    n: int = 0
+    mean: float = 0.0
+    squares: float = 0.0
+
+    def joined(self, values: Array) -> _Moments:
+        if not values.size:
+            return self
+        more = np.asarray(values, np.float64)
+        n, mean = self.n + more.size, float(more.mean())
+        with np.errstate(invalid="ignore"):
+            away, own = mean - self.mean, float(np.sum((more - mean) ** 2))
+        squares = self.squares + own + away**2 * self.n * more.size / n
+        return _Moments(n, self.mean + away * more.size / n, squares)

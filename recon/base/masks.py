@@ -78,20 +78,26 @@ def masked(
         if not (np.isfinite(weight).all() and weight.min(initial=0) >= 0):
             raise ValueError("weights must be finite and 0 or more")
     most = min(largest, float(np.finfo(np.float32).max))
-    bad = ~((projections >= -most) & (projections <= most))
-    if weight is not None:
-        bad |= weight == 0
-    affected = np.flatnonzero(bad.any(axis=(1, 2)))
+
+    def bad(view: int) -> Mask:
+        image = projections[view]
+        outside = ~((image >= -most) & (image <= most))
+        return outside if weight is None else outside | (weight[view] == 0)
+
+    counts = np.array([np.count_nonzero(bad(view)) for view in range(len(projections))])
+    affected, empty = np.flatnonzero(counts), np.flatnonzero(counts == projections.shape[1] * projections.shape[2])
     if affected.size == 0:
         return projections, weight
-    empty = np.flatnonzero(bad.all(axis=(1, 2)))
     if empty.size:
         within = "finite" if math.isinf(largest) else f"finite, within ±{largest:.3g}"
         raise ValueError(
-            f"{empty.size} of {len(bad)} views have no value that is {within} and has a weight "
+            f"{empty.size} of {len(projections)} views have no value that is {within} and has a weight "
             f"({empty[:8].tolist()} ...); leave these views out"
         )
     filled = np.array(projections, np.float32)
-    for view in affected:
-        fill(filled[view], plan_fill(bad[view]))
-    return filled, np.where(bad, 0, 1 if weight is None else weight).astype(np.float32)
+    known = np.ones(projections.shape, np.float32) if weight is None else np.array(weight, np.float32)
+    for view in affected.tolist():
+        hidden = bad(view)
+        fill(filled[view], plan_fill(hidden))
+        known[view][hidden] = 0
+    return filled, known

@@ -139,6 +139,12 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     return FbpPlan(geometry, grid, filter, share, zeros, z + geometry.axis_row, back_project)
 
 
+def fbp_memory(views: int, cols: int) -> int:
+    """Bytes that FBP of slices [cols, cols] takes beside projections and volume, about: of a plan and of one block."""
+    samples, cells = round(1.4 * cols), (round(1.25 * cols) + 64) ** 2
+    return 64 * views * (cols + 2 * samples) + 16 * views * samples + 64 * cells + 4 * 32 * 16 * 8 * cols
+
+
 def is_gridded(geometry: Geometry, grid: Grid, filter: Filter) -> bool:
     """Whether FBP of these views grids the slices; never of a cone, or of rolled or tilted views."""
     if geometry.is_cone or not geometry.is_straight:
@@ -206,6 +212,7 @@ def fbp(
     grid: Grid | None = None,
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
+    out: F32 | None = None,
 ) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
@@ -220,6 +227,7 @@ def fbp(
         grid: voxels wanted; None: one a pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.
+        out: float32 [z, y, x] to write to; None: a new one.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
@@ -234,7 +242,8 @@ def fbp(
             f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
         )
     plan = plan_fbp(geometry, Grid.matching(geometry) if grid is None else grid, filter)
-    out = np.empty(plan.grid.shape, np.float32)
+    if out is None:
+        out = np.empty(plan.grid.shape, np.float32)
     for part in plan.blocks:
         fbp_block(plan, projections, 0, part, out[part])
         on_block(part.stop, len(out))

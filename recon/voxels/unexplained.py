@@ -70,7 +70,7 @@ def unexplained(
     if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
         return None
     n = min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
-    mass = np.maximum(volume.data, 0).sum(axis=(1, 2), dtype=np.float64)
+    mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(rows) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), rows - n)
     views = geometry.rows(first, first + n)
@@ -88,19 +88,30 @@ def unexplained(
     left[unseen] = 0
 
     signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
-    each = [left, *(left * rng.permutation(signs)[:, None, None] for _ in range(_FLIPS))]
-    found, *flipped = (gaussian_filter(images, (0, _SMOOTH, _SMOOTH)) for images in _fbp_of_each(each, views))
-    variance = sum((images**2 / _FLIPS for images in flipped), np.zeros(part.grid.shape, np.float32))
+    kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
+    first_kind, *flipped = _fbp_of_each(left, kinds, views)
+    found, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
+    for images in flipped:
+        variance += _smoothed(images) ** 2 / _FLIPS
     noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
     significance = np.divide(found, noise, out=np.zeros_like(found), where=noise > 0)
     return Unexplained(float(np.mean(np.abs(significance[matter]) > _SIGMAS)), first, significance)
 
 
-def _fbp_of_each(residuals: list[F32], views: Geometry) -> list[F32]:
-    """Slices of each residual; where views do not move along the axis, as slices of one volume: it takes less time."""
-    rows, n = views.detector_shape[0], len(residuals)
+def _smoothed(images: F32) -> F32:
+    return gaussian_filter(images, (0, _SMOOTH, _SMOOTH))
+
+
+def _fbp_of_each(residual: F32, signs: F32, views: Geometry) -> list[F32]:
+    """Slices of the residual times each row of signs [kind, view].
+
+    Where views do not move along the axis, they are slices of one volume: that takes less time.
+    """
+    rows, cols = views.detector_shape
+    kinds = len(signs)
     if views.shifts[:, 1].any():
-        return [fbp(np.ascontiguousarray(each, np.float32), views, filter="hann") for each in residuals]
-    stacked = replace(views, detector_shape=(n * rows, views.detector_shape[1]), axis_row=(n * rows - 1) / 2)
-    images = fbp(np.concatenate(residuals, axis=1, dtype=np.float32), stacked, filter="hann")
-    return list(images.reshape(n, rows, *images.shape[1:]))
+        return [fbp(np.asarray(residual * sign[:, None, None], np.float32), views, filter="hann") for sign in signs]
+    stacked = replace(views, detector_shape=(kinds * rows, cols), axis_row=(kinds * rows - 1) / 2)
+    data = np.multiply(residual[:, None], signs.T[:, :, None, None], dtype=np.float32).reshape(-1, kinds * rows, cols)
+    images = fbp(data, stacked, filter="hann")
+    return list(images.reshape(kinds, rows, *images.shape[1:]))

@@ -18,6 +18,7 @@ from beamline.core.version import version
 from beamline.storage import hdf5
 from recon.base.volume import Grid, Volume
 
+_SLAB = 16  # slices written at a time
 Value = str | int | float | bool | NDArray[Any]
 
 
@@ -89,7 +90,10 @@ def _write_entry(entry: h5py.Group, record: ReconRecord) -> None:
     data.attrs["signal"] = "data"
     data.attrs["axes"] = ["z", "y", "x"]
     # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
-    data.create_dataset("data", data=record.volume.data, chunks=(1, *record.volume.grid.shape[1:]))
+    shape = record.volume.grid.shape
+    stored = data.create_dataset("data", shape, np.float32, chunks=(1, *shape[1:]))
+    for first in range(0, shape[0], _SLAB):  # so that a signal need not wait for the whole
+        stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
     data["data"].attrs["units"] = f"1/{record.length_unit}"
     data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):

@@ -1,0 +1,100 @@
+"""FBP within a memory: the same volume to the bit, within the memory, with nothing left beside it."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.reconstruct.slabs import Needs
+from beamline.storage.writers.recon_file import read_reconstruction
+from recon.voxels.fbp import fbp_memory
+from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
+
+
+@pytest.fixture
+def tall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> TwoCylinders:
+    """A scan of 200 rows with noise, zingers, an area without light, and a beam that becomes weaker: scan.h5."""
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 3.0)), shape=(200, 48), axis_col=23.7)
+    fading = np.linspace(1, 0.8, scan.angles.size)[:, None, None]
+    counts = 100 + rng.poisson((scan.counts().astype(float) - 100) * fading)
+    counts[rng.integers(0, 60, 30), rng.integers(0, 200, 30), rng.integers(0, 48, 30)] += 20000
+    flat = np.full((2, *scan.shape), 20100, np.uint16)
+    flat[:, 90:95, 30:34] = 100
+    write_exchange(Path("scan.h5"), scan, {"data": counts.astype(np.uint16), "data_white": flat})
+    return scan
+
+
+def volume(*options: str) -> np.ndarray:
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--no-report", *options)
+    assert result.exit_code == 0, result.output
+    return read_reconstruction(Path(options[-1])).volume.data
+
+
+@pytest.mark.usefixtures("tall")
+@pytest.mark.parametrize(
+    ("memory", "more"), [("3M", []), ("2M", ["--bin", "2"]), ("3M", ["--rows", "33:181"]), ("3M", ["--air", "none"])]
+)
+def test_the_volume_is_the_same_to_the_bit(tmp_path: Path, memory: str, more: list[str]) -> None:
+    whole = volume(*more, "--memory", "1G", "-o", "whole.h5")
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--no-report", *more, "--memory", memory, "-o", "parts.h5")
+    assert result.exit_code == 0, result.output
+    assert "lie on the disk" in result.stderr and "slices" in result.stderr
+    parts = read_reconstruction(Path("parts.h5"))
+    np.testing.assert_array_equal(parts.volume.data, whole)
+    other = read_reconstruction(Path("whole.h5"))
+    assert parts.metrics.keys() == other.metrics.keys()
+    assert parts.metrics["residual"] == pytest.approx(other.metrics["residual"], rel=1e-6)
+    assert parts.parameters["replaced_fraction"] == pytest.approx(other.parameters["replaced_fraction"])
+    assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
+
+
+def test_flags_and_line_integrals_as_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(shape=(150, 40))
+    write_flagged(Path("scan.h5"), frames_of(scan), {7: "warning", 9: "alarm"})
+    np.testing.assert_array_equal(volume("--memory", "3M", "-o", "a.h5"), volume("--memory", "1G", "-o", "b.h5"))
+    a, b = (read_reconstruction(Path(name)).parameters for name in ("a.h5", "b.h5"))
+    np.testing.assert_array_equal(a["view_weights"], b["view_weights"])
+
+
+def test_no_more_memory_is_taken_than_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that numpy allocates; views and volume alone are three times as much."""
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 3.0)), shape=(400, 256), axis_col=127.1)
+    write_exchange(Path("scan.h5"), scan)
+    few = ("--rows", "0:16", "-o")
+    volume(*few, "first.h5")  # loads and compiles
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        volume_written = beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "--memory", "40M", "-o", "out.h5")
+        peak = tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+    assert volume_written.exit_code == 0, volume_written.output
+    assert 4 * 60 * 400 * 256 + 4 * 400 * 256**2 > 3 * 40e6
+    assert peak < 40e6
+
+
+@pytest.mark.usefixtures("tall")
+def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "1M", "-o", "out.h5")
+    assert result.exit_code == 5, result.output
+    assert "Give --memory 3M if there is as much, or --bin 2" in result.stderr
+    assert left(tmp_path) == {"scan.h5"}
+    result = beamline("recon", "scan.h5", "-m", "sirt", "--memory", "1G")
+    assert result.exit_code == 2 and "for -m fbp" in result.stderr
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "lots")
+    assert result.exit_code == 2 and "such as 8G" in result.stderr
+
+
+def test_what_is_needed_grows_with_the_scan() -> None:
+    full = Needs(1800, (2048, 2048), 1800 * 2048**2 * 2, fbp_memory(1800, 2048))
+    assert full.line_integrals == 1800 * 2048**2 * 4 and full.volume == 2048**3 * 4
+    assert 60e9 < full.at_once < 90e9
+    assert full.block < 3e9
