@@ -40,7 +40,7 @@ from recon.splatting.stream import StreamingFit
 
 _BATCH = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
-_AXIS_MOVES = 0.3  # px by which a better axis makes the fit begin anew
+_AXIS_MOVES = 1.0  # px by which a better axis makes the fit begin anew
 
 
 class ScanFollower:
@@ -155,11 +155,11 @@ class ScanFollower:
             fit.add_views(part.data, self.source.angles[part.view_ids])
         return fit
 
-    def _correct_again(self, axis_col: float, usable: UsableViews) -> None:
+    def _correct_again(self, usable: UsableViews) -> None:
         """Line integrals by all references and air columns, in place of those that the model has learnt from.
 
-        Where views of these are not usable any longer, the fit begins anew without them: a check found them bad when it
-        had seen later ones, or they were taken again.
+        Where views of these are not usable any longer, the model goes on without them, at the first rates: a check
+        found them bad when it had seen later ones, or they were taken again.
         """
         assert self._correction is not None and self._fit is not None
         fed = np.concatenate([part.view_ids for part in self._parts])
@@ -169,15 +169,14 @@ class ScanFollower:
             return
         message = "Flats or darks came after views, or air columns changed: all views are corrected again"
         if gone:
-            message = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it begins anew"
+            message = (
+                f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
+            )
         self._sink(Event("state", self._clock.now(), {"state": "correcting", "message": message}))
         self._correction = self._correction.renewed()
         self._parts = []
         self._parts = [self._correction.at_once(frames)]
-        if gone:
-            self._fit = self._new_fit(axis_col)
-        else:
-            self._fit.replace_views(self._parts[0].data)
+        self._fit.replace_views(self._parts[0].data, self.source.angles[frames] if gone else None)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False where there is nothing to fit yet."""
@@ -240,7 +239,7 @@ class ScanFollower:
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
             )
-        self._correct_again(self.axis_col, usable)
+        self._correct_again(usable)
         prepared = self._prepared(self.axis_col, usable)
         self._sink(
             Event(

@@ -13,7 +13,7 @@ from recon.assess.plans import Quality
 from recon.base.method import Method
 from recon.methods import names, streams
 from recon.splatting.r2 import R2
-from recon.splatting.stream import StreamingMethod
+from recon.splatting.streaming_method import StreamingMethod
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 

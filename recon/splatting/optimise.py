@@ -31,7 +31,7 @@ class FitState:
     """Everything that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
 
     `step` updates the arrays in place: at 50k Gaussians copying them costs as much as the kernels. They live on the
-    backend's device.
+    backend's device. `mean` is a running mean of the parameters, see `averaging`; None where none is kept.
     """
 
     parameters: dict[str, Any]
@@ -47,6 +47,7 @@ class FitState:
     seen: int = 0
     loss: Any = float("nan")
     residual: Any = float("nan")
+    mean: dict[str, Any] | None = None
 
     @property
     def n(self) -> int:
@@ -278,6 +279,12 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
         "raw": change.raw,
     }
     order = _order(grown)
+    if state.mean is not None:
+        for name, new in grown.items():
+            mean = backend.numpy(state.mean[name])[origin]
+            changed = new != p[name][origin]  # what was split or cloned; its other half is new, too
+            changed[fresh:] = True
+            state.mean[name] = backend.array(np.where(changed, new, mean)[order])
     state.parameters = {name: backend.array(values[order]) for name, values in grown.items()}
     for moments in (state.first, state.second):
         for name in NAMES:

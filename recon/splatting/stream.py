@@ -1,10 +1,14 @@
 """StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
 
-The first Gaussians come from an FBP of the first well-spread views. Whenever the number of views has grown by half, a
-new round begins: the learning rates start again, since there is something new to learn, and density control clones and
-splits where the new views ask for it. Between arrivals the model keeps fitting: every third step takes one of the
-newest views, the others replay all of them evenly (the rule of on-the-fly mapping: new views must be learnt, old ones
-not forgotten; Meuleman et al. 2025).
+The first Gaussians come from an FBP of the first well-spread views, and again when these have grown by half where there
+is time for many steps. From then on the model stays: each time the views have grown by half, a new round makes room for
+more Gaussians, which density control clones and splits where the new views ask for it. Between arrivals the model keeps
+fitting: every third step takes one of the newest views, the others replay all of them evenly (the rule of on-the-fly
+mapping: new views must be learnt, old ones not forgotten; Meuleman et al. 2025).
+
+Nobody knows how many steps are to come. So the rates fall as 1 / (1 + t / 60) with the steps t, and the volume is that
+of the mean of the parameters over the last quarter of them: after any number of steps it is about as good as a fit
+whose rates were planned to end there (docs/performance.md, "Streaming").
 """
 
 from __future__ import annotations
@@ -13,16 +17,17 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.method import Method, Progress
+from recon.base.method import Progress
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
+from recon.splatting.averaging import average, averaged
+from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.problem import FitProblem, extend, with_projections
@@ -32,38 +37,18 @@ Clock = Callable[[], float]
 
 _NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
-_ROUND = 400.0  # steps over which the rates decay within a round
+_HALF = 60.0  # steps after which the rates are half of the first ones
+_YOUNG = 16  # a round that begins with fewer views, after so many steps, places all Gaussians anew
+_WINDOW = 0.25  # share of the steps over which the mean is taken
+_EVERY = 4  # steps between two of the mean
+_LAST_GROWTH = 0.5  # density control ends at this share of the last round
+_AXIS_ANEW = 0.3  # px; an axis that moves by so much starts the rates anew, by less in part
 _NEW = 0.2  # weight of the newest of the views that were looked at before they were learnt
 _BLIND = 100.0  # data so many times larger than the density unit implies: the first views showed no sample
-_ROUND_GROWTH = 0.1  # share of the first count that a round may add; the last round may add the rest of the growth
+_ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
 
-# Slower than where all views are there from the start: each round would undo with its first fast steps what the last
-# one had learnt (battery of 180 views: 30.7 dB with the rates of `FitSettings`, 31.9 with these).
-WHILE_VIEWS_COME = FitSettings(pace=3.0, decay=0.1, views_per_step=1, tv_weight=0.15, tv_size=32)
-
-
-@runtime_checkable
-class StreamingMethod(Method, Protocol):
-    """A method whose volume can grow while views arrive.
-
-    Attributes:
-        steps: planned; a fit of views to come takes none.
-        seconds: for the last round, over all views.
-    """
-
-    @property
-    def steps(self) -> int | None: ...
-
-    @property
-    def seconds(self) -> float | None: ...
-
-    def finish_sweeps(self, geometry: Geometry) -> int:
-        """Sweeps on voxels after the last round."""
-        ...
-
-    def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit of views with the geometry of `template`, whose angles are ignored."""
-        ...
+WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
+"""The rates of a fit to all views, to a lower end; density control at any rate, as far as the rounds make room."""
 
 
 class StreamingFit:
@@ -112,7 +97,7 @@ class StreamingFit:
         self._angles: list[float] = []
         self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
-        self._round_views, self._round_step, self._placed = 0, 0, 0
+        self._round_views, self._schedule_step, self._placed = 0, 0, 0
         self.unlearnt = math.nan
         """||rendered - measured|| / ||measured|| of new views before a step has seen them, running mean."""
 
@@ -164,35 +149,51 @@ class StreamingFit:
         if self._state is None or self._problem is None:
             raise ValueError("there is no model yet, and nothing to compare the newest view with")
         problem = self._problem
-        (image,) = fit.renders(self._state, problem, self._settings, [self.n_views - 1])
+        (image,) = fit.renders(averaged(self._state), problem, self._settings, [self.n_views - 1])
         return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale
 
-    def replace_views(self, data: F32) -> None:
+    def replace_views(self, data: F32, angles: ArrayLike | None = None) -> None:
         """Other line integrals [view, row, col] of all views so far, in their order: their correction has changed.
 
-        The model stays and goes on from where it is.
+        The model stays and goes on from where it is. With `angles` [view] in radians these are all views that count
+        from now on, and the rates start again: the model has learnt from views that turned out bad.
 
         Raises:
-            ValueError: where the shape is not that of the views so far, or values are not finite; nothing is changed.
+            ValueError: where the shape is not that of the views, or values are not finite; nothing is changed.
         """
-        expected = (self.n_views, *self._template.detector_shape)
-        if np.shape(data) != expected:
-            raise ValueError(f"the views so far have shape {expected}, got {np.shape(data)}")
+        theta = np.asarray(self._angles if angles is None else angles, np.float64)
+        expected = (theta.size, *self._template.detector_shape)
+        if np.shape(data) != expected or theta.size == 0:
+            raise ValueError(f"the views have shape {expected}, got {np.shape(data)}")
         images = _finite(data)
-        if self._problem is None:
+        self._angles = theta.tolist()
+        if self._problem is None or self._state is None:
             self._data = list(images)
-        else:
-            self._problem = with_projections(self._problem, images)
+            return
+        self._problem = with_projections(replace(self._problem, geometry=self._template.at(theta)), images)
+        if angles is not None:
+            self._state.drawn, self._state.mean, self._schedule_step = [], None, self._state.step
 
     def move_axis(self, axis_col: float) -> None:
-        """Move the rotation axis. The model stays: the fit soon adapts to a shift of a fraction of a pixel.
+        """Move the rotation axis. The model moves to where the views have it about the new axis, and stays.
 
-        Begin a new fit where the axis moves by so much that edges in the model are doubled.
+        An axis that is off by d puts a point x cos θ + y sin θ + d off, and the model follows by the shift (a, b) whose
+        a cos θ + b sin θ is nearest to d in the views so far: (0, 4 d / π) for evenly spread ones. What is left of the
+        error doubles edges, which the model must learn anew: the rates rise again.
         """
+        moved = float(axis_col) - self._template.axis_col
         self._template = replace(self._template, axis_col=float(axis_col))
-        if self._problem is not None:
-            moved = replace(self._problem.geometry, axis_col=float(axis_col))
-            self._problem = replace(self._problem, geometry=moved)
+        if self._problem is None or self._state is None:
+            return
+        self._problem = replace(self._problem, geometry=replace(self._problem.geometry, axis_col=float(axis_col)))
+        theta = self._problem.geometry.angles
+        across = np.stack((np.cos(theta), np.sin(theta)), 1)
+        shift = np.linalg.lstsq(across, np.full(theta.size, moved * self._template.sample_pitch), rcond=None)[0]
+        for parameters in (self._state.parameters, self._state.mean):
+            if parameters is not None:
+                parameters["means"][:, :2] -= shift.astype(np.float32)
+        kept = 1 - min(1.0, abs(moved) / _AXIS_ANEW)
+        self._schedule_step = self._state.step - round(kept * (self._state.step - self._schedule_step))
 
     def advance(self, seconds: float) -> Progress:
         """Fit for about `seconds` s (at least one step once there is a model) and return the progress."""
@@ -209,18 +210,20 @@ class StreamingFit:
         if not self._angles:
             raise ValueError("no view has arrived, there is nothing to finish")
         self._begin_round(force=True)
+        if self._state is not None and self._state.mean is not None:  # from the better of the two
+            self._state.parameters = {name: values + 0 for name, values in self._state.mean.items()}
         return self._advance(seconds, finishing=True, on_progress=on_progress)
 
     def snapshot(self) -> Volume:
         """The volume as it stands, 1/mm; all zero before the first model."""
         if self._state is None:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
-        return fit.volume_of(self._state, self._grid, self._settings)
+        return fit.volume_of(averaged(self._state), self._grid, self._settings)
 
     @property
     def gaussians(self) -> Gaussians | None:
         """A copy of the model, None before the first one."""
-        return None if self._state is None else fit.gaussians_of(self._state)
+        return None if self._state is None else fit.gaussians_of(averaged(self._state))
 
     def progress(self) -> Progress:
         """Where the fit stands."""
@@ -237,11 +240,19 @@ class StreamingFit:
             self._begin_round()
         if self._state is None or self._problem is None:
             return self.progress()
-        reported = begin
+        reported, first = begin, self._fraction()
+        averaged_from = self._state.step if finishing else self._schedule_step
+        settings, settled = self._settings, replace(self._settings, policy=None)
         while True:
             spent = self._now() - begin
-            fraction = min(1.0, spent / seconds) if finishing and seconds > 0 else self._round_fraction()
-            fit.step(self._state, self._problem, self._settings, fraction, self._choose(finishing))
+            fraction = self._fraction()
+            if finishing and seconds > 0:
+                fraction = first + (1 - first) * min(1.0, spent / seconds)
+                if spent >= _LAST_GROWTH * seconds:
+                    settings = settled
+            fit.step(self._state, self._problem, settings, fraction, self._choose(finishing))
+            if self._state.step % _EVERY == 0:
+                average(self._state, _EVERY / (_EVERY + _WINDOW * (self._state.step - averaged_from)))
             if on_progress is not None and self._now() - reported > 0.1:
                 reported = self._now()
                 if on_progress(self.progress()):
@@ -250,10 +261,11 @@ class StreamingFit:
                 break
         return self.progress()
 
-    def _round_fraction(self) -> float:
-        # While views still come the rates go down half way only: the next round starts them again.
+    def _fraction(self) -> float:
+        """How far the rates have come on their logarithmic way to the lowest ones, 0..1."""
         assert self._state is not None
-        return 0.5 * min(1.0, (self._state.step - self._round_step) / _ROUND)
+        steps = self._state.step - self._schedule_step
+        return min(1.0, math.log1p(steps / _HALF) / max(-math.log(self._settings.decay), 1e-9))
 
     def _choose(self, finishing: bool) -> int | None:
         n = self.n_views
@@ -274,15 +286,18 @@ class StreamingFit:
                     raise
                 self._round_views = self.n_views
                 return
-        elif self._problem is not None and max(float(image.max()) for image in self._problem.images) > _BLIND:
-            # The sample or the beam came after the first views: the density unit is that of noise.
+        elif self._problem is not None and (
+            (not force and self.n_views < _YOUNG and self._state.step >= _HALF)
+            or max(float(image.max()) for image in self._problem.images) > _BLIND
+        ):
+            # So few views place Gaussians badly. Or the sample or the beam came later: the density unit is of noise.
             self._data = list(self._problem.projections)
             self._place_first()
         assert self._state is not None
         # Later views need new Gaussians: early ones span a narrow angle and would use all of them for their streaks.
         most = round(self._placed * growth(self._settings))
         self._state.limit = most if force else min(most, self._state.n + round(_ROUND_GROWTH * self._placed))
-        self._round_views, self._round_step = self.n_views, self._state.step
+        self._round_views = self.n_views
         self._state.drawn = []  # draw from all views from now on
 
     def _place_first(self) -> None:
@@ -291,7 +306,7 @@ class StreamingFit:
         field = Grid.for_fit(self._template, self._grid, wider=leaves_the_field(data, geometry))
         placed = place(data, geometry, field, self._count, self._rng, kernel=self._settings.kernel)
         self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
-        self._state = fit.init(placed, self._rng)
+        self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data = []  # the problem holds them from now on
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import recon
 from recon import methods
 from recon.base.method import Method, Traits
-from recon.splatting.stream import StreamingMethod
+from recon.splatting.streaming_method import StreamingMethod
 from recon.voxels.projector import Projector
 
 ROOT = Path(__file__).parents[2]
