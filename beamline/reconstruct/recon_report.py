@@ -87,8 +87,9 @@ class ReconOutcome:
         judged = residual_curve(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:
             return None
-        if (pace := self.settings.get("pace")) is not None:  # of a fit
-            if pace != FitSettings().pace:
+        if "pace" in self.settings:  # of a fit
+            usual = FitSettings()
+            if self.settings["pace"] != usual.pace or self.settings.get("decay", usual.decay) != usual.decay:
                 return None
             return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)
         return next_decibel(judged.seconds, judged.residuals)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beamline.core.errors import DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
 from beamline.core.text import size
@@ -92,7 +92,10 @@ def spill_of(
     """
     if not isinstance(options.method, Fbp) or cone_of(source, options.selection) is not None:
         return None
-    needs = needs_of(source, options)
+    try:
+        needs = needs_of(source, options)
+    except ConfigError:
+        return None  # what is wrong with the views themselves comes first: reading them says it
     memory = round(SHARE * free_memory()) if options.memory is None else options.memory
     if needs.at_once <= memory:
         return None

@@ -15,13 +15,14 @@ from tests.beamline.scans import write_exchange
 
 @pytest.fixture(autouse=True)
 def terminal() -> Iterator[None]:
-    """A hang-up ends things: under nohup it is ignored, and commands respect that."""
+    """Signals that end things: under nohup, or started behind a shell, some are ignored, and commands respect that."""
     if sys.platform == "win32":
         yield
         return
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    before = [(number, signal.signal(number, signal.SIG_DFL)) for number in (signal.SIGHUP, signal.SIGQUIT)]
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before:
+        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -74,7 +74,9 @@ def test_a_fit_says_what_longer_fits_gained() -> None:
     assert made.next_decibel == next_decibel_of_fit(30.0, 60)
     assert "as longer fits gained on four other scans" in made.next_decibel_text
     late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
-    followed = replace(_made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace})
+    followed = replace(
+        _made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace, "decay": WHILE_VIEWS_COME.decay}
+    )
     assert followed.next_decibel is None and followed.next_decibel_text == ""
     assert _made(late, "r2").next_decibel_text == "none in reach of what was measured"
 
