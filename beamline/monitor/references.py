@@ -35,13 +35,14 @@ class ReferenceLimits:
     """Limits of the references, each with its reason.
 
     saturated: as the alarm of the check `saturation`: a cosmic ray hits a pixel or two, one in a thousand is exposure.
-    light_over_noise: a flat at the darks' level has no light; three times the noise of a pixel is the least that can be told.
-    light_gone: half of the light does not go by drift, top-up or decay of the ring's current. Against the brightest flats
-        and against the views, which no sample makes brighter.
+    light_over_noise: a flat at the darks' level has no light; three times the noise of a pixel is the least that can
+        be told.
+    light_gone: half of the light does not go by drift, top-up or decay of the ring's current. Against the brightest
+        flats and against the views, which no sample makes brighter.
     uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
     unlit: a beam may be narrower than the detector, but not so that most of it is dark.
-    light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their variance;
-        an offset has the first alone and readout noise the second. A fifth of both is neither.
+    light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their
+        variance; an offset has the first alone and readout noise the second. A fifth of both is neither.
     """
 
     saturated: Annotated[float, Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")] = 1e-3
