@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
+import numba
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import get_num_threads
 
 from recon.base.geometry import Geometry
 from recon.base.ray_model import RayModel
@@ -171,7 +172,17 @@ def test_a_dynamic_range_of_1e8_leaves_each_pixel_its_digits(what: str) -> None:
     assert all(torch.isfinite(slope).all() for slope in gradients(leaves).values())
 
 
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Each thread adds up its own sums of 512: two of them add half as many one after another as one does."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
+    yield
+    numba.set_num_threads(before)
+
+
 @pytest.mark.parametrize("n", [1000, 100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("two_threads")
 def test_a_pile_at_one_pixel_does_not_drift(n: int) -> None:
     # The worst kind: all alike, so that every rounding goes the same way. One by one a million lose half a percent.
     g = Gaussians.from_physical(np.tile([20.0, 0.0, 10.0], (n, 1)), np.full(n, 1.0), np.full(n, 0.7))
@@ -179,13 +190,12 @@ def test_a_pile_at_one_pixel_does_not_drift(n: int) -> None:
     leaves = as_leaves(g)
     image = project(leaves, VIEW, truncation=WHOLE)[0]
     off = (image.detach().double() / (n * one) - 1).abs()
-    # Half a step for each of the 512 of one sum and for each of these sums that a thread adds up, and the footprint's
-    # own error.
-    most = (512 + n / 512 / get_num_threads()) * STEP / 2 + 0.5 * RECURRENCE
+    # Half a step for each of the 512 of one sum, and the footprint's own error.
+    most = 512 * STEP / 2 + 0.5 * RECURRENCE
     assert float(off[one > 0.05 * one.max()].max()) < most
     one_by_one = np.cumsum(np.full(n, float(one.max()), np.float32), dtype=np.float32)[-1]
     if n >= 100_000:
-        assert abs(float(one_by_one) / (n * float(one.max())) - 1) > 3 * most
+        assert abs(float(one_by_one) / (n * float(one.max())) - 1) > 4 * most
     image.sum().backward()
     slopes = gradients(leaves)
     assert all(torch.isfinite(slope).all() for slope in slopes.values())
