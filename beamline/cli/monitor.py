@@ -113,7 +113,7 @@ def monitor(
             sink(Event("warning", clock.now(), {"message": fault}))
         flags = [flag for each in found for flag in each]
         kinds = by_kind(flags)
-        alarmed = {row for flag in flags if flag.level is Level.ALARM for row in flag.frames} - again
+        alarmed = {frame for flag in flags if flag.level is Level.ALARM for frame in flag.frames} - again
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
             "flags": counts_of(kinds), "references": references,

@@ -57,13 +57,13 @@ _BITS = {check.name: check.bit for check in CHECKS}
 
 def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
     """Frames of a file by check and level; one with a warning and an alarm of a check counts by its alarm."""
-    rows: dict[tuple[str, Level], set[int]] = {}
+    frames: dict[tuple[str, Level], set[int]] = {}
     for flag in flags:
-        rows.setdefault((flag.check, flag.level), set()).update(flag.frames)
-    for check, level in rows:
+        frames.setdefault((flag.check, flag.level), set()).update(flag.frames)
+    for check, level in frames:
         if level is Level.WARN:
-            rows[check, level] -= rows.get((check, Level.ALARM), set())
-    return {key: found for key, found in rows.items() if found}
+            frames[check, level] -= frames.get((check, Level.ALARM), set())
+    return {key: found for key, found in frames.items() if found}
 
 
 def bitmask(flags: Iterable[Flag]) -> int:

@@ -125,8 +125,8 @@ class Recorder:
     def flags(self) -> dict[str, dict[str, int]]:
         """Frames flagged so far: their number by check, then by level."""
         found: dict[str, dict[str, int]] = {}
-        for (check, level), rows in sorted(flagged_frames(self._found).items()):
-            found.setdefault(check, {})[str(level)] = len(rows)
+        for (check, level), frames in sorted(flagged_frames(self._found).items()):
+            found.setdefault(check, {})[str(level)] = len(frames)
         return found
 
     @property
@@ -146,7 +146,7 @@ class Recorder:
 
     @property
     def _alarmed(self) -> set[int]:
-        return {row for flag in self._found if flag.level is Level.ALARM for row in flag.frames} - self._replaced
+        return {frame for flag in self._found if flag.level is Level.ALARM for frame in flag.frames} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Frames beside the timeline's come next; may be called while no frame waits."""

@@ -29,7 +29,7 @@ class Recovered:
     Attributes:
         changed: it was not in order before.
         frames: committed, and kept.
-        dropped: frames that were begun when the writer died, and are gone.
+        dropped: frames at the end that were not committed when the writer died, and are cut off.
         missing: views that were planned and not taken; None where the file does not hold its plan.
     """
 
@@ -43,7 +43,7 @@ class Recovered:
         """One line for people."""
         if not self.changed:
             return f"{self.path} is in order, with {count(self.frames, 'frame')}; nothing was changed."
-        gone = f", {count(self.dropped, 'frame')} that was not complete left out" if self.dropped else ""
+        gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
         views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
         return f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{views}."
 
@@ -102,7 +102,7 @@ def _require_ours(path: Path, file: h5py.File) -> None:
 
 
 def _finished(path: Path, file: h5py.File) -> Recovered:
-    frames, begun = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
+    frames, written = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
     for name in (layout.DATA, layout.PREVIEW, *layout.GROWING):
         if len(file[name]) != frames:
             file[name].resize(frames, 0)
@@ -115,7 +115,7 @@ def _finished(path: Path, file: h5py.File) -> Recovered:
             del file[name]
     layout.settle(file)
     add_exchange_view(file)
-    return Recovered(path, True, frames, max(0, begun - frames), _views_missing(file))
+    return Recovered(path, True, frames, max(0, written - frames), _views_missing(file))
 
 
 def _views_missing(file: h5py.File) -> int | None:
