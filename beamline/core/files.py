@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -58,3 +59,20 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     finally:
         with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk
             partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def result_folder(folder: Path) -> Iterator[Path]:
+    """Make the folder of a result, and in it one to work in, which is gone at the end of the block.
+
+    So is the folder itself where nothing was left in it: an empty one would refuse the next run.
+    """
+    folder.mkdir()
+    work = folder / "work"
+    work.mkdir()
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()

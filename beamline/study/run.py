@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Emit, Event, Sink, Warnings
-from beamline.core.files import named_on_failure, refuse_existing
+from beamline.core.files import named_on_failure, refuse_existing, result_folder
 from beamline.core.machine import machine
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
@@ -125,40 +125,36 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     for cell in table.cells:
         if cell.row.groups is None and cell.method == options.methods[0]:
             warn(f"{cell.row.label} is left out: {cell.message}")
-    folder.mkdir()
-    work = folder / "work"
-    work.mkdir()
     slices: Slices | None = None
-    try:
-        with named_on_failure(work / "views.npy"):
-            np.save(work / "views.npy", prepared.projections.data)
-        del prepared  # from here on the views are in the file alone
-        rig = _Rig(work, geometry, options.seed)
-        whole = Row(REFERENCE, np.arange(geometry.n_views)[:, None])
-        reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
-        if reference is None:
-            raise DataError(f"{options.source.path}: the FBP of all views, to compare with, failed: {outcome.message}")
-        mask = regions(Volume(reference if truth is None else truth, grid), options.seed)
-        slices = Slices(reference, REFERENCE)
-        if truth is not None:
-            slices.add("truth", truth)
-        rig.compile(options.methods)
-        judge = _Judge(reference, truth, mask)
+    with result_folder(folder) as work:
+        try:
+            with named_on_failure(work / "views.npy"):
+                np.save(work / "views.npy", prepared.projections.data)
+            del prepared  # from here on the views are in the file alone
+            rig = _Rig(work, geometry, options.seed)
+            whole = Row(REFERENCE, np.arange(geometry.n_views)[:, None])
+            reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
+            if reference is None:
+                raise DataError(
+                    f"{options.source.path}: the FBP of all views, to compare with, failed: {outcome.message}"
+                )
+            mask = regions(Volume(reference if truth is None else truth, grid), options.seed)
+            slices = Slices(reference, REFERENCE)
+            if truth is not None:
+                slices.add("truth", truth)
+            rig.compile(options.methods)
+            judge = _Judge(reference, truth, mask)
 
-        def say(event: str, data: Mapping[str, Any]) -> None:
-            sink(Event(event, clock.now(), data))
+            def say(event: str, data: Mapping[str, Any]) -> None:
+                sink(Event(event, clock.now(), data))
 
-        for table in _each(table, rig, judge, slices, say, now):  # noqa: B020 - each has one more row than the last
-            write_table(folder, table)
-    except KeyboardInterrupt:
-        if not table.done:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-        table = replace(table, stopped=True)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):  # an empty folder would refuse the next run
-            folder.rmdir()
+            for table in _each(table, rig, judge, slices, say, now):  # noqa: B020 - each has one more row than the last
+                write_table(folder, table)
+        except KeyboardInterrupt:
+            if not table.done:
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            table = replace(table, stopped=True)
     write_table(folder, table)
     assert slices is not None
     write_page(folder, table, slices)

@@ -11,7 +11,7 @@ from typing import Any
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.files import named_on_failure
+from beamline.core.files import named_on_failure, result_folder
 from beamline.core.machine import machine
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
@@ -99,26 +99,20 @@ def run_tradeoff(
         command=options.command,
     )
     sink(Event("tradeoff_started", clock.now(), {"file": options.source.path, "trials": len(trials), "by": table.by}))
-    folder.mkdir()
-    work = folder / "work"
-    work.mkdir()
-    try:
-        with named_on_failure(work / "data.npz"):
-            data.save(work / "data.npz")
-        state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
-        sink(Event("state", clock.now(), state))
-        compile_kernels(trials, work)
-        for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each has one more trial than the last
-            write_table(folder, table)
-    except KeyboardInterrupt:
-        if table.n_done == 0:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-        table = replace(table, stopped=True)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):  # an empty folder would refuse the next run
-            folder.rmdir()
+    with result_folder(folder) as work:
+        try:
+            with named_on_failure(work / "data.npz"):
+                data.save(work / "data.npz")
+            state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
+            sink(Event("state", clock.now(), state))
+            compile_kernels(trials, work)
+            for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each has one more trial than the last
+                write_table(folder, table)
+        except KeyboardInterrupt:
+            if table.n_done == 0:
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            table = replace(table, stopped=True)
     write_table(folder, table)
     write_figures(folder, table)
     summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
