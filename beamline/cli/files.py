@@ -67,12 +67,15 @@ def _text(value: Any) -> str:
 @click.command()
 @click.argument("file", type=_PATH)
 @scan_options
+@click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
-def validate(file: Path, as_json: bool, **said: Any) -> None:
+def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
     """Check the scan in FILE against the rules of its format. Exit code: 0 no error (warnings may be), 5 errors."""
-    now = SystemClock().now()
-    with json_events(as_json) as sinks:
-        findings = findings_of(SourceOptions(file, **said))
+    clock = SystemClock()
+    now = clock.now()
+    with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
+        progress = counting("validate", fan_out(*(sinks or [terminal])), clock)
+        findings = findings_of(SourceOptions(file, **said), progress if deep else None)
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for sink in sinks:
             for finding in findings:

@@ -25,6 +25,7 @@ SAY_EVERY = 0.2
 """s between events on how far many frames are."""
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
+_OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
 
 
 class Terminal:
@@ -76,7 +77,7 @@ class Terminal:
     def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
-        elif event.event == "progress" and event.data.get("stage") in ("ingest", "xafs", "monitor", "correction"):
+        elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
         elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study"):
             self._show("trials", event.data["n"], event.data["of"], trials(event.data))

@@ -80,7 +80,6 @@ def digest(
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image).view()
     image.flags.writeable = False  # one compiled kernel for all: numba tells writable arrays from others
-    checksum = zlib_ng.crc32(image.data.cast("B"))
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     peaks = np.empty_like(preview)
     if image.dtype == np.uint16 and no_data is None:
@@ -90,7 +89,12 @@ def digest(
             image = image.astype(np.float64)
             image.flags.writeable = False
         numbers = _from_reals(image, saturation, preview_bin, no_data, preview, peaks)
-    return FrameDigest(*numbers, checksum, preview, peaks)
+    return FrameDigest(*numbers, checksum_of(image), preview, peaks)
+
+
+def checksum_of(image: NDArray[Any]) -> int:
+    """CRC-32 of the pixels in memory order."""
+    return zlib_ng.crc32(np.ascontiguousarray(image).data.cast("B"))
 
 
 Numbers = tuple[float, float, float, float, float, float, float, float]

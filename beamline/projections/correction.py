@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.text import spans
 from beamline.projections.read import open_beam, photons_of, read_binned, read_references
 from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
@@ -49,7 +50,8 @@ class ScanCorrection:
         if source.quantity == "counts":
             groups = reference_groups(source)
             used = groups if selection.accept_references else groups.good()
-            self._references = read_references(source, used, self.rows, self.binning)
+            self._references = read_references(source, used, self.rows, self.binning, not selection.use_flags)
+            self._tell_damaged(np.concatenate([*used.darks, *used.flats]))
             self.photons = photons_of(source, used, self._references, self.rows, selection)
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
@@ -66,7 +68,7 @@ class ScanCorrection:
         """
         data, frames = self._read(frames, rows)
         if not frames.size:
-            raise DataError(f"{self._source.path}: none of the pixels of the views chosen is a finite number.")
+            raise self._no_view()
         if self._references is None:
             return _as_given(data, frames)
         return self._corrected(self._correction(rows), data, frames, last=True)
@@ -115,7 +117,7 @@ class ScanCorrection:
             kept.append(replace(corrected, data=np.empty((0, *out.shape[1:]), np.float32)))
             told(begun + min((done + 1) * batch, frames.size), passes * frames.size)
         if not at:
-            raise DataError(f"{self._source.path}: none of the pixels of the views chosen is a finite number.")
+            raise self._no_view()
         return _joined(kept, out[:at])
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
@@ -164,7 +166,7 @@ class ScanCorrection:
         return ScanCorrection(self._source, self._selection, self._warn)
 
     def _read(self, frames: NDArray[np.int64], rows: slice | None) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Pixels [frame, row, col] of the frames that hold a finite one, and these frames."""
+        """Pixels [frame, row, col] of the frames that hold a finite one and are not damaged, and these frames."""
         first, end = self.rows.start, self.rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // self.binning)
@@ -175,7 +177,26 @@ class ScanCorrection:
             lost = frames[~alive]
             self._warn(f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out.")
             data, frames = data[alive], frames[alive]
+        if (damaged := self._tell_damaged(frames)).any() and self._selection.use_flags:
+            data, frames = data[~damaged], frames[~damaged]
         return data, frames
+
+    def _tell_damaged(self, frames: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the frames are not what was written, as far as they were read; a warning names them."""
+        damaged = np.isin(frames, sorted(self._source.damaged))
+        if damaged.any():
+            taken = "left out" if self._selection.use_flags else "used as they are (--flags ignore)"
+            self._warn(
+                f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
+                f"checksums: {taken}. Look for a good copy of {self._source.path}."
+            )
+        return damaged
+
+    def _no_view(self) -> DataError:
+        return DataError(
+            f"{self._source.path}: none of the views chosen can be used: their pixels are not finite, or not those "
+            "that were written."
+        )
 
     def _correction(self, rows: slice | None) -> Correction:
         assert self._references is not None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups
@@ -55,18 +55,30 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, binning: int) -> References:
+def read_references(
+    source: ScanSource, groups: ReferenceGroups, rows: slice, binning: int, use_damaged: bool = False
+) -> References:
     """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
 
-    The light of flats with an exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat,
-    where both are known. The dark is one for all: the file's rules tell where it was exposed otherwise.
+    Frames that are damaged (see ScanSource) are left out, unless `use_damaged`. The light of flats with an exposure of
+    their own is scaled to the projections': dark + (flat - dark) * t / t_flat, where both are known. The dark is one
+    for all: the file's rules tell where it was exposed otherwise.
+
+    Raises:
+        DataError: all frames of a kind are damaged.
     """
-    dark = _mean(source, np.concatenate(groups.darks), rows, binning)
+    dark = _mean(source, np.concatenate(groups.darks), rows, binning, None, use_damaged)
     scale = light_scale(source.image_key, source.exposures)
     flats = []
     for group in groups.flats:
-        mean = _mean(source, group, rows, binning, scale[group])
-        flats.append((float(group.mean()), (mean + (1 - scale[group].mean()) * dark).astype(np.float32)))
+        mean = _mean(source, group, rows, binning, scale[group], use_damaged)
+        if dark is not None and mean is not None:
+            flats.append((float(group.mean()), (mean + (1 - scale[group].mean()) * dark).astype(np.float32)))
+    if dark is None or not flats:
+        raise DataError(
+            f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: their pixels are not those that "
+            "were written, by their checksums. Use a good copy, or --flags ignore, which takes them as they are."
+        )
     return References(dark.astype(np.float32), tuple(flats))
 
 
@@ -88,14 +100,17 @@ def _mean(
     frames: NDArray[np.int64],
     rows: slice,
     binning: int,
-    weights: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Mean of the frames, each times its weight; float64 [row, col], binned."""
-    total = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64)
+    weights: NDArray[np.float64] | None,
+    use_damaged: bool,
+) -> NDArray[np.float64] | None:
+    """Mean of the frames that may be used, each times its weight; float64 [row, col], binned; None where none may."""
+    total, n = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64), 0
     for i, frame in enumerate(frames):
         image = read_binned(source, np.array([frame]), rows, binning)[0]
-        total += image if weights is None else weights[i] * image
-    return total / frames.size
+        if use_damaged or int(frame) not in source.damaged:
+            total += image if weights is None else weights[i] * image
+            n += 1
+    return total / n if n else None
 
 
 def photons_of(
@@ -115,8 +130,9 @@ def photons_of(
     binning = selection.binning
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
+    spoilt = [] if not selection.use_flags else sorted(source.damaged)
     flats, darks = (
-        read_binned(source, max(groups, key=len)[:_TRANSFER_FRAMES], middle, binning)
+        read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (used.flats, used.darks)
     )
     if selection.gain is not None:  # a mean of n pixels has n times as many photons a count

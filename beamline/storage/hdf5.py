@@ -182,13 +182,24 @@ def missing_links(item: h5py.Dataset) -> list[Path]:
 
 
 def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
-    """Fill out [frame, row, col] with frames in the order asked for; consecutive ones are read at once."""
+    """Fill out [frame, row, col] with frames in the order asked for; consecutive ones are read at once.
+
+    Raises:
+        DataError: the file does not give them: damaged or cut chunks, or a compression that is not installed.
+    """
     start = 0
     while start < indices.size:
         stop = start + 1
         while stop < indices.size and indices[stop] == indices[stop - 1] + 1:
             stop += 1
-        out[start:stop] = item[indices[start] : indices[start] + stop - start, rows]
+        first, last = int(indices[start]), int(indices[stop - 1])
+        try:
+            out[start:stop] = item[first : last + 1, rows]
+        except OSError as error:
+            which = f"Frame {first}" if first == last else f"One of the frames {first} to {last}"
+            raise DataError(
+                f"{which} of {item.name} in {item.file.filename} cannot be read ({reason(error)})."
+            ) from error
         start = stop
 
 

@@ -124,9 +124,15 @@ def _copy(
     rows = layout.Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0
-    for i, (image, record) in enumerate(_frames(source)):
+    for i, (given, record) in enumerate(_frames(source)):
+        image = given.astype(dtype, copy=False)
         if should_stop is not None and should_stop():
             raise ScanStopped(f"Stopped after {i} of {n} frames; nothing is left of {file.filename}.")
+        if i in source.damaged:
+            raise DataError(
+                f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
+                f"good copy; `beamline validate --deep` looks at all frames. Nothing is left of {file.filename}."
+            )
         statistics = digest(image, saturation=saturation, no_data=no_data)
         invalid += statistics.invalid_fraction == 1.0
         rows.write(i, image, statistics, record)

@@ -25,6 +25,8 @@ class ArraySource:
     attributes: dict[str, Any] = {}  # noqa: RUF012
     flags = None
     replaces = None
+    checksummed = False
+    damaged: frozenset[int] = frozenset()
     finished = True
     plan: dict[str, Any] = {}  # noqa: RUF012
 

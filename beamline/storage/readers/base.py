@@ -41,6 +41,9 @@ class ScanSource(Protocol):
         flags: of the monitor, by frame; None where no monitor looked at the frames.
         replaces: int64 [frame], the row of the view that a frame was taken again for (an INVALID frame from then on),
             -1 in others; None where no view was taken again.
+        checksummed: the file holds a checksum of every frame.
+        damaged: rows read so far whose pixels are not those that were written, by these checksums; frames of
+            which less than half is read are not compared.
         plan: what the operator asked for, as our files record it; empty where it is not known.
         finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
@@ -75,6 +78,10 @@ class ScanSource(Protocol):
     def flags(self) -> FrameFlags | None: ...
     @property
     def replaces(self) -> NDArray[np.int64] | None: ...
+    @property
+    def checksummed(self) -> bool: ...
+    @property
+    def damaged(self) -> frozenset[int]: ...
     @property
     def plan(self) -> Mapping[str, Any]: ...
     @property
@@ -163,6 +170,14 @@ class ScanReader(ABC):
     @property
     def replaces(self) -> NDArray[np.int64] | None:
         return None
+
+    @property
+    def checksummed(self) -> bool:
+        return False
+
+    @property
+    def damaged(self) -> frozenset[int]:
+        return frozenset()
 
     @property
     def plan(self) -> Mapping[str, Any]:

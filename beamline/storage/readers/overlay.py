@@ -91,6 +91,14 @@ class Overlay(ScanReader):
         return None if rows is None else np.concatenate([np.full(n, -1), np.where(rows < 0, -1, rows + n)])
 
     @property
+    def checksummed(self) -> bool:
+        return self._base.checksummed
+
+    @property
+    def damaged(self) -> frozenset[int]:
+        return frozenset(row + len(self._front) for row in self._base.damaged)
+
+    @property
     def finished(self) -> bool:
         return self._base.finished
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.text import count, spans
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -24,6 +25,9 @@ from drivers.frame import FrameKind
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
 
+Progress = Callable[[int, int], None]
+"""Is told how many of how many frames are done."""
+
 _TURNS = 10  # fewer are not taken for degrees
 _FARTHEST = 1e6  # degrees
 
@@ -31,15 +35,19 @@ SAMPLES = 4  # frames of a kind that are looked at
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
 
-def validate(scan: SourceOptions | Path | str) -> list[Finding]:
+def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:
     """Everything that the rules find in a file, worst first; [] for a scan without fault.
 
     Never raises for what is wrong with the file: what cannot be opened is a finding.
+
+    Args:
+        deep: every frame is read and compared with its checksum; is told how many of how many.
     """
     findings = _as_hdf5(Path(scan.path if isinstance(scan, SourceOptions) else scan))
     try:
         with open_scan(scan) as source:
             findings += source_findings(source)
+            findings += frames_as_written(source, deep)
     except DataError as error:
         if not any(finding.severity == "error" for finding in findings):  # else it is already said why
             findings.append(Finding("error", "readable", str(error)))
@@ -60,6 +68,36 @@ def scan_findings(source: ScanSource) -> list[Finding]:
 def reconstruction_blockers(source: ScanSource) -> list[Finding]:
     """Why this scan must not be reconstructed; [] where nothing stands against it."""
     return [finding for finding in source_findings(source) if finding.severity == "error"]
+
+
+def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Finding]:
+    """Every frame can be read, and has the checksum that was written with it, where the file has checksums.
+
+    Args:
+        told: how many of how many frames were read; None: only those that other rules have read are judged.
+    """
+    n, unreadable, why = int(source.image_key.size), list[int](), ""
+    for row in range(n) if told is not None else ():
+        try:
+            source.read([row])
+        except DataError as error:
+            unreadable.append(row)
+            why = why or str(error)
+        if told is not None:
+            told(row + 1, n)
+    if unreadable:
+        said = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
+        yield Finding("error", "unreadable", said)
+    if source.damaged:
+        yield Finding(
+            "error",
+            "checksums",
+            f"{len(source.damaged)} of {n} frames differ from the checksums that were written with them: "
+            f"{spans(sorted(source.damaged))}. Look for a good copy; `beamline recon` leaves them out."
+            + ("" if told else " `validate --deep` compares all frames."),
+        )
+    elif told and not source.checksummed:
+        yield Finding("info", "checksums", "The file holds no checksums: it is only known that its frames can be read.")
 
 
 def enough_views(source: ScanSource) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         try:
             with hdf5.created(partial) as file:
                 file.attrs["format"], file.attrs["version"] = _FORMAT, version()
-                file.attrs["steps"] = checkpoint.steps
+                file.attrs["steps"], file.attrs["digest"] = checkpoint.steps, _digest(checkpoint)
                 for group, values in (("state", checkpoint.state), ("made_from", checkpoint.made_from)):
                     node = file.create_group(group)
                     for name, value in values.items():
@@ -58,7 +59,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """The checkpoint that `write_checkpoint` wrote.
 
     Raises:
-        DataError: there is none, or the file is something else.
+        DataError: there is none, the file is something else, or damaged: its content differs from its digest (files of
+            earlier versions have none).
     """
     if not path.is_file():
         raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
@@ -67,10 +69,28 @@ def read_checkpoint(path: Path) -> Checkpoint:
             said = file.attrs.get("format")
             if said != _FORMAT:
                 raise KeyError(f"its format is {said!r}, expected {_FORMAT!r}")
-            return Checkpoint(
+            kept = Checkpoint(
                 {name: np.asarray(node[()]) for name, node in file["state"].items()},
                 {name: value_of(node) for name, node in file["made_from"].items()},
                 int(file.attrs["steps"]),
             )
-    except (OSError, KeyError) as error:
+            digest = file.attrs.get("digest")
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:  # h5py's
         raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint makes one.") from error
+    if digest is not None and digest != _digest(kept):
+        raise DataError(
+            f"The checkpoint {path} is damaged: its content is not what was written (its digest differs). Resume from "
+            "another, or start anew."
+        )
+    return kept
+
+
+def _digest(checkpoint: Checkpoint) -> str:
+    """SHA-256 of names, types, shapes and values."""
+    digest = hashlib.sha256(str(checkpoint.steps).encode())
+    for group in (checkpoint.state, checkpoint.made_from):
+        for name in sorted(group):
+            value = np.asarray(group[name])
+            digest.update(f"|{name} {value.dtype.str} {value.shape} ".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+    return digest.hexdigest()

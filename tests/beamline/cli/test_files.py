@@ -228,3 +228,15 @@ def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) 
     said = _beamline(command, "stack.tif", "--quantity", "counts").stdout
     assert "Counts without flats: give --flats FILE (or a folder), or --quantity line-integrals" in said
     assert "Counts without darks: give --darks FILE (or a folder), or --quantity line-integrals" in said
+
+
+def test_validate_deep_names_damaged_frames(folder: Path) -> None:
+    good = _beamline("validate", "scan.h5", "--deep")
+    assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
+    with h5py.File("scan.h5", "r+") as file:
+        file["entry/instrument/detector/data"][9, 1, 1] ^= 1
+    result = _beamline("validate", "scan.h5", "--deep")
+    assert result.exit_code == 5
+    assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
+    events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
+    assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}

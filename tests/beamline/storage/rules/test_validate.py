@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +12,15 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import reconstruction_blockers, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
+from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
 
 Write = Callable[[list[Frame]], Path]
@@ -153,7 +157,13 @@ def skipped_stamp(file: h5py.File) -> None:
 
 
 def stuck(file: h5py.File) -> None:
-    file["entry/digest/checksum"][9] = file["entry/digest/checksum"][8]
+    repaint(file, 9, file[f"{DETECTOR}/data"][8])
+
+
+def repaint(file: h5py.File, row: int, pixels: np.ndarray) -> None:
+    """Other pixels, as if they had been written."""
+    file[f"{DETECTOR}/data"][row] = pixels
+    file["entry/digest/checksum"][row] = zlib.crc32(pixels.tobytes())
 
 
 def counted_too_many(file: h5py.File) -> None:
@@ -173,12 +183,14 @@ def lost_triggers(file: h5py.File) -> None:
 
 
 def no_beam(file: h5py.File) -> None:
-    pixels = file[f"{DETECTOR}/data"]
-    pixels[2:5] = pixels[()][[0, 1, 0]] + np.uint16(3)
+    darks = file[f"{DETECTOR}/data"][:2]
+    for row in (2, 3, 4):
+        repaint(file, row, darks[row % 2] + np.uint16(3))
 
 
 def dead_projections(file: h5py.File) -> None:
-    file[f"{DETECTOR}/data"][5:] = 65535
+    for row in range(5, 14):
+        repaint(file, row, np.full(SHAPE, 65535, np.uint16))
 
 
 def huge_pixels(file: h5py.File) -> None:
@@ -346,3 +358,64 @@ def test_real_scans_can_be_reconstructed(shared_data: Path) -> None:
         with open_scan(SourceOptions(shared_data / name, **how)) as source:  # type: ignore[arg-type]
             assert reconstruction_blockers(source) == [], name
             assert int((source.image_key == FrameKind.PROJECTION).sum()) >= 91
+
+
+def flip(path: Path, at: int, bit: int) -> None:
+    """Flip one bit of a file, as a disk or a memory does."""
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def test_a_flipped_bit_of_any_pixel_is_found_in_its_frame(
+    write: Write, frames: list[Frame], rng: np.random.Generator
+) -> None:
+    path = write(frames)
+    with h5py.File(path) as file:
+        offsets = [file[f"{DETECTOR}/data"].id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in range(14)]
+    for row in range(14):
+        at, bit = offsets[row] + int(rng.integers(2 * SHAPE[0] * SHAPE[1])), int(rng.integers(8))
+        flip(path, at, bit)
+        told: list[tuple[int, int]] = []
+        (hit,) = [hit for hit in validate(path, deep=lambda n, of: told.append((n, of))) if hit.rule == "checksums"]  # noqa: B023
+        assert hit.severity == "error"
+        assert f"1 of 14 frames differ from the checksums that were written with them: {row}." in hit.message
+        assert told == [(n, 14) for n in range(1, 15)]
+        flip(path, at, bit)
+    assert validate(path, deep=lambda n, of: None) == []
+
+
+def test_frames_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders())
+    assert [hit.rule for hit in validate(path, deep=lambda n, of: None)] == ["checksums"]  # it has none
+    with h5py.File(path, "r+") as file:
+        data = file["exchange/data"][()]
+        del file["exchange/data"]
+        packed = file.create_dataset("exchange/data", data=data, chunks=(1, *data.shape[1:]), compression="gzip")
+        offset = packed.id.get_chunk_info(30).byte_offset
+    flip(path, offset + 8, 3)
+    (hit,) = [hit for hit in validate(path, deep=lambda n, of: None) if hit.rule == "unreadable"]
+    assert hit.message.startswith("1 frame cannot be read: 34. Frame 30 of /exchange/data in ")
+
+
+def test_frames_of_big_endian_files_are_as_written_when_ingested(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(), {"data": TwoCylinders().counts().astype(">u2")})
+    ingest(path, tmp_path / "ours.h5")
+
+    def differ() -> list[str]:
+        return [hit.message for hit in validate(tmp_path / "ours.h5", lambda n, of: None) if hit.rule == "checksums"]
+
+    assert differ() == []
+    with h5py.File(tmp_path / "ours.h5", "r+") as file:  # as earlier versions wrote it
+        frames = file[f"{DETECTOR}/data"][()]
+        file["entry/digest/checksum"][:] = [zlib.crc32(frame.astype(">u2").tobytes()) for frame in frames]
+    assert differ() == []
+
+
+def test_a_damaged_scan_is_not_ingested(write: Write, frames: list[Frame], tmp_path: Path) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        file[f"{DETECTOR}/data"][6, 0, 0] ^= 8
+    with pytest.raises(DataError, match=r"Frame 6 of .* checksum differs"):
+        ingest(path, tmp_path / "copy.h5")
+    assert [left.name for left in tmp_path.iterdir()] == ["scan.h5"]

@@ -1,0 +1,84 @@
+"""Frames whose pixels are not those that were written are named, and used only where that is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.writers import layout
+from drivers.frame import FrameKind
+from recon.prep.correct import CorrectionSettings
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+SCAN = TwoCylinders()
+DARKS, FLATS, VIEWS = (0, 1), (2, 3), 4  # rows of the file
+
+
+def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
+    """The scan with one bit of the last pixel flipped in these rows, after it was written."""
+    path = write_flagged(folder / "scan.h5", frames_of(SCAN), {})
+    with h5py.File(path, "r+") as file:
+        for row in damaged:
+            file[layout.DATA][row, -1, -1] ^= 1 << bit
+    return path
+
+
+def prepare(path: Path, spill: Spill | None = None, **chosen: object) -> tuple[PreparedProjections, list[str]]:
+    told: list[str] = []
+    selection = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air="none"), **chosen)  # type: ignore[arg-type]
+    with open_scan(path) as source:
+        return prepare_projections(source, selection, told.append, spill), told
+
+
+def test_a_good_scan_says_nothing(tmp_path: Path) -> None:
+    assert prepare(scan(tmp_path))[1] == []
+
+
+@pytest.mark.parametrize("rows", [None, (1, 4)], ids=["whole frames", "most of their rows"])
+@pytest.mark.parametrize("spilled", [False, True])
+def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, spilled: bool) -> None:
+    path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
+    spill = Spill(np.empty((45, height, 40), np.float32), 7, lambda n, of: None) if spilled else None
+    prepared, told = prepare(path, spill, rows=rows)
+    np.testing.assert_array_equal(prepared.projections.view_ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
+    said = " ".join(told)
+    assert ("Frames 9 " in said and "Frames 20-21 " in said) if spilled else "Frames 9, 20-21 " in said
+    assert "left out" in said
+
+
+def test_flags_ignore_uses_them_and_says_so(tmp_path: Path) -> None:
+    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), use_flags=False)
+    assert prepared.projections.view_ids.size == 45
+    assert "Frames 9 do not have the pixels that were written" in said and "used as they are" in said
+
+
+def test_a_damaged_reference_is_left_out_of_the_mean(tmp_path: Path) -> None:
+    good, _ = prepare(scan(tmp_path))
+    (tmp_path / "scan.h5").unlink()
+    spoilt, told = prepare(scan(tmp_path, 1, 3))
+    assert "Frames 1, 3 " in told[0] and "left out" in told[0]
+    # One count is in the last pixel of the good second flat: 1/20000 of the light, half of it in the mean.
+    np.testing.assert_allclose(spoilt.projections.data, good.projections.data, atol=1e-4)
+
+
+@pytest.mark.parametrize(("rows", "kind"), [(DARKS, "darks"), (FLATS, "flats")])
+def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple[int, int], kind: str) -> None:
+    path = scan(tmp_path, *rows, bit=0)
+    with pytest.raises(DataError, match=f"all {kind} are damaged"):
+        prepare(path)
+    assert prepare(path, use_flags=False)[0].projections.view_ids.size == 45
+
+
+def test_rows_count_on_behind_references_that_were_given(tmp_path: Path) -> None:
+    darks, flats = np.full((3, *SCAN.shape), 100, np.uint16), np.full((2, *SCAN.shape), 20100, np.uint16)
+    with open_scan(SourceOptions(scan(tmp_path, 9), darks=darks, flats=flats)) as source:
+        assert source.checksummed and not source.damaged
+        source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION))
+        assert source.damaged == {9 + 5}
