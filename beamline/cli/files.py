@@ -32,7 +32,7 @@ _PATH = click.Path(path_type=Path)
 @scan_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
 def info(file: Path, as_json: bool, **said: Any) -> None:
-    """Describe the scan in FILE: frames, angles, geometry, and problems of its format."""
+    """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format."""
     with json_events(as_json) as sinks:
         facts = dict(describe(SourceOptions(file, **said)))
         for sink in sinks:
@@ -40,7 +40,7 @@ def info(file: Path, as_json: bool, **said: Any) -> None:
     if as_json:
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
-    if facts["flags"] is not None:
+    if facts.get("flags") is not None:
         facts["flags"] = counted(facts["flags"])
     width = max(len(name) for name in (*facts, *attributes)) + 2
     for name, value in (facts | attributes).items():
@@ -70,7 +70,10 @@ def _text(value: Any) -> str:
 @click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
 def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
-    """Check the scan in FILE against the rules of its format. Exit code: 0 no error (warnings may be), 5 errors."""
+    """Check the scan or volume in FILE against the rules of its format.
+
+    Exit code: 0 no error (warnings may be), 5 errors.
+    """
     clock = SystemClock()
     now = clock.now()
     with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:

@@ -40,11 +40,12 @@ _COMMANDS = {
     "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
     "segment": _Entry("segment", "Segment the particles of a volume: labels, sizes, places."),
     "bench": _Entry("bench", "Measure this machine: kernels, fits, and quality against time."),
-    "info": _Entry("files", "Describe a scan file."),
-    "validate": _Entry("files", "Check a scan file against the rules of its format."),
+    "info": _Entry("files", "Describe a scan file or a volume."),
+    "validate": _Entry("files", "Check a scan file or a volume against the rules of its format."),
     "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor."),
     "ingest": _Entry("files", "Convert a multi-page TIFF into an HDF5 scan, page by page."),
+    "export": _Entry("export", "Copy a volume to another format: TIFF, npy, NRRD, with grey values if wanted."),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema."),
 }
 

@@ -31,6 +31,7 @@ from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.follow import follow as follow_scan
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
+from beamline.storage.volumes.files import format_of
 from drivers.clock import SystemClock
 from recon.assess.plans import Quality
 from recon.auto import Auto
@@ -41,9 +42,12 @@ from recon.voxels.fbp import Filter
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
-    """An output file; its name must differ from that of the report, which ends in .html."""
-    if value is not None and (not value.name or value.suffix.lower() in (".html", ".htm")):
-        raise click.BadParameter(f"{str(value)!r} cannot hold a volume; name an HDF5 file, such as volume.h5")
+    """An output whose suffix names the format of a volume."""
+    if value is not None:
+        try:
+            format_of(value)
+        except ValueError as error:
+            raise click.BadParameter(str(error)) from error
     return value
 
 
@@ -90,9 +94,10 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=click.Path(path_type=Path),
     callback=whole_output,
-    help="Output file. Default: FILE's stem + _METHOD.h5, in this folder.",
+    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, or no suffix: a folder of TIFFs. Default: FILE's stem + "
+    "_METHOD.h5, in this folder.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
@@ -143,9 +148,9 @@ def recon(
 ) -> None:
     """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
 
-    Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown) as NXtomoproc, with all settings, and a
-    report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or iterations
-    stops with the volume reached so far (exit code 4), the second discards it.
+    Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
+    and a report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or
+    iterations stops with the volume reached so far (exit code 4), the second discards it.
     """
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()

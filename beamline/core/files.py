@@ -36,7 +36,8 @@ def named_on_failure(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A temporary file beside `path` to write to. It becomes `path` at the end of the block; an error removes it.
+    """A temporary name beside `path` to write to, a file or a folder. It becomes `path` at the end of the block; an
+    error removes it.
 
     Args:
         path: the file to write. Without `replace` it must not exist.
@@ -58,7 +59,15 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
             raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
     finally:
         with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk
-            partial.unlink(missing_ok=True)
+            remove(partial)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from beamline.core.events import Event, Sink
-from beamline.core.files import refuse_existing
+from beamline.core.files import refuse_existing, remove
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.reconstruct.remarks import hiding_warning, odd_views_warning
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
-from beamline.storage.writers.recon_file import ReconRecord, Value, write_reconstruction
+from beamline.storage.volumes.files import write_volume
+from beamline.storage.writers.recon_file import ReconRecord, Value
 from drivers.clock import Clock
 from recon.base.volume import Volume
 from recon.methods import BASELINE, by_name
@@ -95,13 +96,13 @@ def write_result(
         metrics=own,
         history=history_arrays(made.history),
     )
-    write_reconstruction(target.output, record, replace=target.replace)
+    write_volume(target.output, record, replace=target.replace)
     if target.report is not None:
         page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
         try:
             write_report(target.report, page, replace=target.replace)
         except BaseException:
-            target.output.unlink(missing_ok=True)
+            remove(target.output)
             raise
     summary: dict[str, Any] = {
         "output": target.output,

@@ -1,8 +1,9 @@
-"""describe: what a scan is, in plain values; `beamline info` prints them."""
+"""describe: what a scan or a volume is, in plain values; `beamline info` prints them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,40 @@ import numpy as np
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import source_findings
+from beamline.storage.volumes.files import volume_format
+from beamline.storage.writers.recon_file import ReconRecord
 from drivers.frame import FrameKind
 
 
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
-    """Describe a scan. DataError where it cannot be opened."""
+    """Describe a scan or a volume. DataError where it cannot be opened."""
+    path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
+    if (kind := volume_format(path)) is not None:
+        with kind.open(path) as record:
+            return describe_volume(path, kind.name, record)
     with open_scan(scan) as source:
         return describe_source(source)
+
+
+def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, Any]:
+    """Format, voxels, where they come from, and every setting and figure of merit that is one number or a text."""
+    grid, data = record.volume.grid, record.volume.data
+    attributes = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray) or v.size == 2}
+    return {
+        "path": str(path),
+        "format": f"volume, {kind}",
+        "shape": tuple(grid.shape),
+        "dtype": str(data.dtype),
+        "bytes": _size(path),
+        "voxel_zyx": tuple(float(f"{edge:.6g}") for edge in grid.spacing),
+        "length_unit": record.length_unit,
+        "title": record.title,
+        "sample": record.sample,
+        "raw_file": record.raw_file,
+        "date": datetime.fromtimestamp(record.time, UTC).isoformat(timespec="seconds"),
+        "attributes": {**attributes, **record.metrics},
+        "findings": [],
+    }
 
 
 def describe_source(source: ScanSource) -> Mapping[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import zipfile
 import zlib
 from pathlib import Path
@@ -18,6 +19,24 @@ from beamline.storage.hdf5 import require_real
 
 SUFFIXES = (".tif", ".tiff")
 UNREADABLE = (tifffile.TiffFileError, OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+class Complaints(logging.Handler):
+    """What tifffile says about a damaged file: it logs that, and goes on with the pages that it finds."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.said: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.said.append(record.getMessage())
+
+    def __enter__(self) -> Complaints:
+        logging.getLogger("tifffile").addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("tifffile").removeHandler(self)
 
 
 def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:

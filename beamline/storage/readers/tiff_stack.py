@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +13,8 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, pages_one_by_one
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, pages_one_by_one
 from drivers.frame import FrameKind
-
-
-class _Complaints(logging.Handler):
-    """What tifffile says about a damaged file: it logs that, and goes on with the pages that it finds."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.ERROR)
-        self.said: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.said.append(record.getMessage())
-
-    def __enter__(self) -> None:
-        logging.getLogger("tifffile").addHandler(self)
-
-    def __exit__(self, *_: object) -> None:
-        logging.getLogger("tifffile").removeHandler(self)
 
 
 class TiffStack(ScanReader):
@@ -42,7 +24,7 @@ class TiffStack(ScanReader):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        complaints = _Complaints()
+        complaints = Complaints()
         with complaints:
             try:
                 self._tif = tifffile.TiffFile(path)

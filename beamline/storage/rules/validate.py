@@ -21,6 +21,8 @@ from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.volume import volume_findings
+from beamline.storage.volumes.files import volume_format
 from drivers.frame import FrameKind
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
@@ -38,13 +40,18 @@ EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:
     """Everything that the rules find in a file, worst first; [] for a scan without fault.
 
-    Never raises for what is wrong with the file: what cannot be opened is a finding.
+    Never raises for what is wrong with the file: what cannot be opened is a finding. A volume is judged as one.
 
     Args:
         deep: every frame is read and compared with its checksum; is told how many of how many.
     """
-    findings = _as_hdf5(Path(scan.path if isinstance(scan, SourceOptions) else scan))
+    path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
+    kind = volume_format(path)
+    findings = _as_hdf5(path) if kind is None else []
     try:
+        if kind is not None:
+            with kind.open(path) as record:
+                return [*volume_findings(record)]
         with open_scan(scan) as source:
             findings += source_findings(source)
             findings += frames_as_written(source, deep)

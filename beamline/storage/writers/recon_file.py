@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from beamline.core.version import version
 from beamline.storage import hdf5
 from recon.base.volume import Grid, Volume
 
+DEFINITION = "NXtomoproc"
 _SLAB = 16  # slices written at a time
 Value = str | int | float | bool | NDArray[Any]
 
@@ -56,18 +58,23 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
     """
     with whole_file(path, replace=replace) as partial:
         try:
-            with hdf5.created(partial) as file:
-                _write_entry(_group(file, "entry", "NXentry"), record)
-                file.attrs["default"] = "entry"
+            write_record(partial, record)
         except OSError as error:
             raise DataError(
                 f"{path} could not be written ({hdf5.reason(error)}). Check the disk; nothing was left there."
             ) from error
 
 
+def write_record(path: Path, record: ReconRecord) -> None:
+    """Write the new file `path`, sixteen slices at a time. OSError where the disk refuses."""
+    with hdf5.created(path) as file:
+        _write_entry(_group(file, "entry", "NXentry"), record)
+        file.attrs["default"] = "entry"
+
+
 def _write_entry(entry: h5py.Group, record: ReconRecord) -> None:
     entry.attrs["default"] = "data"
-    entry["definition"] = "NXtomoproc"
+    entry["definition"] = DEFINITION
     entry["title"] = record.title
     source = _group(_group(entry, "instrument", "NXinstrument"), "source", "NXsource")
     source["probe"] = "x-ray"
@@ -113,11 +120,25 @@ def read_reconstruction(path: Path) -> ReconRecord:
     Raises:
         DataError: if the file is missing or is not such a file.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            return _read_entry(file["entry"])
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error
+    with opened_reconstruction(path) as record:
+        values = np.asarray(record.volume.data[:], dtype=np.float32)
+        return replace(record, volume=Volume(values, record.volume.grid))
+
+
+@contextmanager
+def opened_reconstruction(path: Path) -> Iterator[ReconRecord]:
+    """The same without its voxels in memory: the volume's data are read where they are sliced along z.
+
+    Raises:
+        DataError: if the file is missing or is not such a file.
+    """
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(h5py.File(path, "r"))
+            record = _read_entry(file["entry"])
+        except (OSError, KeyError, ValueError, AttributeError) as error:
+            raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error
+        yield record
 
 
 def _read_entry(entry: h5py.Group) -> ReconRecord:
@@ -129,7 +150,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
     grid = Grid(data["data"].shape, size, tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x)))  # type: ignore[arg-type]
     parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(
-        volume=Volume(np.asarray(data["data"][:], dtype=np.float32), grid),
+        volume=Volume(data["data"], grid),
         length_unit=str(data["x"].attrs["units"]),
         raw_file=str(parameters.pop("raw_file")),
         title=str(value_of(entry["title"])),

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from beamline.cli.recon import repeated, report_beside
+from beamline.core.errors import DataError
 from beamline.monitor.check import Level
+from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr
 from recon.splatting.schedule import DEFAULT_STEPS
@@ -34,6 +36,28 @@ def test_defaults_and_results(folder: Path) -> None:
     assert "Data residual" in result.stdout
     assert "fbp: 30 views" in result.stderr
     assert "fbp: 30 views" not in result.stdout
+
+
+@pytest.mark.parametrize("name", ["v.h5", "v.tif", "v", "v.npy", "v.nrrd"])
+def test_the_suffix_of_the_output_is_its_format(folder: Path, name: str) -> None:
+    assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "reference.h5", "--no-report").exit_code == 0
+    result = beamline("recon", "scan.h5", "-m", "fbp", "-o", name)
+    assert result.exit_code == 0, result.output
+    assert left(folder) == {"scan.h5", "reference.h5", name, "v.html"}
+    with opened_volume(folder / name) as read, opened_volume(folder / "reference.h5") as reference:
+        np.testing.assert_array_equal(read.volume.data[:], reference.volume.data[:])
+    said = beamline("info", name)
+    assert said.exit_code == 0 and "2 x 40 x 40" in said.stdout
+    assert beamline("validate", name).exit_code == 0
+
+
+def test_a_report_that_fails_takes_the_folder_of_slices_with_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise DataError("v.html could not be written (No space left on device).")
+
+    monkeypatch.setattr("beamline.reconstruct.result.write_report", full)
+    assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "v").exit_code == 5
+    assert left(folder) == {"scan.h5"}
 
 
 def _axis(lines: dict[str, str]) -> dict[str, str]:

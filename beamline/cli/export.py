@@ -1,0 +1,101 @@
+"""`beamline export`: copies a volume to another format, slice by slice."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import click
+import numpy as np
+
+from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.options import json_option
+from beamline.cli.recon import refuse_shared, whole_output
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event
+from beamline.core.files import refuse_existing
+from beamline.core.text import size
+from beamline.storage.volumes.base import Pixels
+from beamline.storage.volumes.files import format_of, opened_volume, write_volume
+from beamline.storage.writers.recon_file import ReconRecord
+from drivers.clock import SystemClock
+
+
+def window_of(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, float] | None:
+    """LOW:HIGH, two finite numbers."""
+    if value is None:
+        return None
+    try:
+        low, high = map(float, value.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise click.BadParameter(f"{value!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
+    return low, high
+
+
+@click.command()
+@click.argument("volume", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=whole_output,
+    required=True,
+    help="Its suffix names the format: .tif, .npy, .nrrd, .h5, or none: a folder of TIFFs.",
+)
+@click.option("--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values.")
+@click.option(
+    "--window",
+    metavar="LOW:HIGH",
+    callback=window_of,
+    help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
+)
+@click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
+@json_option
+def export(
+    volume: Path, output: Path, bits: str, window: tuple[float, float] | None, dataset: str | None, as_json: bool
+) -> None:
+    """Copy VOLUME to another format: TIFF (BigTIFF from 2 GiB on), a folder of TIFFs, NRRD, npy or NXtomoproc.
+
+    Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
+    Nothing is overwritten, and a failure leaves nothing.
+    """
+    refuse_shared({"VOLUME": volume, "--output": output})
+    pixels = Pixels(int(bits), window)
+    if pixels.bits == 32 and window is not None:
+        raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")
+    if pixels.bits < 32 and not format_of(output).greys:
+        raise click.UsageError(f"{format_of(output).name} holds the values themselves: leave out --bits and --window.")
+    clock = SystemClock()
+    began = clock.now()
+    with terminated_like_interrupted(), json_events(as_json) as sinks:
+        refuse_existing(output)
+        with opened_volume(volume, dataset) as record:
+            if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
+                raise DataError(
+                    f"{volume} holds grey values of a window, not the volume itself. Export the volume it was made of."
+                )
+            if pixels.bits < 32 and window is None:
+                raise ConfigError(f"--bits {bits} needs --window LOW:HIGH. {_suggestion(record)}")
+            clipped = write_volume(output, record, pixels)
+            shape = record.volume.grid.shape
+        seconds = clock.now() - began
+        share = clipped / math.prod(shape)
+        for sink in sinks:
+            facts = {"output": output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
+            sink(Event("done", clock.now(), {**facts, "seconds": seconds}))
+    if as_json:
+        return
+    click.echo(f"output   {output} ({format_of(output).name}, {pixels.dtype.name})")
+    click.echo(f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}")
+    if window is not None:
+        click.echo(f"window   {window[0]:g} to {window[1]:g}; {share:.3%} of the voxels lie outside and are clipped")
+
+
+def _suggestion(record: ReconRecord) -> str:
+    """A window for the middle slice."""
+    middle = record.volume.grid.shape[0] // 2
+    values = np.asarray(record.volume.data[middle : middle + 1], np.float32)
+    low, high = np.percentile(values[np.isfinite(values)], (0.1, 99.9)) if np.isfinite(values).any() else (0.0, 1.0)
+    return f"99.8 % of the values of the middle slice lie in {low:.4g}:{high:.4g}. Nothing was written."

@@ -1,0 +1,1 @@
+"""Files that hold a volume, by format."""

@@ -1,0 +1,159 @@
+"""What a format of volume files does, how voxels become grey values, and the facts that go with them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.version import version
+from beamline.storage.writers.recon_file import ReconRecord
+from recon.base.volume import Grid, Volume
+
+MARK = "splatline volume"
+"""Value of `format` in the facts of a file that is a volume of ours, not a scan."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """What a voxel is stored as.
+
+    Attributes:
+        bits: 32: float32, the value itself; 16 or 8: a grey value.
+        window: of grey values: the values that become 0 and the greatest; what lies outside is clipped.
+    """
+
+    bits: int = 32
+    window: tuple[float, float] | None = None
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype({32: "<f4", 16: "<u2", 8: "u1"}[self.bits])
+
+
+class Slices:
+    """The slices of a volume as they are stored, one after another.
+
+    `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite.
+    """
+
+    def __init__(self, volume: Volume, pixels: Pixels) -> None:
+        self._data, self.pixels, self.shape, self.outside = volume.data, pixels, volume.grid.shape, 0
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        for z in range(self.shape[0]):
+            yield self._stored(np.asarray(self._data[z : z + 1][0], np.float32))
+
+    def _stored(self, values: NDArray[np.float32]) -> NDArray[Any]:
+        dtype, window = self.pixels.dtype, self.pixels.window
+        if window is None:
+            return np.ascontiguousarray(values, dtype)
+        low, high = window
+        inside = (values >= low) & (values <= high)
+        self.outside += values.size - int(inside.sum())
+        greatest = np.iinfo(dtype).max
+        grey = (np.nan_to_num(values, nan=low).astype(np.float64) - low) * (greatest / (high - low))
+        return np.clip(np.rint(grey), 0, greatest).astype(dtype)
+
+
+class VolumeFormat(Protocol):
+    """A format of volume files."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """That a file's name ends in; "" for a folder."""
+        ...
+
+    @property
+    def greys(self) -> bool:
+        """Whether it holds grey values of 8 and 16 bits."""
+        ...
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        """Write a new file, slice by slice. OSError where the disk refuses."""
+        ...
+
+    def holds(self, path: Path) -> bool:
+        """Whether this is a volume in this format, written by this program; False for what cannot be read."""
+        ...
+
+    def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
+        """The record of such a file; its volume's data are read where they are sliced along z.
+
+        Raises:
+            DataError: cut off or damaged.
+        """
+        ...
+
+
+def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
+    """What a file without places of its own says of its volume, for JSON: all but arrays and the history."""
+    grid = record.volume.grid
+    scalars = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}
+    return {
+        "format": MARK,
+        "program": f"splatline {version()}",
+        "title": record.title,
+        "sample": record.sample,
+        "raw_file": record.raw_file,
+        "date": datetime.fromtimestamp(record.time, UTC).isoformat(timespec="seconds"),
+        "length_unit": record.length_unit,
+        "values": f"1/{record.length_unit}",
+        **({} if pixels.window is None else {"window": pixels.window}),
+        "voxel_size": grid.voxel_size,
+        "slice_pitch": grid.slice_pitch,
+        "centre_zyx": grid.centre,
+        "parameters": scalars,
+        "metrics": dict(record.metrics),
+    }
+
+
+def marked(text: str) -> dict[str, Any] | None:
+    """The facts in a description; None where it is none of ours."""
+    if MARK not in text:
+        return None
+    try:
+        facts = json.loads(text)
+    except ValueError:
+        return None
+    return facts if isinstance(facts, dict) and facts.get("format") == MARK else None
+
+
+def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
+    """The record that `facts_of` describes, of these values [z, y, x]; a window is among its parameters."""
+    z, y, x = facts["centre_zyx"]
+    grid = Grid(values.shape, facts["voxel_size"], (z, y, x), facts["slice_pitch"])
+    window = {"window": np.asarray(facts["window"])} if "window" in facts else {}
+    return ReconRecord(
+        volume=Volume(values, grid),
+        length_unit=facts["length_unit"],
+        raw_file=facts["raw_file"],
+        title=facts["title"],
+        sample=facts["sample"],
+        time=datetime.fromisoformat(facts["date"]).timestamp(),
+        parameters={**facts["parameters"], **window},
+        metrics=facts["metrics"],
+    )
+
+
+def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:
+    """The record of a volume of which nothing else is known; `spacing` (z, y, x) in mm."""
+    dz, _, dx = spacing or (1.0, 1.0, 1.0)
+    return ReconRecord(
+        volume=Volume(values, Grid(values.shape, dx, slice_pitch=dz)),
+        length_unit="px" if spacing is None else "mm",
+        raw_file="not stated",
+        title=path.name,
+        sample="not stated",
+        time=path.stat().st_mtime,
+        parameters={},
+    )

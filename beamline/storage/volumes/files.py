@@ -1,0 +1,94 @@
+"""The formats of volume files, by the suffix of a name; writing one as a whole, and opening one slice by slice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.storage import hdf5
+from beamline.storage.volume_file import SUFFIXES, read_volume
+from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record
+from beamline.storage.volumes.nxtomoproc import NXtomoproc
+from beamline.storage.volumes.plain import Npy, Nrrd
+from beamline.storage.volumes.tiff import TiffFile, TiffFolder
+from beamline.storage.writers.recon_file import ReconRecord
+
+FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffFile(), TiffFolder(), Npy(), Nrrd())
+"""Every format that volumes are written in."""
+
+_ZARR = (".zarr", ".ome")
+
+
+def format_of(path: Path) -> VolumeFormat:
+    """The format that the suffix of a name stands for.
+
+    Raises:
+        ValueError: for none; the message lists those that there are.
+    """
+    suffix = path.suffix.lower()
+    if not path.name or (not suffix and path.name.startswith(".")):
+        raise ValueError(f"{str(path)!r} names no file and no folder for a volume; expected such as volume.h5.")
+    found = next((kind for kind in FORMATS if suffix in kind.suffixes), None)
+    if found is None:
+        known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in FORMATS)
+        why = " OME-Zarr is not written, as no library of this program does it." if suffix in _ZARR else ""
+        raise ValueError(
+            f"{str(path)!r}: the suffix names the format of a volume, and {suffix!r} is none of {known}.{why}"
+        )
+    return found
+
+
+def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, *, replace: bool = False) -> int:
+    """Write a volume in the format that the suffix of `path` names, slice by slice: as a whole, or not at all.
+
+    Args:
+        pixels: default: float32.
+        replace: a file takes the place of an older one; a folder never does.
+
+    Returns:
+        how many voxels the window clipped.
+
+    Raises:
+        ValueError: an unknown suffix, or grey values in a format without.
+        DataError: `path` exists and `replace` is not set, or the disk refuses; nothing is left.
+    """
+    kind, pixels = format_of(path), pixels or Pixels()
+    if pixels.window is not None and not kind.greys:
+        raise ValueError(f"{kind.name} holds the values themselves (float32); leave bits and window out.")
+    slices = Slices(record.volume, pixels)
+    with whole_file(path, replace=replace) as partial:
+        try:
+            kind.write(partial, record, slices)
+        except OSError as error:
+            raise DataError(
+                f"{path} could not be written ({hdf5.reason(error)}). Check the disk; nothing was left there."
+            ) from error
+    return slices.outside
+
+
+def volume_format(path: Path) -> VolumeFormat | None:
+    """The format of a volume that this program wrote, or of an .npy; None for scans and all else."""
+    return next((kind for kind in FORMATS if kind.holds(path)), None)
+
+
+@contextmanager
+def opened_volume(path: Path, dataset: str | None = None) -> Iterator[ReconRecord]:
+    """Any volume file: ours is read where it is sliced along z, others as a whole (see `read_volume`).
+
+    Raises:
+        DataError: it cannot be read, or holds no volume.
+    """
+    kind = None if dataset is not None else volume_format(path)
+    if kind is not None:
+        with kind.open(path) as record:
+            yield record
+        return
+    if path.is_dir():
+        raise DataError(f"{path} is a folder, and not one of slices that this program wrote; expected {SUFFIXES}.")
+    values, spacing = read_volume(path, dataset)
+    if values.ndim != 3 or values.dtype.kind not in "uifb":
+        raise DataError(f"{path} holds {values.dtype} of shape {values.shape}; expected real numbers [z, y, x].")
+    yield bare_record(path, values, spacing)

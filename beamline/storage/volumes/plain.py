@@ -1,0 +1,110 @@
+"""NRRD and npy: a short header, then the voxels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.storage.volumes.base import MARK, Slices, bare_record, facts_of, marked, record_of
+from beamline.storage.writers.recon_file import ReconRecord
+
+_TYPES = {32: "float", 16: "uint16", 8: "uint8"}
+_LONGEST_HEADER = 2**20
+_KEY = b"splatline:="
+
+
+@dataclass(frozen=True)
+class Nrrd:
+    """NRRD 4 (teem.sourceforge.net/nrrd/format.html), raw, attached header; the facts are JSON under `splatline`."""
+
+    name: str = "NRRD"
+    suffixes: tuple[str, ...] = (".nrrd",)
+    greys: bool = True
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        grid, nz, ny, nx = record.volume.grid, *slices.shape
+        z, y, x = (float(centres[0]) for centres in grid.coordinates())
+        dz, dy, dx = (float(edge) for edge in grid.spacing)
+        units = f'space units: "{record.length_unit}" "{record.length_unit}" "{record.length_unit}"\n'
+        facts = json.dumps(facts_of(record, slices.pixels))
+        header = (
+            f"NRRD0004\ntype: {_TYPES[slices.pixels.bits]}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n"
+            f"space directions: ({dx!r},0,0) (0,{dy!r},0) (0,0,{dz!r})\nkinds: space space space\nendian: little\n"
+            f"encoding: raw\n{units}space origin: ({x!r},{y!r},{z!r})\n"
+        ).encode("ascii")
+        with path.open("xb") as file:
+            file.write(header + _KEY + _escaped(facts) + b"\n\n")
+            for values in slices:
+                file.write(values.data)
+
+    def holds(self, path: Path) -> bool:
+        return path.name.lower().endswith(self.suffixes) and path.is_file() and MARK.encode() in _header(path)[0]
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        header, begin = _header(path)
+        fields = dict(line.split(b": ", 1) for line in header.splitlines() if b": " in line and b":=" not in line)
+        (said,) = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
+        facts = marked(_unescaped(said))
+        kinds = {name.encode(): bits for bits, name in _TYPES.items()}
+        try:
+            nx, ny, nz = map(int, fields[b"sizes"].split())
+            dtype = {32: "<f4", 16: "<u2", 8: "u1"}[kinds[fields[b"type"]]]
+            values = np.memmap(path, dtype, "r", begin, (nz, ny, nx))
+        except (KeyError, ValueError) as error:
+            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
+        assert facts is not None
+        yield record_of(facts, values)
+
+
+@dataclass(frozen=True)
+class Npy:
+    """NumPy's own format: the voxels and their shape, and nothing else."""
+
+    name: str = "npy"
+    suffixes: tuple[str, ...] = (".npy",)
+    greys: bool = True
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        header = {"descr": slices.pixels.dtype.str, "fortran_order": False, "shape": slices.shape}
+        with path.open("xb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+            for values in slices:
+                file.write(values.data)
+
+    def holds(self, path: Path) -> bool:
+        """Any that has three axes of numbers: a scan is never one."""
+        if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
+            return False
+        try:
+            values = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError):
+            return False
+        return isinstance(values, np.ndarray) and values.ndim == 3 and values.dtype.kind in "uif"
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        yield bare_record(path, np.load(path, mmap_mode="r", allow_pickle=False))
+
+
+def _header(path: Path) -> tuple[bytes, int]:
+    """The header of an NRRD and where its data begin; (b"", 0) where it has none."""
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER)
+    end = head.find(b"\n\n")
+    return (head[:end], end + 2) if head.startswith(b"NRRD") and end >= 0 else (b"", 0)
+
+
+def _escaped(text: str) -> bytes:
+    """JSON has no line ends; the other thing that NRRD escapes are backslashes."""
+    return text.replace("\\", "\\\\").encode("ascii")
+
+
+def _unescaped(text: bytes) -> str:
+    return text.decode("ascii").replace("\\\\", "\\")

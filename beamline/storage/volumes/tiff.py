@@ -1,0 +1,127 @@
+"""TIFF: all slices in one file, or a folder with a file for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.tiff import UNREADABLE, Complaints
+from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
+from beamline.storage.writers.recon_file import ReconRecord
+
+_CLASSIC = 2**31  # bytes of voxels that a TIFF with offsets of 32 bits holds; more take a BigTIFF
+
+
+@dataclass(frozen=True)
+class TiffFile:
+    """One TIFF, or BigTIFF from 2 GiB on; the facts are JSON in the description of the first slice."""
+
+    name: str = "TIFF"
+    suffixes: tuple[str, ...] = (".tif", ".tiff")
+    greys: bool = True
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        dtype = slices.pixels.dtype
+        size = int(np.prod(slices.shape, dtype=np.int64)) * dtype.itemsize
+        with tifffile.TiffWriter(path, bigtiff=size >= _CLASSIC) as tif:
+            tif.write(iter(slices), shape=slices.shape, dtype=dtype, **_tags(record, facts_of(record, slices.pixels)))
+
+    def holds(self, path: Path) -> bool:
+        return path.is_file() and path.name.lower().endswith(self.suffixes) and _facts(path) is not None
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        facts = _facts(path)
+        assert facts is not None
+        try:
+            with Complaints() as complaints, tifffile.TiffFile(path) as tif:
+                pages = len(tif.pages)
+                values: NDArray[Any] = tifffile.memmap(path, mode="r").reshape(facts["shape"])
+            if complaints.said or pages != facts["shape"][0]:
+                raise ValueError(f"{pages} of {facts['shape'][0]} slices, {'; '.join(complaints.said)}")
+        except UNREADABLE as error:
+            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
+        yield record_of(facts, values)
+
+
+@dataclass(frozen=True)
+class TiffFolder:
+    """A folder of `slice_00000.tif` and so on; every file has the facts, its own number and how many there are."""
+
+    name: str = "folder of TIFFs"
+    suffixes: tuple[str, ...] = ("",)
+    greys: bool = True
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        path.mkdir()
+        tags = _tags(record, facts_of(record, slices.pixels))
+        for z, values in enumerate(slices):
+            tags["metadata"] |= {"slice": z, "slices": slices.shape[0]}
+            tifffile.imwrite(_slice(path, z), values, **tags)
+
+    def holds(self, path: Path) -> bool:
+        return path.is_dir() and _slice(path, 0).is_file() and _facts(_slice(path, 0)) is not None
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        facts = _facts(_slice(path, 0))
+        assert facts is not None
+        missing = [z for z in range(facts["slices"]) if not _slice(path, z).is_file()]
+        if missing:
+            raise DataError(
+                f"{path} lacks {len(missing)} of {facts['slices']} slices (first: {_slice(path, missing[0]).name})."
+            )
+        yield record_of(facts, _Stack(path, (facts["slices"], *facts["shape"][-2:])))
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """A folder of slices that is sliced along z as an array is."""
+
+    folder: Path
+    shape: tuple[int, int, int]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self[0:1].dtype
+
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        return np.stack([self._read(z) for z in range(*part.indices(self.shape[0]))])
+
+    def _read(self, z: int) -> NDArray[Any]:
+        path = _slice(self.folder, z)
+        try:
+            values = tifffile.imread(path)
+        except UNREADABLE as error:
+            raise DataError(f"{path} cannot be read ({error}).") from error
+        if values.shape != self.shape[1:]:
+            raise DataError(f"{path} has shape {values.shape}, slice 0 has {self.shape[1:]}.")
+        return values
+
+
+def _slice(folder: Path, z: int) -> Path:
+    return folder / f"slice_{z:05d}.tif"
+
+
+def _facts(path: Path) -> dict[str, Any] | None:
+    try:
+        with Complaints(), tifffile.TiffFile(path) as tif:
+            return marked(tif.pages.first.description)
+    except UNREADABLE:
+        return None
+
+
+def _tags(record: ReconRecord, facts: dict[str, Any]) -> dict[str, Any]:
+    """What other programs show of it: pixels per cm, and the facts."""
+    tags: dict[str, Any] = {"photometric": "minisblack", "metadata": facts}
+    if record.length_unit == "mm":
+        tags |= {"resolution": (10 / record.volume.grid.voxel_size,) * 2, "resolutionunit": "CENTIMETER"}
+    return tags

@@ -1,0 +1,92 @@
+"""`beamline export`: formats, grey values, what is refused and what is left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.storage.volumes.files import opened_volume, write_volume
+from beamline.storage.writers.recon_file import ReconRecord
+from recon.base.volume import Grid, Volume
+from tests.beamline.cli.small_scan import beamline, left
+
+VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
+
+
+@pytest.fixture
+def volume(folder: Path) -> Path:
+    grid = Grid(VALUES.shape, 0.5)
+    write_volume(folder / "v.h5", ReconRecord(Volume(VALUES, grid), "mm", "scan.h5", "t", "s", 0.0, {"method": "fbp"}))
+    return folder
+
+
+def test_values_stay_as_they_are(volume: Path) -> None:
+    for name in ("v.tif", "v", "v.npy", "v.nrrd", "copy.h5"):
+        result = beamline("export", "v.h5", "-o", name)
+        assert result.exit_code == 0, result.output
+        with opened_volume(volume / name) as read:
+            np.testing.assert_array_equal(read.volume.data[:], VALUES)
+    assert beamline("export", "v", "-o", "again.h5").exit_code == 0
+    with opened_volume(volume / "again.h5") as read, opened_volume(volume / "v.h5") as first:
+        np.testing.assert_array_equal(read.volume.data[:], VALUES)
+        assert (read.volume.grid, read.parameters) == (first.volume.grid, first.parameters)
+
+
+def test_volumes_of_others(folder: Path) -> None:
+    np.savez(folder / "other.npz", v=VALUES, voxel_mm=0.5)
+    assert beamline("export", "other.npz", "-o", "v.h5").exit_code == 0
+    with opened_volume(folder / "v.h5") as read:
+        np.testing.assert_array_equal(read.volume.data[:], VALUES)
+        assert (read.volume.grid.voxel_size, read.length_unit) == (0.5, "mm")
+
+
+def test_grey_values_say_what_was_clipped(volume: Path) -> None:
+    result = beamline("export", "v.h5", "-o", "g.tif", "--bits", "8", "--window", "0:1", "--json")
+    assert result.exit_code == 0, result.output
+    done = json.loads(result.stdout.splitlines()[-1])
+    outside = float(((VALUES < 0) | (VALUES > 1)).mean())
+    assert (done["bits"], done["window"], done["clipped"]) == (8, [0.0, 1.0], pytest.approx(outside))
+    grey = tifffile.imread(volume / "g.tif")
+    assert grey.dtype == np.uint8
+    assert np.abs(grey / 255 - np.clip(VALUES, 0, 1)).max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["-o", "v.zarr"], 2, "OME-Zarr is not written"),
+        (["-o", "v.png"], 2, "'.png' is none of"),
+        (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
+        (["-o", "no/v.tif"], 5, "does not exist"),
+        (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of the middle slice lie in"),
+        (["-o", "g.tif", "--window", "0:1"], 2, "give --bits 8"),
+        (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
+        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "no window"),
+        (["-o", "g.h5", "--bits", "8", "--window", "0:1"], 2, "leave out --bits"),
+    ],
+)
+def test_refused_with_one_sentence_and_nothing_left(volume: Path, options: list[str], code: int, said: str) -> None:
+    before = left(volume)
+    result = beamline("export", "v.h5", *options)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr and result.stdout == ""
+    assert left(volume) == before
+
+
+def test_what_is_no_volume_is_refused(volume: Path) -> None:
+    assert beamline("export", "v.h5", "-o", "g.tif", "--bits", "16", "--window", "0:1").exit_code == 0
+    (volume / "empty").mkdir()
+    before = left(volume)
+    for name, said in (
+        ("g.tif", "grey values"),
+        ("scan.h5", "volumes"),
+        ("empty", "is a folder"),
+        ("none.h5", "no vol"),
+    ):
+        result = beamline("export", name, "-o", "out.nrrd")
+        assert (result.exit_code, said in result.stderr) == (5, True), result.output
+    assert left(volume) == before
