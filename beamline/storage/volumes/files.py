@@ -9,6 +9,8 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.storage import hdf5
+from beamline.storage.readers.base import Opening
+from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import SUFFIXES, read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record
 from beamline.storage.volumes.nxtomoproc import NXtomoproc
@@ -70,8 +72,12 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
 
 
 def volume_format(path: Path) -> VolumeFormat | None:
-    """The format of a volume that this program wrote, or of an .npy; None for scans and all else."""
-    return next((kind for kind in FORMATS if kind.holds(path)), None)
+    """The format of a volume that this program wrote, or of an .npy that is no scan; None for scans and all else."""
+    found = next((kind for kind in FORMATS if kind.holds(path)), None)
+    # Voxels alone say nothing of where they come from: a reader of scans goes first.
+    if isinstance(found, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
+        return None
+    return found
 
 
 @contextmanager

@@ -79,7 +79,7 @@ class Npy:
                 file.write(values.data)
 
     def holds(self, path: Path) -> bool:
-        """Any that has three axes of numbers: a scan is never one."""
+        """Any that has three axes of numbers."""
         if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
             return False
         try:
