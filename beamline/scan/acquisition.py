@@ -21,6 +21,8 @@ from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, Devices
 
+DOUBTFUL = 0.2  # steps by which an angle may be wrong, from which that is told
+
 NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DARK: "dark"}
 
 
@@ -251,7 +253,7 @@ class Acquisition:
             )
         if text := self._discrepancies():
             raise LedgerError(
-                f"{text.strip()} Every other frame is in the file with its own angle. Repeat these views, or "
+                f"{text.strip()} Every other frame is in the file with the angle of its trigger. Repeat these views, or "
                 "reconstruct without them; a longer period_s leaves the camera more time.",
                 self.missing,
             )
@@ -287,6 +289,11 @@ def _describe(done: TakenBlock) -> str:
     if taken.shift:
         text += (
             f" The angles of a pass may all be wrong by up to {taken.shift} steps: it is not known at which of its "
-            "ends frames are missing."
+            "ends frames are missing or too many."
+        )
+    if text and taken.off > DOUBTFUL:
+        text += (
+            f" A frame came {taken.off:.2f} periods off its trigger: its angle may be wrong by as much of a step "
+            "(warnings of `timing` name such frames)."
         )
     return text.strip()

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import InstrumentError
+from beamline.core.errors import BeamlineError, InstrumentError
 from beamline.core.events import Emit
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, pass_ends
-from beamline.scan.ledger import EXTRA, Account, Ledger, Train, assign, settle
+from beamline.scan.ledger import EXTRA, Account, Exposed, Ledger, Train, enter, settle
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frame import Frame, FrameKind
@@ -38,6 +38,7 @@ class Taken:
         lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
         extra: frames that no trigger exposed.
         shift: triggers by which the angles of a pass may be wrong (see ledger.Account).
+        off: steps by which the angle of a frame may be wrong (likewise).
     """
 
     frames: int = 0
@@ -46,6 +47,7 @@ class Taken:
     ignored: int = 0
     extra: int = 0
     shift: int = 0
+    off: float = 0.0
 
     def enter(self, account: Account, first: int) -> None:
         """Add a pass whose first trigger is `first`."""
@@ -54,33 +56,56 @@ class Taken:
         self.ignored += account.ignored
         self.extra += len(account.extra)
         self.shift = max(self.shift, account.shift)
+        self.off = max(self.off, account.off)
 
 
 @dataclass
 class _Pass:
     """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes.
 
-    `braked`: time at which the stage was ordered to stop during the pass.
+    `braked`: time at which the stage was ordered to stop during the pass. `waiting`: frames whose trigger is told by
+    those that follow.
     """
 
     ledger: Ledger
     first: int
     seconds: float
     braked: float = math.inf
+    waiting: list[CameraFrame] = field(default_factory=list)
+
+    @property
+    def so_far(self) -> Ledger:
+        """The ledger as if no further frame came."""
+        ledger, waiting = self.ledger, [self._exposed(frame) for frame in self.waiting]
+        while waiting and (entered := enter(ledger, waiting, last=True)):
+            ledger, waiting = entered[0], waiting[1:]
+        return ledger
 
     @property
     def last_due(self) -> float:
         """When the last trigger of the pass is due, in s since the Unix epoch; inf where that is not known."""
-        ledger, train = self.ledger, self.ledger.train
+        ledger, train = self.so_far, self.ledger.train
         if ledger.last >= 0:
             return ledger.phase + (train.n - 1 - ledger.last) * ledger.period
         return math.inf if train.first is None else train.first + (train.n - 1) * train.period
 
-    def enter(self, frame: CameraFrame) -> tuple[CameraFrame, int, float]:
-        """The frame with its trigger within the block (or EXTRA) and its angle."""
-        steady = frame.time < self.braked
-        self.ledger, entry = assign(self.ledger, frame.framestamp, frame.time, steady)
-        return frame, EXTRA if entry.trigger == EXTRA else self.first + entry.trigger, entry.angle
+    def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[tuple[CameraFrame, int, float]]:
+        """The frames that need not wait any more, each with its trigger within the block (or EXTRA) and its angle.
+
+        Args:
+            last: no further frame will come: none waits.
+        """
+        self.waiting += frames
+        while self.waiting:
+            entered = enter(self.ledger, [self._exposed(frame) for frame in self.waiting], last)
+            if entered is None:
+                return
+            self.ledger, entry = entered
+            trigger = EXTRA if entry.trigger == EXTRA else self.first + entry.trigger
+            yield self.waiting.pop(0), trigger, entry.angle
+
+    def _exposed(self, frame: CameraFrame) -> Exposed:
+        return Exposed(frame.framestamp, frame.time, frame.time < self.braked)
 
 
 class Exposures:
@@ -156,7 +181,12 @@ class Exposures:
             flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), first, seconds)
             cut_short = True
             try:
-                yield from self._until_standing(block, flight)
+                try:
+                    yield from self._until_standing(block, flight)
+                except (BeamlineError, DeviceError):
+                    yield from flight.enter(last=True)
+                    raise
+                yield from flight.enter(last=True)
                 cut_short = self._stop.stopping
             finally:
                 taken.enter(settle(flight.ledger, cut_short), first)
@@ -189,7 +219,7 @@ class Exposures:
         first_pulse = flight.ledger.train.first or 0.0
         wait = patience + max(0.0, first_pulse - self._clock.now())
         braking = False
-        while not flight.ledger.complete:
+        while not flight.so_far.complete:
             if self._stop.stopping and not braking:
                 flight.braked = self._clock.now()
                 self._stage.stop()
@@ -197,7 +227,7 @@ class Exposures:
             frame = self._next_frame(tail + 2 * block.period if braking else wait, until_stop=not braking)
             if frame is not None:
                 wait = patience
-                yield flight.enter(frame)
+                yield from flight.enter(frame)
             elif braking or not self._stop.stopping:
                 if not self._stage.moving():
                     break
@@ -211,7 +241,7 @@ class Exposures:
         if not braking:
             self._wait(flight.seconds)
         while (frame := self._next_frame(0.0, until_stop=False)) is not None:
-            yield flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
+            yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
     def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats."""

@@ -4,7 +4,9 @@ A camera counts the frames it exposes. A gap in its framestamps is a frame that 
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
 While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame is the
 nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). All functions are pure; a Ledger is a value.
+Bordner 1962). Noise on the trigger line exposes frames, too: where the first trigger's time is not known well, the first
+frames are those that make a regular train, and of two frames that could be a trigger's the nearer one is. That takes a
+look at the frames that follow, so frames are entered by `enter`. All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -19,6 +21,12 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 
 FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
+NEAR = (
+    0.1  # periods; a frame that comes earlier than its trigger by more waits for the next, which may be the trigger's
+)
+KNOWN = 0.25  # periods by which the first trigger's time may be wrong, so that the first frame can be told by it
+TRAIN, LOOK = 3, 6  # frames that make a train, and how many are looked at for it at most
+UNEVEN = 0.25  # periods; frames of a train are more regular than this
 PHASE_GAIN, PERIOD_GAIN = 0.3, 0.05
 PERIOD_RANGE = 0.2  # the true period may differ from the planned one by this fraction
 
@@ -83,6 +91,8 @@ class Ledger:
         lost: of these, frames that were exposed but never delivered.
         ignored: of these, triggers that exposed nothing.
         extra: framestamps of frames that no trigger exposed.
+        beyond: of these, frames that came when a trigger after the last one would have come.
+        off: of the matched frames the largest distance from the trigger's expected time, in periods.
     """
 
     train: Train
@@ -96,6 +106,8 @@ class Ledger:
     lost: int = 0
     ignored: int = 0
     extra: tuple[int, ...] = ()
+    beyond: int = 0
+    off: float = 0.0
 
     @property
     def complete(self) -> bool:
@@ -113,7 +125,9 @@ class Account:
         ignored: of these, not exposed (time gap). Those after the last frame may be either.
         extra: framestamps of the frames that no trigger exposed.
         shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
-            missing at the other; 0 where nothing is missing there or the time of the first trigger was known.
+            missing at the other, or a frame too many at the end could be one at the beginning; 0 where there is none
+            or the time of the first trigger was known.
+        off: steps by which the angle of a frame may be wrong, because it came so much off its trigger.
     """
 
     missing: tuple[int, ...]
@@ -121,6 +135,45 @@ class Account:
     ignored: int
     extra: tuple[int, ...]
     shift: int
+    off: float = 0.0
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A frame as it comes from the camera: see `assign`."""
+
+    framestamp: int
+    time: float
+    steady: bool = True
+
+
+def enter(ledger: Ledger, frames: Sequence[Exposed], last: bool) -> tuple[Ledger, Entry] | None:
+    """Enter the first of the frames that wait, by what those after it show; None: it must wait for further frames.
+
+    Args:
+        frames: in the order in which they were exposed.
+        last: there will be no further ones.
+    """
+    first, *others = frames
+    ahead = [frame for frame in others if frame.steady]
+    last = last or len(ahead) < len(others)  # frames of a braking stage show nothing
+    after, entry = assign(ledger, first.framestamp, first.time, first.steady)
+    if not first.steady:
+        return after, entry
+    if ledger.last < 0 and not _start_known(ledger.train):
+        regular = _regular([frame.time for frame in (first, *ahead)], ledger.train.period)
+        if len(regular) < min(TRAIN, ledger.train.n) and len(frames) < LOOK and not last:
+            return None
+        return (after, entry) if regular[0] == 0 else _extra(ledger, first.framestamp, 0.0, False)
+    if entry.trigger == EXTRA or (off := _off(ledger, entry.trigger, first.time)) >= -NEAR:
+        return after, entry
+    if not ahead and not last:
+        return None
+    for other in ahead:
+        if assign(ledger, other.framestamp, other.time)[1].trigger == entry.trigger:
+            nearer = abs(_off(ledger, entry.trigger, other.time)) < -off
+            return _extra(ledger, first.framestamp, entry.trigger + off, False) if nearer else (after, entry)
+    return after, entry
 
 
 def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
@@ -141,19 +194,14 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
         trigger = ledger.last + steps
         position = float(trigger)
     elif ledger.last < 0:
-        position, trigger, residual = _first_place(train, framestamp, time)
+        position, trigger, residual = _first_place(train, exposures - 1, time)
         steps = trigger + 1
     else:
         position = ledger.last + (time - ledger.phase) / ledger.period
         trigger = round(position)
         steps, residual = trigger - ledger.last, position - trigger
     if new_exposures < 1 or steps < 1 or trigger >= train.n or abs(residual) > FREE:
-        angle = float(np.interp(position, np.arange(train.n), train.angles))
-        extra = (*ledger.extra, framestamp)
-        exposed = max(framestamp, ledger.exposed)
-        # An extra frame is accounted for: it takes no part in the count of exposures between two triggers.
-        unmatched = ledger.unmatched + max(new_exposures - 1, 0)
-        return replace(ledger, exposed=exposed, unmatched=unmatched, extra=extra), Entry(EXTRA, angle)
+        return _extra(ledger, framestamp, position, trigger >= train.n and abs(residual) <= FREE)
     lost = min(exposures, steps) - 1
     matched = replace(
         ledger,
@@ -163,12 +211,27 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
         missing=(*ledger.missing, *range(ledger.last + 1, trigger)),
         lost=ledger.lost + lost,
         ignored=ledger.ignored + steps - 1 - lost,
+        off=max(ledger.off, abs(residual)),
     )
     if ledger.last < 0:
-        matched = replace(matched, phase=time, period=train.period, first=(framestamp, trigger, position))
+        matched = replace(matched, phase=time, period=train.period, first=(exposures - 1, trigger, position))
     else:
         matched = _follow(ledger, matched, time, steps, residual)
     return matched, Entry(trigger, float(train.angles[trigger]))
+
+
+def _extra(ledger: Ledger, framestamp: int, position: float, beyond: bool) -> tuple[Ledger, Entry]:
+    """Enter a frame that no trigger exposed, at a position in periods."""
+    train, new_exposures = ledger.train, framestamp - ledger.exposed
+    after = replace(
+        ledger,
+        exposed=max(framestamp, ledger.exposed),
+        # An extra frame is accounted for: it takes no part in the count of exposures between two triggers.
+        unmatched=ledger.unmatched + max(new_exposures - 1, 0),
+        extra=(*ledger.extra, framestamp),
+        beyond=ledger.beyond + beyond,
+    )
+    return after, Entry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
 
 
 def settle(ledger: Ledger, cut_short: bool = False) -> Account:
@@ -184,7 +247,32 @@ def settle(ledger: Ledger, cut_short: bool = False) -> Account:
         ignored=ledger.ignored,
         extra=ledger.extra,
         shift=_shift(ledger, None if cut_short else len(at_the_end)),
+        off=ledger.off,
     )
+
+
+def _start_known(train: Train) -> bool:
+    return train.n == 1 or (train.first is not None and train.tolerance <= KNOWN * train.period)
+
+
+def _off(ledger: Ledger, trigger: int, time: float) -> float:
+    """Periods by which a frame came after the time when its trigger was expected; negative: before."""
+    if ledger.last >= 0:
+        return (time - ledger.phase) / ledger.period - (trigger - ledger.last)
+    return 0.0 if ledger.train.first is None else (time - ledger.train.first) / ledger.train.period - trigger
+
+
+def _regular(times: Sequence[float], period: float) -> tuple[int, ...]:
+    """Which of the first frames a train of triggers made: those that come most regularly, whole periods apart."""
+    best: list[tuple[float, tuple[int, ...]]] = []  # the best train that ends with each frame, and how good it is
+    for i, time in enumerate(times):
+        trains = [(0.0, (i,))]
+        for good, chain in best:
+            steps = (time - times[chain[-1]]) / period
+            if round(steps) >= 1:
+                trains.append((good + 1 - ((steps - round(steps)) / UNEVEN) ** 2, (*chain, i)))
+        best.append(max(trains, key=lambda train: train[0]))
+    return max(best, key=lambda train: train[0])[1]
 
 
 def _window(train: Train) -> float:
@@ -194,6 +282,9 @@ def _window(train: Train) -> float:
 
 def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int, float]:
     """Position in periods, trigger, and distance between the two, of the first frame.
+
+    Args:
+        framestamp: exposures before it, without those that no trigger made.
 
     Where the expected time is not precise enough, framestamps decide: no trigger was ignored before the first frame,
     because a camera that is armed and idle ignores none.
@@ -219,7 +310,7 @@ def _shift(ledger: Ledger, at_the_end: int | None) -> int:
     window = _window(ledger.train)
     if at_the_end is None:
         at_the_end = max(0, round(position - trigger))
-    shifts = range(framestamp - trigger, at_the_end + 1)
+    shifts = range(framestamp - trigger - ledger.beyond, at_the_end + 1)
     if math.isinf(window):
         return max((abs(j) for j in shifts), default=0)
     return max((abs(j) for j in shifts if abs(position - trigger - j) <= window), default=0)

@@ -49,6 +49,7 @@ class Faults:
     lost: Set[int] = frozenset()
     ignored: Set[int] = frozenset()
     extra_after: Set[int] = frozenset()  # hardware triggers after which a spurious one follows half a period on
+    noise: dict[int, float] = field(default_factory=dict)  # hardware trigger: exposure by noise, periods before it
     errors: dict[int, int] = field(default_factory=dict)  # frame number: how often taking it raises DeviceError
     repeats: Set[int] = frozenset()  # frames that are the one before, pixel for pixel
     stuck_shutter: bool = False
@@ -244,6 +245,9 @@ class Camera:
             if self.seen < time <= now:
                 number = self.number
                 self.seen = time
+                if number in self.instrument.faults.noise:
+                    early = self.instrument.faults.noise[number] * self.instrument.period
+                    self._expose(time - early, -1, round(self.instrument.stage.count(time - early)))
                 self._trigger(time, count)
                 if number in self.instrument.faults.extra_after:
                     self._expose(time + self.instrument.period / 2, -1, count)

@@ -133,6 +133,30 @@ def test_frames_that_no_trigger_made_become_invalid_rows() -> None:
     assert_safe(instrument)
 
 
+@pytest.mark.parametrize("acceleration", [200.0, 60.0], ids=["start known", "start vague"])
+@pytest.mark.parametrize("early", [0.6, 0.3, 0.15])
+def test_noise_before_triggers_is_invalid_and_every_view_keeps_its_angle(acceleration: float, early: float) -> None:
+    """Trigger 5 is the first of the views: noise before it was view 0, and the views after it were invalid or shifted;
+    noise before trigger 9 took the place of the view."""
+    instrument = FakeInstrument(Faults(noise={5: early, 9: early}))
+    instrument.stage.limits = replace(instrument.stage.limits, acceleration=np.radians(acceleration).item())
+    run = Run(instrument, instrument.timeline(n=36, speed=55))
+    assert run.views == list(range(36))
+    assert_true_angles(run)
+    assert [f.index for f in run.of(FrameKind.INVALID)] == [5, 10]
+    assert "2 frames came without a trigger" in str(run.error)
+    assert "may" not in str(run.error)
+    assert_safe(instrument)
+
+
+def test_a_stop_or_a_silent_camera_loses_no_frame_that_waited_for_the_next() -> None:
+    instrument = FakeInstrument(Faults(noise={5: 0.6}, ignored=set(range(7, 200))))
+    run = Run(instrument, instrument.timeline(n=40, speed=3))
+    assert isinstance(run.error, InstrumentError) and "no frame for" in str(run.error)
+    assert len(run.frames) == 3 + 2 + 3
+    assert_safe(instrument, home=False)
+
+
 class Dawdling(Camera):
     """Slow to be ready again, and every second trigger is fired only 10 ms after the call."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from random import Random
 
 import numpy as np
@@ -12,7 +12,19 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.core.text import spans
-from beamline.scan.ledger import EXTRA, Account, Entry, Ledger, LedgerError, Train, assign, settle
+from beamline.scan.ledger import (
+    EXTRA,
+    LOOK,
+    Account,
+    Entry,
+    Exposed,
+    Ledger,
+    LedgerError,
+    Train,
+    assign,
+    enter,
+    settle,
+)
 
 PERIOD = 0.12
 FIRST = 1_795_152_000.0
@@ -45,10 +57,16 @@ def camera(
 
 
 def book(train: Train, sent: list[Sent]) -> tuple[list[Entry], Account]:
-    ledger, entries = Ledger(train), []
+    """Frames one after the other, as they come; the last ones when there will be no more."""
+    ledger, entries, waiting = Ledger(train), list[Entry](), list[Exposed]()
     for frame in sent:
-        ledger, entry = assign(ledger, frame.framestamp, frame.time)
-        entries.append(entry)
+        waiting.append(Exposed(frame.framestamp, frame.time))
+        assert len(waiting) <= LOOK
+        while waiting and (entered := enter(ledger, waiting, last=frame is sent[-1])):
+            ledger, entry = entered
+            entries.append(entry)
+            waiting.pop(0)
+    assert not waiting
     return entries, settle(ledger)
 
 
@@ -166,7 +184,58 @@ def test_a_pass_cut_short_misses_nothing_after_its_last_frame_and_doubts_a_late_
     for stamp, at in ((0, 0), (2, 2)):
         ledger, entry = assign(ledger, stamp, FIRST + (at + late) * PERIOD)
         assert entry.trigger == at
-    assert settle(ledger, cut_short=True) == Account(missing=(1,), lost=1, ignored=0, extra=(), shift=shift)
+    account = settle(ledger, cut_short=True)
+    assert replace(account, off=0.0) == Account(missing=(1,), lost=1, ignored=0, extra=(), shift=shift)
+    assert account.off == pytest.approx(0, abs=1e-6)
+
+
+def with_noise(n: int, *at: float, taken: float = 0.0) -> list[Sent]:
+    """A camera with all triggers, and noise at these positions in periods; after it no trigger for `taken` periods."""
+    moments = [(place, EXTRA) for place in at]
+    moments += [(float(i), i) for i in range(n) if not any(0 <= i - place < taken for place in at)]
+    return [Sent(stamp, FIRST + place * PERIOD, trigger) for stamp, (place, trigger) in enumerate(sorted(moments))]
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.2, 0.7, 2.5], ids="start known to {} periods".format)
+@pytest.mark.parametrize("noise", [-3.4, -0.7, -0.6, -0.4, -0.3, -0.15, 0.2, 0.4])
+def test_noise_around_the_first_trigger_costs_no_view(tolerance: float, noise: float) -> None:
+    sent = with_noise(12, noise)
+    entries, account = book(Train(angles(12), PERIOD, FIRST, tolerance * PERIOD), sent)
+    assert [entry.trigger for entry in entries] == [frame.trigger for frame in sent]
+    assert account.missing == () and len(account.extra) == 1
+
+
+@pytest.mark.parametrize("tolerance", [0.2, 2.5])
+def test_two_pulses_of_noise_before_the_first_trigger_cost_no_view(tolerance: float) -> None:
+    sent = with_noise(12, -2.6, -0.3)
+    entries, account = book(Train(angles(12), PERIOD, FIRST, tolerance * PERIOD), sent)
+    assert [entry.trigger for entry in entries] == [frame.trigger for frame in sent]
+    assert account.missing == () and len(account.extra) == 2
+
+
+@given(st.lists(st.integers(1, 28), min_size=1, max_size=4, unique=True), st.floats(0.12, 0.49))
+def test_noise_shortly_before_a_trigger_does_not_take_its_place(triggers: list[int], before: float) -> None:
+    sent = with_noise(30, *(i - before for i in triggers))
+    entries, account = book(Train(angles(30), PERIOD, FIRST), sent)
+    assert [entry.trigger for entry in entries] == [frame.trigger for frame in sent]
+    assert account.missing == () and account.off == pytest.approx(0, abs=1e-4)  # 0.12 s of 1.8e9
+
+
+def test_noise_that_keeps_the_camera_from_its_trigger_says_how_far_the_angle_is_off() -> None:
+    entries, account = book(Train(angles(12), PERIOD, FIRST), with_noise(12, 4.7, taken=0.5))
+    assert [entry.trigger for entry in entries] == list(range(12))
+    assert account.off == pytest.approx(0.3, abs=1e-4)
+
+
+@pytest.mark.parametrize(("tolerance", "shift"), [(0.4, 0), (1.2, 1)])
+def test_noise_a_whole_period_before_the_first_trigger_is_told_where_the_start_is_vague(
+    tolerance: float, shift: int
+) -> None:
+    """Nothing but the time of the start tells which of thirteen regular frames is none of twelve triggers'."""
+    entries, account = book(Train(angles(12), PERIOD, FIRST, tolerance * PERIOD), with_noise(12, -1.0))
+    assert sorted(entry.trigger for entry in entries) == [EXTRA, *range(12)]
+    assert account.shift == shift
+    assert (entries[0].trigger == EXTRA) is (shift == 0)
 
 
 def test_a_spurious_exposure_that_is_lost_too_is_no_lost_trigger() -> None:
