@@ -253,8 +253,8 @@ class Acquisition:
             )
         if text := self._discrepancies():
             raise LedgerError(
-                f"{text.strip()} Every other frame is in the file with the angle of its trigger. Repeat these views, or "
-                "reconstruct without them; a longer period_s leaves the camera more time.",
+                f"{text.strip()} Every other frame is in the file with the angle of its trigger. Repeat these views, "
+                "or reconstruct without them; a longer period_s leaves the camera more time.",
                 self.missing,
             )
 

@@ -4,9 +4,9 @@ A camera counts the frames it exposes. A gap in its framestamps is a frame that 
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
 While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame is the
 nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too: where the first trigger's time is not known well, the first
-frames are those that make a regular train, and of two frames that could be a trigger's the nearer one is. That takes a
-look at the frames that follow, so frames are entered by `enter`. All functions are pure; a Ledger is a value.
+Bordner 1962). Noise on the trigger line exposes frames, too: where the first trigger's time is not known well, the
+first frames are those that make a regular train, and of two frames that could be a trigger's the nearer one is. That
+takes a look at the frames that follow: see `enter`. All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ def _regular(times: Sequence[float], period: float) -> tuple[int, ...]:
     """Which of the first frames a train of triggers made: those that come most regularly, whole periods apart."""
     best: list[tuple[float, tuple[int, ...]]] = []  # the best train that ends with each frame, and how good it is
     for i, time in enumerate(times):
-        trains = [(0.0, (i,))]
+        trains: list[tuple[float, tuple[int, ...]]] = [(0.0, (i,))]
         for good, chain in best:
             steps = (time - times[chain[-1]]) / period
             if round(steps) >= 1:
