@@ -15,11 +15,12 @@ from beamline.core.errors import DataError
 from beamline.core.text import count
 from beamline.storage import hdf5
 from beamline.storage.superblock import SIZE, Superblock, superblock
+from beamline.storage.writer_lock import held
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from drivers.frame import FrameKind
 
-QUIET = 10.0  # s without a change, after which no program is taken to write the file
+QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ def recover(path: Path) -> Recovered:
     Only the 48 bytes of the head are written before the file was read; where it cannot be read, they are put back.
 
     Raises:
-        DataError: no scan of ours, a file that is cut off or damaged, or one that changed within 10 s: then nothing is
-            changed.
+        DataError: no scan of ours, a file that is cut off or damaged, one that a running program has open, or one that
+            changed within 10 s: then nothing is changed.
     """
     head = _checked(path)
     if not head.open_for_writing:
@@ -87,6 +88,11 @@ def _checked(path: Path) -> Superblock:
     if head.missing:
         raise DataError(
             f"{path} is cut off: {head.missing} bytes are missing at its end, as its head says. Nothing was changed."
+        )
+    if held(path):
+        raise DataError(
+            f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
+            "Nothing was changed."
         )
     if head.open_for_writing and (age := time.time() - path.stat().st_mtime) < QUIET:
         raise DataError(

@@ -23,6 +23,7 @@ from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of
+from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.layout import ScanInfo
@@ -92,6 +93,7 @@ class NXtomoWriter:
                 start=clock.now(),
             )
             self._file.swmr_mode = True  # from here on nothing may be created: Rows can only grow what it holds
+            self._lock = WriterLock(self.path)
         except BaseException as error:  # without a frame in it, it is no use to anybody
             with suppress(*FAILURES):
                 self._file.close()
@@ -172,6 +174,8 @@ class NXtomoWriter:
                 with suppress(*FAILURES):
                     self._let_go()
             raise self._disk_error("be finished", error) from error
+        finally:
+            self._lock.release()
         self._add_exchange_view()
 
     def __enter__(self) -> Self:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +20,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import QUIET, recover
 from beamline.storage.rules.validate import validate
 from beamline.storage.superblock import superblock
+from beamline.storage.writer_lock import held
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
@@ -84,10 +87,37 @@ def test_every_committed_frame_is_kept(
 def test_what_may_still_be_written_is_left_alone(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
     writer = _written(tmp_path / "s.h5", frames[:5], clock)
     before = (tmp_path / "s.h5").read_bytes()
-    with pytest.raises(DataError, match=r"changed \d s ago and is marked as being written.*Nothing was changed"):
+    _aged(tmp_path / "s.h5")  # its writer waits: for a motor, the operator, or a long exposure
+    with pytest.raises(DataError, match=r"open in a program that still runs.*Nothing was changed"):
         recover(tmp_path / "s.h5")
     assert (tmp_path / "s.h5").read_bytes() == before
     writer.close()
+    assert not recover(tmp_path / "s.h5").changed
+
+
+def test_a_file_that_just_changed_is_left_alone_where_no_lock_tells(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    died = _died_in_the_scan(tmp_path, frames, clock)
+    os.utime(died)
+    with pytest.raises(DataError, match=r"changed \d s ago and is marked as being written.*Nothing was changed"):
+        recover(died)
+
+
+def test_the_writers_lock_is_given_back_when_it_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / "s.h5"
+    path.write_bytes(bytes(64))
+    code = (
+        f"import sys, time; from pathlib import Path; from beamline.storage.writer_lock import WriterLock; "
+        f"lock = WriterLock(Path({str(path)!r})); print('held', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout is not None and writer.stdout.readline().strip() == b"held"
+        assert held(path)
+        with path.open("rb") as reader:  # reading goes on
+            assert reader.read() == bytes(64)
+        writer.kill()
+    assert not held(path)
 
 
 @pytest.mark.parametrize(
