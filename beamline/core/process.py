@@ -38,6 +38,7 @@ class ChildProcess:
         on_line: receives each line.
         environment: of the process; None: as ours.
         tether: give it a stdin that stays open as long as this process lives, so that it can notice when we die.
+        on_end: is called after its last line, in the same thread.
 
     Raises:
         OSError: the command cannot be started.
@@ -51,8 +52,9 @@ class ChildProcess:
         environment: Mapping[str, str] | None = None,
         *,
         tether: bool = False,
+        on_end: Callable[[], None] = lambda: None,
     ) -> None:
-        self._on_line = on_line
+        self._on_line, self._on_end = on_line, on_end
         self._silent_since = time.monotonic()
         self._process = subprocess.Popen(
             list(command),
@@ -152,6 +154,7 @@ class ChildProcess:
             for line in lines:
                 self._silent_since = time.monotonic()
                 self._on_line(line)
+        self._on_end()
 
 
 def json_object(line: str) -> dict[str, Any] | None:

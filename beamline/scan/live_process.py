@@ -115,11 +115,12 @@ class LiveReconstruction:
     ) -> None:
         self._emit, self._log, self._enough = emit, log, enough
         self._done: Mapping[str, Any] | None = None
+        self._wanted = True  # nobody has asked it to end
         self._ready = threading.Event()
         self._process: ChildProcess | None = None
         try:
             with log.open("x", encoding="utf-8") as stderr:
-                self._process = ChildProcess(command, stderr, self._pass_on)
+                self._process = ChildProcess(command, stderr, self._pass_on, on_end=self._say_if_early)
         except OSError as error:
             message = f"The live reconstruction could not be started ({error}). The scan goes on without it."
             emit("warning", {"message": message})
@@ -151,6 +152,7 @@ class LiveReconstruction:
         process = self._process
         if process is None:
             return None
+        self._wanted = False
         ending = process.wait(stop=stop, hurry=hurry, silence=_SILENCE, grace=_GRACE)
         if self._done is None:
             reasons = {
@@ -166,8 +168,18 @@ class LiveReconstruction:
 
     def close(self) -> None:
         """End it if it still runs."""
+        self._wanted = False
         if self._process is not None:
             self._process.end(_GRACE / 6)
+
+    def _say_if_early(self) -> None:
+        """Warn at once where it has ended while the scan runs: the operator watches a volume that grows no more."""
+        if self._wanted and self._done is None:
+            message = (
+                f"The live reconstruction has ended in the middle of the scan; see {self._log.name}. The scan goes on "
+                "without it. To start another: beamline recon FILE --follow -o OUT.h5"
+            )
+            self._emit("warning", {"message": message, "source": "recon"})
 
     def _pass_on(self, line: str) -> None:
         data = json_object(line)

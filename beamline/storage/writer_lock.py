@@ -7,46 +7,46 @@ from __future__ import annotations
 
 import os
 import sys
+import weakref
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 if sys.platform == "win32":
     import msvcrt
 
     _BEYOND = 2**62  # a byte that no file has: Windows lets nobody read or write one that is locked
 
-    def _lock(file: BinaryIO, *, alone: bool) -> None:
-        os.lseek(file.fileno(), _BEYOND, os.SEEK_SET)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    def _lock(file: int, *, alone: bool) -> None:
+        os.lseek(file, _BEYOND, os.SEEK_SET)
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
 
 else:
     import fcntl
 
-    def _lock(file: BinaryIO, *, alone: bool) -> None:
+    def _lock(file: int, *, alone: bool) -> None:
         # Shared by the writer, because HDF5 takes a shared lock to open a file for reading.
-        fcntl.flock(file.fileno(), (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
 
 
 class WriterLock:
     """Held from now on until `release`, or until this process ends. Nothing is held where the disk has no locks."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
+        file = os.open(path, os.O_RDWR)
+        self.release = weakref.finalize(self, os.close, file)
         with suppress(OSError):
-            _lock(self._file, alone=False)
-
-    def release(self) -> None:
-        self._file.close()
+            _lock(file, alone=False)
 
 
 def held(path: Path) -> bool:
     """Whether a program that runs has the file open, so far as locks tell."""
-    with path.open("r+b") as file:
-        try:
-            _lock(file, alone=True)
-        except (BlockingIOError, PermissionError):
-            return True
-        except OSError:  # no locks on this disk
-            return False
+    file = os.open(path, os.O_RDWR)
+    try:
+        _lock(file, alone=True)
+    except (BlockingIOError, PermissionError):
+        return True
+    except OSError:  # no locks on this disk
+        return False
+    finally:
+        os.close(file)
     return False

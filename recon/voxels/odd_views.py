@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, uniform_filter
+from scipy.ndimage import gaussian_filter, label, uniform_filter
 
 from recon.base.geometry import Geometry
 from recon.base.noise import median_deviation
@@ -23,6 +23,7 @@ _CELLS = 128  # columns of cells, at least, where the detector has so many pixel
 _BROAD = 3  # cells a side, over which a difference is averaged
 _AROUND, _BESIDE = 12, 3  # views on either side that say what is usual, without so many next to the one that is judged
 _OUTLIER = 3.0  # times the median of these, which one of them may add
+_SHARP = 0.1  # of what a blur of one pixel changes in a view, by which any volume may miss an edge
 _EXTENT = 0.5  # of the limit, above which a cell belongs to the region
 _LEAST_VIEWS = 2 * _AROUND + 1
 
@@ -51,7 +52,8 @@ def odd_views(
     The difference of each view from the volume's projection, less what all its pixels have in common (light), averaged
     over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views fully: at
     edges that it blurs, at rings, at what lies outside the field. So a difference counts by what the 18 views of the
-    nearest angles have at the same place [our own].
+    nearest angles have at the same place, and by the edges of the volume in the view itself, where a face or a crack
+    that is parallel to the rays is sharp in few views only [our own].
 
     Args:
         projections: [view, row, col].
@@ -67,7 +69,8 @@ def odd_views(
     order = np.argsort(geometry.angles, kind="stable")
     rows, cols = geometry.detector_shape
     side = max(1, min(cols // _CELLS, rows))
-    differences = np.stack([_difference(volume, projections, geometry, weights, int(i), side) for i in order])
+    looks = (_difference(volume, projections, geometry, weights, int(i), side) for i in order)
+    differences, edges = (np.stack(each) for each in zip(*looks, strict=True))
     squares = differences**2
     found = []
     for place in range(n):
@@ -75,7 +78,7 @@ def odd_views(
         near = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
         around = squares[near]
         usual = np.minimum(around, _OUTLIER**2 * (1 + np.median(around, axis=0))).mean(axis=0)
-        score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD), 1))
+        score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD) + edges[place] ** 2, 1))
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
         if abs(peak) > limit:
@@ -86,20 +89,28 @@ def odd_views(
     return tuple(sorted(found, key=lambda odd: odd.view))
 
 
-def _difference(volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None, view: int, side: int) -> F32:
-    """Of one view from the volume, averaged over cells, in standard deviations of noise."""
+def _difference(
+    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None, view: int, side: int
+) -> tuple[F32, F32]:
+    """Of one view from the volume, averaged over cells, in standard deviations of noise; what edges explain of it."""
     measured = projections[view]
-    left = measured - project(volume, geometry.select(np.array([view])))[0]
+    rendered = project(volume, geometry.select(np.array([view])))[0]
+    left = measured - rendered
     known = np.ones_like(left) if weights is None else (weights[view] > 0).astype(np.float32)
     light = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
     cells, lit = _cells(left * light, side), _cells(known, side)
     third = np.diff(_cells(measured * light, side), 3, axis=1)  # of the view: what is finest in the sample counts too
     noise = median_deviation(third) / math.sqrt(20.0)
     if not lit.any() or not noise > 0:
-        return np.zeros_like(cells)
+        return np.zeros_like(cells), np.zeros_like(cells)
     common = float(np.median(_cells(left * known, side)[lit > 0]))
     cells -= np.float32(common) * _cells(light, side)
-    return np.asarray(uniform_filter(cells, _BROAD) * (_BROAD / noise), np.float32)
+    sharp = _cells(np.abs(rendered - gaussian_filter(rendered, 1.0)) * light, side)
+    # Sums over the cells that are there and lit, by their own noise: there are fewer at an edge, and of a single row.
+    there = uniform_filter(lit, _BROAD, mode="constant")
+    scale = np.divide(_BROAD / noise, np.sqrt(there), out=np.zeros_like(there), where=there > 0)
+    difference, edges = (uniform_filter(each, _BROAD, mode="constant") * scale for each in (cells, _SHARP * sharp))
+    return difference.astype(np.float32), edges.astype(np.float32)
 
 
 def _cells(image: F32, side: int) -> F32:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,21 @@ def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: s
     ran.assert_good_file(19, "complete")
     if "memory" in code:
         assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
+
+
+def test_one_that_dies_in_the_scan_is_told_at_once(tmp_path: Path) -> None:
+    def wait_for_the_warning(number: int) -> None:
+        deadline = time.monotonic() + 20
+        while number == 10 and "warning" not in said and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+    said: list[str] = []
+    instrument = FakeInstrument(on_frame=wait_for_the_warning)
+    live = script("raise SystemExit(1)")
+    result = run_scan(
+        small(), tmp_path, [lambda event: said.append(event.event)], live=live, instrument=instrument.connected()
+    )
+    assert result.n_frames == 19 and said.index("warning") < said.index("scan_done")
 
 
 def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:

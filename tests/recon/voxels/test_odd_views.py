@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -58,6 +59,18 @@ def test_a_speck_in_two_views_is_named_with_its_place(
     for odd in found:
         assert math.copysign(1, odd.score) == math.copysign(1, height) and abs(odd.score) > LIMIT
         assert odd.rows[0] <= 15 < odd.rows[1] <= 21 and odd.cols[0] <= 40 < odd.cols[1] <= 46
+
+
+@pytest.mark.parametrize("rows", [1, ROWS])
+def test_a_face_along_the_rays_is_not_odd_though_few_views_see_it_sharp(rows: int, rng: np.random.Generator) -> None:
+    geometry = Geometry.parallel(TURN, (rows, COLS))
+    grid = Grid.matching(geometry)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    along, across = x * math.cos(TURN[30]) + y * math.sin(TURN[30]), y * math.cos(TURN[30]) - x * math.sin(TURN[30])
+    plate = (0.05 * ((np.abs(along - 3) < 4) & (np.abs(across) < 20))).astype(np.float32)
+    views = Projector(geometry, grid).forward(plate) + rng.normal(0, SIGMA, (60, rows, COLS)).astype(np.float32)
+    smooth = Volume(gaussian_filter(plate, (0, 0.5, 0.5)), grid)
+    assert odd_views(smooth, views.astype(np.float32), geometry) == ()
 
 
 def test_rays_that_were_not_measured_show_nothing(geometry: Geometry, rng: np.random.Generator) -> None:
