@@ -1,4 +1,4 @@
-"""Tomographic reconstruction: arrays in, arrays out. `recon.reconstruct` and `recon.Geometry` are the public names.
+"""Tomographic reconstruction: arrays in, arrays out: `recon.correct`, `recon.find_axis`, `recon.reconstruct`.
 
 The values (Geometry, Grid, Volume, RunControl, DataUse) load at once; what computes loads torch and numba on first use,
 so that a program which only plans a scan starts quickly.
@@ -21,6 +21,8 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
     from recon.auto import Auto
+    from recon.prep.align import AxisEstimate, find_axis
+    from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.splatting.r2 import R2
@@ -36,7 +38,9 @@ __all__ = [
     "R2",
     "AsdPocs",
     "Auto",
+    "AxisEstimate",
     "Cgls",
+    "CorrectionSettings",
     "Counts",
     "DataUse",
     "Fbp",
@@ -45,16 +49,23 @@ __all__ = [
     "Grid",
     "OsSirtTv",
     "Progress",
+    "Projections",
     "Reconstruction",
+    "References",
     "RunControl",
     "Sart",
     "Sirt",
     "Volume",
+    "correct",
+    "find_axis",
     "reconstruct",
 ]
 
 _LAZY = {
     "Auto": "recon.auto",
+    "AxisEstimate": "recon.prep.align",
+    "find_axis": "recon.prep.align",
+    **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
     "Counts": "recon.prep.counts",
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",

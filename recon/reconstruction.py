@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -13,6 +16,7 @@ from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
+from recon.base.units import look_like_counts, look_like_degrees
 from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
@@ -40,6 +44,37 @@ class Reconstruction:
     gaussians: Gaussians | None
     settings: Mapping[str, Any]
     checkpoint: Mapping[str, NDArray[Any]] | None = None
+
+    def __repr__(self) -> str:
+        model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
+        return f"Reconstruction({self.method}: {self.volume!r}, {self.seconds:.3g} s{model})"
+
+    def save(self, path: str | Path) -> None:
+        """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
+
+        Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `centre_zyx_mm`, `method`, `seconds`, and `settings`,
+        JSON of those that are no arrays. Written as a whole or not at all.
+
+        Raises:
+            ValueError: another suffix.
+            FileExistsError: nothing is overwritten.
+        """
+        path = Path(path)
+        if path.suffix != ".npz":
+            raise ValueError(f"{str(path)!r} is no .npz; save writes only that. beamline export writes other formats")
+        if path.exists():
+            raise FileExistsError(f"{path} exists and is not overwritten; name another file")
+        settings = {k: v for k, v in self.settings.items() if not isinstance(v, np.ndarray)}
+        partial = path.with_name(f".{path.name}.partial.npz")
+        try:
+            np.savez(
+                partial, volume=self.volume.data, voxel_mm=self.volume.grid.voxel_size,
+                centre_zyx_mm=self.volume.grid.centre, method=self.method, seconds=self.seconds,
+                settings=json.dumps(settings, default=str),
+            )  # fmt: skip
+            partial.rename(path)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def reconstruct(
@@ -73,6 +108,9 @@ def reconstruct(
     Raises:
         ValueError: for an unknown method, shapes that disagree, views from one side only, data without matter, or
             what the method does not take: views held out, a device, checkpoints, or these views.
+
+    Warns:
+        UserWarning: where angles look like degrees or projections like counts; the reconstruction goes on.
     """
     if isinstance(method, type):
         raise ValueError(
@@ -84,7 +122,21 @@ def reconstruct(
     _refuse_one_side(geometry)
     if isinstance(projections, Counts):
         projections, use = _of_counts(projections, geometry, use)
-    data = _line_integrals(projections, geometry)
+        data = _line_integrals(projections, geometry)
+    else:
+        data = _line_integrals(projections, geometry)
+        if look_like_counts(data):
+            warnings.warn(
+                f"projections have a median of {np.nanmedian(data[:1]):.4g}: they look like counts. Line integrals are "
+                "-log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
+                stacklevel=2,
+            )
+    if look_like_degrees(geometry.angles):
+        warnings.warn(
+            f"angles reach {np.abs(geometry.angles).max():.5g} rad and look like degrees. A Geometry takes radians: "
+            "give np.deg2rad(angles)",
+            stacklevel=2,
+        )
     begin = control.now()
     found = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
     return Reconstruction(

@@ -66,6 +66,8 @@ def exit_code(error: BaseException) -> int:
         return InstrumentError.exit_code
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
+    if isinstance(error, MemoryError):
+        return DataError.exit_code
     # click handles a closed pipe (`beamline info x | head`); an OSError without a number is a defect.
     if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
         return DataError.exit_code
@@ -77,4 +79,9 @@ def user_message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
+    if isinstance(error, MemoryError):
+        return (
+            f"Out of memory ({str(error) or 'no details'}). No half result was kept. Take fewer --rows or --views, a "
+            "coarser --bin, or recon -m fbp, which keeps within --memory."
+        )
     return "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or repr(error)

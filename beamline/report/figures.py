@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from beamline.report.record import residual_curve
@@ -74,8 +74,9 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     )
     axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
-    ticks = np.unique(np.linspace(0, len(order) - 1, min(len(order), 7)).round().astype(int))
-    axes.set_yticks(ticks, [f"{angles[i]:.0f}" for i in ticks])
+    ticks = MaxNLocator(7, steps=[1, 1.5, 2, 3, 4.5, 6, 9, 10]).tick_values(angles[0], angles[-1])
+    ticks = ticks[(ticks >= angles[0]) & (ticks <= angles[-1])]
+    axes.set_yticks(np.interp(ticks, angles, np.arange(len(order))), [f"{angle:g}" for angle in ticks])
     axes.set(xlabel="column (px)", ylabel="angle (°)", title=f"Sinogram of row {row}, {len(order)} views")
     figure.colorbar(image, ax=axes, label="line integral", pad=0.02)
     return png(figure)

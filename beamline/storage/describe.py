@@ -57,7 +57,7 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     findings = source_findings(source)
     attributes = dict(source.attributes)
-    return {
+    facts = {
         "path": str(source.path),
         "format": source.format,
         "frames": int(source.image_key.size),
@@ -74,9 +74,12 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
         "finished": source.finished,
         "missing_triggers": attributes.pop("missing_triggers", None),
         **_flags(source),
-        "attributes": attributes,
-        "findings": [finding.message for finding in findings if finding.severity != "info"],
         "reconstructable": all(finding.severity != "error" for finding in findings),
+    }
+    return {
+        **facts,
+        "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
+        "findings": [finding.message for finding in findings if finding.severity != "info"],
     }
 
 

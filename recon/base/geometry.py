@@ -109,6 +109,16 @@ class Geometry:
             angles, detector_shape, pixel_pitch, axis_col, axis_row, float(sod), float(sdd), shifts, roll, tilt
         )  # fmt: skip
 
+    def __repr__(self) -> str:
+        low, high = np.rad2deg((self.angles.min(), self.angles.max()))
+        beam = f"cone {self.sod:.6g}:{self.sdd:.6g}" if self.is_cone else "parallel"
+        moved = [name for name in ("shifts", "roll", "tilt") if getattr(self, name).any()]
+        return (
+            f"Geometry({beam}, {self.n_views} views from {low:.4g} to {high:.4g} degrees, detector "
+            f"{self.detector_shape[0]} x {self.detector_shape[1]}, pitch {self.pixel_pitch:.4g}, axis_col "
+            f"{self.axis_col:.6g}{''.join(f', with {name}' for name in moved)})"
+        )
+
     @property
     def n_views(self) -> int:
         return int(self.angles.size)

@@ -135,3 +135,7 @@ class Volume:
     def __post_init__(self) -> None:
         if self.data.shape != self.grid.shape:
             raise ValueError(f"volume data has shape {self.data.shape}, its grid {self.grid.shape}")
+
+    def __repr__(self) -> str:
+        size, edge = " x ".join(map(str, self.grid.shape)), self.grid.voxel_size
+        return f"Volume({size} voxels [z, y, x] of {edge:.4g})"

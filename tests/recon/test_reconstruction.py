@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -367,3 +369,46 @@ def test_tilted_views_half_a_turn_apart_are_two_sides(noisy: np.ndarray) -> None
 def test_one_view_is_refused(noisy: np.ndarray) -> None:
     with pytest.raises(ValueError, match="one view"):
         recon.reconstruct(noisy[:1], VIEWS.select([0]))
+
+
+def test_degrees_and_counts_are_warned_of_with_what_to_give(noisy: np.ndarray) -> None:
+    degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, PITCH, axis_col=18.3)
+    with pytest.warns(UserWarning, match=r"172\.5 rad and look like degrees.*np\.deg2rad"):
+        recon.reconstruct(noisy, degrees, "fbp")
+    with pytest.warns(UserWarning, match="look like counts.*recon.correct"):
+        recon.reconstruct(np.round(2e4 * np.exp(-noisy)), VIEWS, "fbp")
+
+
+def test_from_counts_to_a_volume_by_public_names(phantom: Phantom, rng: np.random.Generator) -> None:
+    detector = Detector(SHAPE, PITCH, VIEWS.axis_col, (SHAPE[0] - 1) / 2)
+    dark, flat = np.full(SHAPE, 100.0), np.full(SHAPE, 20100.0)
+    lines = np.stack([phantom.line_integrals(a, detector) for a in ANGLES])
+    counts = rng.poisson(100 + 2e4 * np.exp(-lines))
+    views = recon.correct(counts, np.arange(len(ANGLES)), recon.References(dark, ((0.0, flat),)))
+    assert np.abs(views.data - lines).mean() < 0.01
+    assert recon.find_axis(views.data, ANGLES).value == pytest.approx(VIEWS.axis_col, abs=0.25)
+    result = recon.reconstruct(views.data, VIEWS, "fbp")
+    assert psnr(phantom.attenuation(GRID), result.volume.data) > 15
+
+
+def test_a_result_says_in_a_line_what_it_is(noisy: np.ndarray) -> None:
+    result = recon.reconstruct(noisy, VIEWS, "fbp")
+    text = repr(result)
+    assert text.startswith("Reconstruction(fbp: Volume(20 x 40 x 40 voxels [z, y, x] of 0.1), ") and len(text) < 100
+    assert repr(VIEWS) == (
+        "Geometry(parallel, 24 views from 0 to 172.5 degrees, detector 20 x 40, pitch 0.1, axis_col 18.3)"
+    )
+
+
+def test_a_result_is_saved_as_a_whole_and_nothing_is_overwritten(noisy: np.ndarray, tmp_path: Path) -> None:
+    result = recon.reconstruct(noisy, VIEWS, "fbp")
+    result.save(tmp_path / "v.npz")
+    with np.load(tmp_path / "v.npz", allow_pickle=False) as saved:
+        np.testing.assert_array_equal(saved["volume"], result.volume.data)
+        assert (float(saved["voxel_mm"]), str(saved["method"])) == (PITCH, "fbp")
+        assert json.loads(str(saved["settings"]))["filter"] == "hann"
+    with pytest.raises(FileExistsError, match="not overwritten"):
+        result.save(tmp_path / "v.npz")
+    with pytest.raises(ValueError, match="beamline export"):
+        result.save(tmp_path / "v.tif")
+    assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]

@@ -24,13 +24,13 @@ from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import volume_format
 from drivers.frame import FrameKind
+from recon.base.units import look_like_counts, look_like_degrees
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
 
 Progress = Callable[[int, int], None]
 """Is told how many of how many frames are done."""
 
-_TURNS = 10  # fewer are not taken for degrees
 _FARTHEST = 1e6  # degrees
 
 SAMPLES = 4  # frames of a kind that are looked at
@@ -149,7 +149,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
         return
     step = span / (distinct.size - 1)
-    if span > 360 * _TURNS and _degrees_as_radians(angles, distinct.size):
+    if look_like_degrees(angles):
         yield Finding(
             "warning",
             "angle-spread",
@@ -168,14 +168,6 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angle-spread",
             f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
         )
-
-
-def _degrees_as_radians(angles: NDArray[np.float64], distinct: int) -> bool:
-    """Whether the numbers of radians are round, or span half a turn or a turn if they are read as degrees."""
-    span = float(np.ptp(angles))
-    round_numbers = np.allclose(angles * 100, np.round(angles * 100), rtol=0, atol=1e-3)
-    step = span / (distinct - 1)
-    return bool(round_numbers or any(abs(s / turn - 1) < 1e-3 for s in (span, span + step) for turn in (180, 360)))
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:
@@ -240,6 +232,13 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "pixels", f"Every pixel of the projections looked at is {views[finite][0]:g}.")
     elif not finite.all():
         yield Finding("warning", "pixels", f"{1 - finite.mean():.3%} of the pixels looked at are NaN or infinite.")
+    if source.quantity == "line_integrals" and look_like_counts(views):
+        yield Finding(
+            "warning",
+            "pixels",
+            f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
+            "If so, say --quantity counts, with darks and flats.",
+        )
 
 
 def series_complete(source: ScanSource) -> Iterator[Finding]:

@@ -59,6 +59,16 @@ def test_info_for_machines(folder: Path) -> None:
     assert said["kinds"] == {"projection": 18, "flat": 2, "dark": 2}
 
 
+def test_what_the_file_calls_by_the_same_name_stays_apart(folder: Path) -> None:
+    with h5py.File("exchange.h5", "r+") as file:
+        file.attrs["quantity"] = "NOT what we call it"
+    lines = _beamline("info", "exchange.h5").stdout.splitlines()
+    assert [" ".join(line.split()) for line in lines if line.startswith("quantity")] == [
+        "quantity counts",
+        "quantity (of the file) NOT what we call it",
+    ]
+
+
 def test_info_takes_what_the_caller_says(folder: Path) -> None:
     with h5py.File("exchange.h5", "r+") as file:
         del file["exchange/data_white"], file["exchange/data_dark"]

@@ -47,6 +47,7 @@ def _run(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> click.testing
         (errors.BeamlineError("something"), 1),
         (OSError(errno.ENOSPC, "No space left on device", "out.h5"), 5),
         (PermissionError(errno.EACCES, "Permission denied", "out.h5"), 5),
+        (MemoryError("Unable to allocate 90 GiB"), 5),
         (KeyboardInterrupt(), 130),
         (click.UsageError("what?"), 2),
     ],

@@ -1,0 +1,45 @@
+"""Numbers that do not look like what they are said to be: degrees for radians, counts for line integrals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
+_FEWEST = 5  # of fewer views nothing is said
+_OPAQUE = 15.0  # exp(-15) of the light: no detector measures that in nine of ten pixels
+_LOOKED_AT = 2**16  # values
+
+
+def look_like_degrees(angles: NDArray[np.floating]) -> bool:
+    """Whether angles [view] that are said to be radians are degrees, by the look of them.
+
+    They are where all are whole numbers, or where they span more than ten turns and are round to two digits, span 180
+    or 360, or go on by more than a turn from view to view.
+    """
+    distinct = np.unique(angles)
+    if distinct.size < _FEWEST or not np.isfinite(distinct).all():
+        return False
+    span = float(distinct[-1] - distinct[0])
+    if span >= _FEWEST - 1 and np.array_equal(distinct, np.round(distinct)):
+        return True
+    if span <= 2 * np.pi * _TURNS:
+        return False
+    round_numbers = np.allclose(distinct * 100, np.round(distinct * 100), rtol=0, atol=1e-3)
+    whole = span + span / (distinct.size - 1)
+    turns = any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
+    return bool(round_numbers or turns or np.median(np.abs(np.diff(angles))) > 2 * np.pi)
+
+
+def look_like_counts(projections: NDArray[np.floating]) -> bool:
+    """Whether values [view, row, col] that are said to be line integrals are counts, by the look of some of them.
+
+    They are where nine in ten are so large that no detector could have measured the light that is left, or where half
+    are and all are whole numbers.
+    """
+    flat = projections.reshape(-1)
+    some = flat[:: max(1, flat.size // _LOOKED_AT)]
+    some = some[np.isfinite(some)]
+    if some.size == 0 or not np.median(some) > _OPAQUE:
+        return False
+    return bool(np.quantile(some, 0.1) > _OPAQUE or np.array_equal(some, np.round(some)))
