@@ -14,8 +14,8 @@ _LOOKED_AT = 2**16  # values
 def look_like_degrees(angles: NDArray[np.floating]) -> bool:
     """Whether angles [view] that are said to be radians are degrees, by the look of them.
 
-    They are where all are whole numbers, or where they span more than ten turns and are round to two digits, span 180
-    or 360, or go on by more than a turn from view to view.
+    They are where all are whole numbers, or where they span more than ten turns and are round to two digits, or span
+    180 or 360.
     """
     distinct = np.unique(angles)
     if distinct.size < _FEWEST or not np.isfinite(distinct).all():
@@ -28,7 +28,7 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
     round_numbers = np.allclose(distinct * 100, np.round(distinct * 100), rtol=0, atol=1e-3)
     whole = span + span / (distinct.size - 1)
     turns = any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
-    return bool(round_numbers or turns or np.median(np.abs(np.diff(angles))) > 2 * np.pi)
+    return bool(round_numbers or turns)
 
 
 def look_like_counts(projections: NDArray[np.floating]) -> bool:

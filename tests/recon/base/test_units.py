@@ -7,13 +7,11 @@ import pytest
 
 from recon.base.units import look_like_counts, look_like_degrees
 
-GOLDEN = 111.246117975
 SCANS = {
     "half a turn": np.arange(0, 180, 0.1),
     "uneven steps": np.linspace(0, 180, 721),
     "a full turn": np.linspace(-180, 180, 1000, endpoint=False),
     "a sector": np.arange(0, 60, 1.0),
-    "golden angle, not wrapped": np.arange(500) * GOLDEN,
 }
 
 
