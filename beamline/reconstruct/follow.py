@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopScope, never_stopped
+from beamline.core.text import count
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.recon_report import ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
+from beamline.storage.writer_lock import held
 from drivers.clock import Clock
 from recon.base.views import parse_views
 from recon.warm_up import warm_up
@@ -28,7 +31,7 @@ class FollowTiming:
         poll: between looks at the file while there is nothing to fit.
         slice: of fitting between looks at the file.
         snapshot: between intermediate volumes.
-        patience: without a new frame in an unfinished file, before the scan is given up.
+        patience: without a new frame in an unfinished file, before it is asked whether its writer still runs.
     """
 
     poll: float = 0.1
@@ -49,9 +52,12 @@ def follow(
     Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`, each replacing the last
     in one step; a failure leaves the newest ones, success none.
 
+    A stop ends it with the volume of the views so far, marked `ended_early`.
+
     Raises:
         ConfigError: a method or selection that needs the whole scan.
         DataError: no scan, or one that stopped growing without being finished.
+        KeyboardInterrupt: a stop before there was a volume.
     """
     rhythm = rhythm or FollowTiming()
     method = options.streaming
@@ -72,9 +78,12 @@ def follow(
     _compile(sink, clock)
     with _open(options, sink, clock, rhythm) as source:
         growing = ScanFollower(options, source, sink, clock, warn)
-        _watch(growing, clock, rhythm)
         with stop_scope() as stopped:
-            growing.catch_up(stopped)
+            if _watch(growing, clock, rhythm, stopped):
+                growing.catch_up(stopped)
+            else:
+                n = growing.n_views_taken
+                warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
             made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
@@ -113,16 +122,27 @@ def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming)
             clock.sleep(rhythm.poll)
 
 
-def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming) -> None:
-    """Take views and fit, in turns, until the scan has ended."""
+def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: Callable[[], bool]) -> bool:
+    """Take views and fit, in turns, until the scan has ended (True) or a stop finds views enough for a volume (False).
+
+    Raises:
+        DataError: the scan died. KeyboardInterrupt: a stop, before there were views enough.
+    """
     last_frame = last_snapshot = clock.now()
     while True:
         ended = growing.source.finished  # asked before the frames, so that none can slip in between
         if growing.take_new_frames(ended):
             last_frame = clock.now()
         if ended:
-            return
+            return True
+        if stopped() and not growing.source.finished:
+            if not growing.has_volume:
+                raise KeyboardInterrupt
+            return False
         if clock.now() - last_frame > rhythm.patience:
+            if held(growing.source.path):  # it waits: for the operator, the beam, or a long exposure
+                last_frame = clock.now()
+                continue
             raise DataError(
                 f"{growing.source.path} has not grown for {rhythm.patience:.0f} s and is not finished: the scan died. "
                 f"Run without --follow and with --unfinished to use the {growing.n_views} views that are there."

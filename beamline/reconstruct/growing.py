@@ -70,6 +70,16 @@ class ScanFollower:
     def n_views(self) -> int:
         return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
 
+    @property
+    def n_views_taken(self) -> int:
+        """Views that have fed the fit."""
+        return sum(part.view_ids.size for part in self._parts)
+
+    @property
+    def has_volume(self) -> bool:
+        """There is a model, of views enough for a volume after a stop."""
+        return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
+
     def take_new_frames(self, ended: bool) -> bool:
         """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
         n = self.source.refresh()
@@ -111,9 +121,8 @@ class ScanFollower:
     def catch_up(self, stopped: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
         while self._taken < self._frames:
-            corrected = sum(part.view_ids.size for part in self._parts)
-            if corrected >= _LEAST_VIEWS and stopped():
-                self._warn(f"Stopped: the volume is of the first {corrected} of {self.n_views} views.")
+            if self.n_views_taken >= _LEAST_VIEWS and stopped():
+                self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.n_views} views.")
                 return
             self.take_new_frames(ended=True)
 

@@ -39,8 +39,11 @@ class WriterLock:
 
 
 def held(path: Path) -> bool:
-    """Whether a program that runs has the file open, so far as locks tell."""
-    file = os.open(path, os.O_RDWR)
+    """Whether a program that runs has the file open, so far as locks tell; not where the file cannot be opened."""
+    try:
+        file = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)
+    except OSError:
+        return False
     try:
         _lock(file, alone=True)
     except (BlockingIOError, PermissionError):

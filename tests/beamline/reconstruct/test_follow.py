@@ -114,6 +114,7 @@ def _schedule(
     if status is not None:
         clock.due.append((end, lambda: writers[0].close(status)))
     else:
+        clock.due.append((end, lambda: writers[0]._lock.release()))  # its program is dead
         # Hours later, so that the file is closed when the test is over.
         clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
 
@@ -286,13 +287,39 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
 
     @contextmanager
-    def at_once() -> Iterator[Callable[[], bool]]:
-        yield lambda: True
+    def at_the_end() -> Iterator[Callable[[], bool]]:
+        yield lambda: any(event.data.get("state") == "finishing" for event in events)
 
-    follow(_options(tmp_path, method=replace(FIT, seconds=1e5)), events.append, clock, RHYTHM, at_once)
+    follow(_options(tmp_path, method=replace(FIT, seconds=1e5)), events.append, clock, RHYTHM, at_the_end)
     assert events[-1].event == "done"
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
     assert parameters["ended_early"] and parameters["n_views"] == 30
+
+
+@pytest.mark.parametrize("seconds", [1.5, 3.0])
+def test_a_stop_while_the_scan_runs_delivers_the_views_so_far_if_they_make_a_volume(
+    tmp_path: Path, seconds: float
+) -> None:
+    clock, events = ScanClock(), list[Event]()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+
+    @contextmanager
+    def soon() -> Iterator[Callable[[], bool]]:
+        yield lambda: clock.time > EPOCH + seconds
+
+    options = _options(tmp_path, method=replace(FIT, seconds=1e5))
+    if seconds < 2:  # seven views
+        with pytest.raises(KeyboardInterrupt):
+            follow(options, events.append, clock, RHYTHM, soon)
+        assert not options.target.output.exists()
+    else:
+        follow(options, events.append, clock, RHYTHM, soon)
+        parameters = read_reconstruction(tmp_path / "recon.h5").parameters
+        n_views = int(parameters["n_views"])
+        assert parameters["ended_early"] and 16 <= n_views < 30
+        told = [event.data["message"] for event in events if event.event == "warning"]
+        assert f"Stopped while the scan runs: the volume is of the first {n_views} views." in told
+    _close(clock)
 
 
 def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
@@ -313,6 +340,13 @@ def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
     assert 16 <= n_views < 30
     told = [event.data["message"] for event in events if event.event == "warning"]
     assert f"Stopped: the volume is of the first {n_views} of 30 views." in told
+
+
+def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: Path) -> None:
+    clock = ScanClock()
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), pause=5 * RHYTHM.patience)
+    follow(_options(tmp_path), lambda event: None, clock, RHYTHM)
+    assert read_reconstruction(tmp_path / "recon.h5").parameters["n_views"] == 30
 
 
 def test_one_of_so_many_views_feeds_the_volume(tmp_path: Path) -> None:
