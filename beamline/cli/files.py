@@ -16,6 +16,7 @@ from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
+from beamline.core.text import printable
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
@@ -60,7 +61,7 @@ def _text(value: Any) -> str:
         return " x ".join(str(v) for v in value)
     if isinstance(value, float):
         return f"{value:.6g}"
-    text = str(value)
+    text = printable(str(value))
     return text if len(text) <= 160 else text[:157] + "..."
 
 

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import click
 
 from beamline.core.errors import BeamlineError, exit_code, user_message
+from beamline.core.text import printable
 from beamline.core.version import version
 
 
@@ -74,7 +75,7 @@ class LazyGroup(click.Group):
             code = exit_code(error)
             if code == BeamlineError.exit_code and not isinstance(error, BeamlineError):
                 raise  # a defect, or click's own
-            click.echo(f"beamline: {user_message(error)}", err=True)
+            click.echo(f"beamline: {printable(user_message(error))}", err=True)
             ctx.exit(code)
 
 

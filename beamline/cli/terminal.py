@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from beamline.core.events import Event, Sink
 from beamline.core.narration import sentence
+from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
 from drivers.clock import Clock
 from drivers.manual import Ask
@@ -90,7 +91,7 @@ class Terminal:
             text = sentence(event)
             if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                 self._last_text = text
-                self._console.print(text)
+                self._console.print(printable(text))
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
         if self._asking:

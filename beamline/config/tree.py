@@ -12,6 +12,7 @@ from beamline.core.errors import ConfigError
 
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
+_MOST_VALUES, _MOST_DIGITS = 100_000, 1000
 
 
 @dataclass(frozen=True)
@@ -34,32 +35,39 @@ def read(text: str, name: str) -> Tree:
     Raises:
         ConfigError: bad syntax, a key said twice, or a top level that is no group of keys; with file and line.
     """
-    loader = yaml.SafeLoader(text)
+    data, origins = _parsed(text, name)
+    if data is None:
+        raise ConfigError(f"{name}: is empty; `beamline config init` prints a complete example. Nothing was started.")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{name}:1: holds no `key: value` lines; `beamline config init` prints a complete example.")
+    return Tree(data, origins)
+
+
+def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
+    """The values in a YAML text, and where each is."""
+    origins: dict[KeyPath, str] = {}
+    loader = None
     try:
+        loader = yaml.SafeLoader(text)  # refuses control characters
         node = loader.get_single_node()
         if node is None:
-            raise ConfigError(
-                f"{name}: is empty; `beamline config init` prints a complete example. Nothing was started."
-            )
-        if not isinstance(node, yaml.MappingNode):
-            raise ConfigError(
-                f"{name}:1: holds no `key: value` lines; `beamline config init` prints a complete example."
-            )
-        origins: dict[KeyPath, str] = {(): f"{name}:{_line(node)}"}
+            return None, origins
+        origins[()] = f"{name}:{_line(node)}"
         _walk(node, (), name, origins)
-        data = loader.construct_document(node)
+        return loader.construct_document(node), origins
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f"{name}:{mark.line + 1}" if mark else name
+        where = f"{name}:{mark.line + 1}" if mark and "\n" in text else name
         what = ", ".join(part for part in (error.context, error.problem) if part)
         raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{name}: this is not YAML ({error}). Nothing was started.") from None
+    except (yaml.YAMLError, ValueError, ArithmeticError) as error:  # such as a 13th month, or a number of 5000 digits
+        what = " ".join(str(error).split())
+        raise ConfigError(f"{name}: this is not YAML ({what}). Nothing was started.") from None
     except RecursionError:
         raise ConfigError(f"{name}: a value holds itself, or is nested beyond reason. Nothing was started.") from None
     finally:
-        loader.dispose()
-    return Tree(data, origins)
+        if loader is not None:
+            loader.dispose()
 
 
 def _line(node: yaml.Node) -> int:
@@ -67,6 +75,15 @@ def _line(node: yaml.Node) -> int:
 
 
 def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
+    if len(origins) > _MOST_VALUES:  # aliases of aliases make billions of a few lines
+        raise ConfigError(f"{name} holds more than {_MOST_VALUES} values: it is no configuration. Nothing was started.")
+    if isinstance(node, yaml.ScalarNode):
+        if "\0" in node.value:
+            raise ConfigError(f"{name}:{_line(node)}: a text holds a NUL character. Nothing was started.")
+        if (
+            node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS
+        ):  # Python neither reads nor writes very long ones
+            raise ConfigError(f"{name}:{_line(node)}: a number has {len(node.value)} digits. Nothing was started.")
     if isinstance(node, yaml.SequenceNode):
         for index, child in enumerate(node.value):
             origins[(*path, index)] = f"{name}:{_line(child)}"
@@ -112,10 +129,7 @@ def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str
 
 
 def _value(text: str, origin: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{origin}: the value is not YAML ({' '.join(str(error).split())})") from None
+    return _parsed(text, origin)[0]
 
 
 def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:

@@ -19,6 +19,11 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes:.3g} TB"
 
 
+def printable(text: str) -> str:
+    """The text as a terminal can show it: control characters but line ends and tabs as `\\x1b`, so that none acts."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+
+
 def count(n: int, noun: str) -> str:
     """`1 view`, `2 views`."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

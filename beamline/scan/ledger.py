@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 
 FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
-NEAR = (
-    0.1  # periods; a frame that comes earlier than its trigger by more waits for the next, which may be the trigger's
-)
+NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next, which may be nearer
 KNOWN = 0.25  # periods by which the first trigger's time may be wrong, so that the first frame can be told by it
 TRAIN, LOOK = 3, 6  # frames that make a train, and how many are looked at for it at most
 UNEVEN = 0.25  # periods; frames of a train are more regular than this

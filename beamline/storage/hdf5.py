@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.text import printable
 from beamline.storage.superblock import superblock
 
 DEGREE = np.pi / 180
@@ -124,10 +125,10 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator
 
 
 def text(value: Any) -> str:
-    """A string from what HDF5 gives for one: str, bytes, or an array of one of these."""
+    """A string from what HDF5 gives for one: str, bytes, or an array of one of these; without control characters."""
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else ""
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    return printable(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value))
 
 
 def attribute(item: h5py.HLObject, name: str) -> str:

@@ -18,7 +18,16 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 
 SUFFIXES = (".tif", ".tiff")
-UNREADABLE = (tifffile.TiffFileError, OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (
+    tifffile.TiffFileError,
+    OSError,
+    ValueError,
+    LookupError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    MemoryError,
+)
 
 
 class Complaints(logging.Handler):

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
+from beamline.core.text import spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
@@ -25,6 +26,7 @@ from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image
 from drivers.frame import FrameKind
 
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
+COUNTED = 100  # numbers between the first and the last file, over their number, from which they count no frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
@@ -58,7 +60,7 @@ class TiffSeries(ScanReader):
         except BaseException:
             self.close()
             raise
-        gaps = ", ".join(map(str, _gaps(series)[:20]))
+        gaps = _gaps(series)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
@@ -70,6 +72,11 @@ class TiffSeries(ScanReader):
             image = self._image(name)
             if image.shape != self.shape:
                 raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
+            if not np.can_cast(image.dtype, self.dtype):
+                raise DataError(
+                    f"{name} in {self.path} holds {image.dtype} pixels, the frames before it {self.dtype}, which "
+                    "cannot hold them all. Write all images of a scan in one type."
+                )
             out[i] = image[rows]
         return out
 
@@ -83,11 +90,15 @@ class TiffSeries(ScanReader):
         return [item.relative_to(self.path).as_posix() for item in self.path.rglob("*") if item.is_file()]
 
     def _bytes(self, name: str) -> bytes:
-        return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
+        try:
+            return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
+        except (*UNREADABLE, RuntimeError) as error:  # of an archive with a password
+            raise DataError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
     def _image(self, name: str) -> NDArray[Any]:
+        content = self._bytes(name)
         try:
-            image = read_image(io.BytesIO(self._bytes(name)))
+            image = read_image(io.BytesIO(content))
         except UNREADABLE as error:
             raise DataError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
         if image.ndim != 2:
@@ -127,11 +138,13 @@ def _check_one_series(path: Path, names: list[str]) -> None:
         )
 
 
-def _gaps(names: list[str]) -> list[int]:
-    """Numbers that a series leaves out between its first and its last."""
+def _gaps(names: list[str]) -> str:
+    """Numbers that a series leaves out between its first and its last; none where its numbers are no counts (dates)."""
     found = [re.search(r"(\d+)\.\w+$", name) for name in names]
-    numbers = {int(match[1]) for match in found if match is not None}
-    return sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
+    numbers = sorted({int(match[1]) for match in found if match is not None})
+    if not numbers or numbers[-1] - numbers[0] > COUNTED * len(numbers):
+        return ""
+    return spans(sorted(set(range(numbers[0], numbers[-1])) - set(numbers)))
 
 
 FORMAT = Format(

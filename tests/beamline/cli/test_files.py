@@ -250,3 +250,12 @@ def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
     events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
     assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}
+
+
+def test_escapes_in_the_texts_of_a_file_do_not_reach_the_terminal(folder: Path) -> None:
+    with h5py.File("scan.h5", "r+") as file:
+        file["entry/title"][()] = "a\x1b]0;owned\x07\x1b[2J"
+    for command in ("info", "validate"):
+        output = _beamline(command, "scan.h5").output
+        assert "\x1b" not in output and "\x07" not in output
+    assert "a\\x1b]0;owned" in _beamline("info", "scan.h5").stdout

@@ -119,6 +119,37 @@ def test_files_that_are_no_configuration(tmp_path: Path, text: str) -> None:
     assert "my.yaml" in faults(tmp_path, text)
 
 
+_BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9)
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ("'a\x07b'", "special characters are not allowed"),
+        ('"a\\0b"', "NUL character"),
+        ("2026-13-45", "month must be in 1..12"),
+        ("9" * 5000, "a number has 5000 digits"),
+        ("0x" + "f" * 5000, "a number has 5002 digits"),
+        ("1e400", "scan.exposure_s is"),
+        ("&a [*a]", "holds itself"),
+        ("[" * 3000, "nested beyond reason"),
+        ("!!python/name:os.system", "could not determine a constructor"),
+    ],
+)
+def test_hostile_values_are_refused_in_a_line(tmp_path: Path, value: str, said: str) -> None:
+    for text in (
+        faults(tmp_path, GOOD.replace("exposure_s: 0.01", f"exposure_s: {value}")),
+        faults(tmp_path, GOOD, f"scan.exposure_s={value}"),
+    ):
+        assert said in text and "\n" not in text
+
+
+def test_a_few_lines_that_stand_for_billions_are_refused(tmp_path: Path) -> None:
+    assert "more than 100000 values" in faults(tmp_path, _BOMB)
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"there is no file .*absent\.yaml"):
         load(tmp_path / "absent.yaml")
@@ -135,7 +166,7 @@ def test_faults_of_overrides_name_the_override(tmp_path: Path) -> None:
     text = faults(tmp_path, GOOD, BEAMLINE_SCAN__ANGLES__VIEWS="many")
     assert text.startswith("BEAMLINE_SCAN__ANGLES__VIEWS: scan.angles.views is 'many'; expected a whole number > 0")
     assert "expected section.key=value" in faults(tmp_path, GOOD, "scan.period_s")
-    assert "--set scan.period_s=[: the value is not YAML" in faults(tmp_path, GOOD, "scan.period_s=[")
+    assert "--set scan.period_s=[: this is not YAML" in faults(tmp_path, GOOD, "scan.period_s=[")
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:

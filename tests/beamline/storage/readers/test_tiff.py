@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -112,6 +113,38 @@ def test_several_series_are_refused(series: tuple[Path, np.ndarray]) -> None:
     tifffile.imwrite(folder / "preview_1.tif", images[0])
     with pytest.raises(DataError, match=r"several series of images: 1 of 'preview_\.tif', 12 of 'tiffs/raw_\.tiff'"):
         open_scan(folder)
+
+
+def test_numbers_that_are_dates_are_no_counts(tmp_path: Path) -> None:
+    for day in range(4):
+        tifffile.imwrite(tmp_path / f"img_2026012{day}120000.tif", np.full(SHAPE, day, np.uint16))
+    tracemalloc.start()
+    with open_scan(tmp_path) as source:
+        assert source.image_key.size == 4
+        assert "missing_numbers" not in source.attributes
+    assert tracemalloc.get_traced_memory()[1] < 10e6  # every number between them took 8.6 GB for 24 files in a month
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("later", [np.uint32, np.int16, np.float32])
+def test_a_frame_of_a_larger_type_is_refused_not_wrapped(series: tuple[Path, np.ndarray], later: type) -> None:
+    folder, _ = series
+    tifffile.imwrite(folder / "tiffs" / "raw_7.tiff", np.full(SHAPE, 30000, later))
+    with open_scan(folder) as source, pytest.raises(DataError, match=f"raw_7.tiff .* holds {later.__name__} pixels"):
+        source.read(np.arange(3, 15))
+
+
+def test_an_encrypted_archive_is_refused(series: tuple[Path, np.ndarray]) -> None:
+    path = zipped(series[0])
+    content = bytearray(path.read_bytes())
+    for signature, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):  # bit 0 of the general purpose flags: encrypted
+        place = content.find(signature)
+        while place >= 0:
+            content[place + at] |= 1
+            place = content.find(signature, place + 1)
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"cannot be read .*encrypted"):
+        open_scan(path)
 
 
 def test_a_gap_in_the_numbers_is_told(series: tuple[Path, np.ndarray]) -> None:
