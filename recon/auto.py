@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.binning import bin_views
+from recon.base.choices import AUTO
 from recon.base.masks import masked
 from recon.base.method import DataUse, Depth, Method, MethodResult, Progress, ReconProblem, RunControl, Traits
 from recon.base.method import TrialSettings as Trial
@@ -73,7 +74,7 @@ class Auto:
         candidates: the methods, by preference.
     """
 
-    name: ClassVar[str] = "auto"
+    name: ClassVar[str] = AUTO
     label: ClassVar[str] = "Automatic choice"
     colour: ClassVar[str] = "tab:green"
     traits: ClassVar[Traits] = Traits(device=True, budget=True)

@@ -12,14 +12,10 @@ from click.core import ParameterSource
 from beamline.cli.options import POSITIVE
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
-from recon.auto import Auto
+from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
 from recon.base.kernel import Kernel
 from recon.base.method import Method
 from recon.methods import build, by_name, has_setting, taking, with_trait
-from recon.splatting.initialise import Start
-from recon.splatting.problem import Loss
-from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS
-from recon.splatting.settings import FitSettings
 
 SETTINGS = {
     "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
@@ -72,7 +68,9 @@ def method_with(name: str, options: Mapping[str, Any]) -> Method:
         name: in `recon.methods`, or of `recon.Auto`.
         options: values by option; None stands for the method's own.
     """
-    if name == Auto.name:
+    if name == AUTO:
+        from recon.auto import Auto  # here: it loads all methods
+
         return Auto(tuple(method_with(method.name, options) for method in Auto().candidates))
     method = by_name(name)
     paths = {option: SETTINGS.get(option, option) for option, value in options.items() if value is not None}
@@ -88,13 +86,10 @@ def takers(option: str) -> tuple[str, ...]:
     """Names of the methods that take an option."""
     if option not in _TRAITS:
         return taking(SETTINGS[option])
+    from recon.auto import Auto
+
     trait = _TRAITS[option]
     return (*((Auto.name,) if getattr(Auto.traits, trait) else ()), *with_trait(trait))
-
-
-def _of(option: str) -> str:
-    """Names of the methods that take an option, for its help."""
-    return ", ".join(takers(option))
 
 
 def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None:
@@ -133,75 +128,69 @@ _OPTIONS = (
     click.option(
         "--steps",
         type=click.IntRange(min=1),
-        help=f"Steps of the fit ({_of('steps')}). Default: {DEFAULT_STEPS}; "
+        help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
         f"{SHORT_STEPS} where the noise of the views hides what more would gain and a finish follows.",
     ),
     click.option(
         "--seconds",
         type=POSITIVE,
-        help=f"Time of the fit ({_of('seconds')}), instead of --steps. With --follow: after the end of the scan.",
+        help="Time of the fit, instead of --steps. With --follow: after the end of the scan.",
     ),
     click.option(
         "--budget",
         callback=time_given,
         metavar="30s|2m|1h",
-        help=f"Time from line integrals to volume ({_of('budget')}): chooses method, steps, Gaussians and binning "
-        "to end in time.",
+        help="Time from line integrals to volume: chooses method, steps, Gaussians and binning to end in time.",
     ),
     click.option(
         "--quality",
         type=click.Choice(list(PRESETS)),
         help="Preset of steps and Gaussians.",
     ),
-    click.option(
-        "--gaussians", type=click.IntRange(min=1), help=f"Number of Gaussians at the start ({_of('gaussians')})."
-    ),
+    click.option("--gaussians", type=click.IntRange(min=1), help="Number of Gaussians at the start."),
     click.option(
         "--start",
         type=click.Choice(get_args(Start)),
         default="fbp",
         show_default=True,
-        help=f"Volume that the first Gaussians are drawn from ({_of('start')}); tv: slower, no streaks of few views.",
+        help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views.",
     ),
     click.option(
         "--loss",
         type=click.Choice(get_args(Loss)),
         default="l1",
         show_default=True,
-        help=f"Loss of the fit ({_of('loss')}), beside SSIM: absolute, squared, or squares weighted by photon noise.",
+        help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise.",
     ),
     click.option(
         "--kernel",
         type=click.Choice([kernel.value for kernel in Kernel]),
-        default=FitSettings().kernel.value,
+        default=KERNEL.value,
         show_default=True,
-        help=f"Shape of the Gaussians ({_of('kernel')}): true ones, or with an end of their own, (1 - r²/8)^1.5.",
+        help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5.",
     ),
-    click.option(
-        "--device", default="cpu", show_default=True, metavar="cpu|cuda", help=f"Device of the fit ({_of('device')})."
-    ),
+    click.option("--device", default="cpu", show_default=True, metavar="cpu|cuda", help="Device of the fit."),
     click.option(
         "--early-stop",
         is_flag=True,
-        help=f"End the fit ({_of('early_stop')}) when views held out stop improving; holds out every tenth if --views "
-        "leaves none.",
+        help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
     ),
     click.option(
         "--finish",
         type=click.IntRange(min=0),
-        help=f"Sweeps on voxels after the fit ({_of('finish')}), which bring back edges, cracks and pores. Default: 8, "
+        help="Sweeps on voxels after the fit, which bring back edges, cracks and pores. Default: 8, "
         "or 16 or 24 where views held out are explained the better; 0: none.",
     ),
     click.option(
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
         callback=checkpoint_output,
-        help=f"Write the state of the fit ({_of('checkpoint')}) to this file: every minute, at the end, and at Ctrl-C.",
+        help="Write the state of the fit to this file: every minute, at the end, and at Ctrl-C.",
     ),
     click.option(
         "--resume",
         type=click.Path(path_type=Path, dir_okay=False),
-        help=f"Continue the fit ({_of('resume')}) from this checkpoint of the same data and options.",
+        help="Continue the fit from this checkpoint of the same data and options.",
     ),
     click.option(
         "--iterations",
@@ -211,6 +200,6 @@ _OPTIONS = (
     click.option(
         "--tv-weight",
         type=POSITIVE,
-        help=f"Weight of the total variation ({_of('tv_weight')}), relative to the density of the sample.",
+        help="Weight of the total variation, relative to the density of the sample.",
     ),
 )

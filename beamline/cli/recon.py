@@ -7,7 +7,8 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,28 +23,24 @@ from beamline.cli.method_options import (
     refuse_contradictions,
 )
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
+from beamline.cli.recipe import Repeatable, config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import Terminal, results
-from beamline.core.errors import QualityError, ScanStopped
-from beamline.core.events import Event, fan_out
-from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.finished import reconstruct_file
-from beamline.reconstruct.follow import follow as follow_scan
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
-from beamline.storage.volumes.files import format_of
+from beamline.cli.terminal import LogLines, Terminal, results
+from beamline.core.errors import QualityError, ScanStopped, user_message
+from beamline.core.events import Event, Sink, fan_out
+from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.version import version
 from drivers.clock import SystemClock
 from recon.assess.plans import Quality
-from recon.auto import Auto
+from recon.base.choices import AUTO, Filter
 from recon.methods import DEFAULT, names
-from recon.voxels.direct import Fbp
-from recon.voxels.enough_views import Goal
-from recon.voxels.fbp import Filter
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
     """An output whose suffix names the format of a volume."""
     if value is not None:
+        from beamline.storage.volumes.files import format_of  # here: help needs none of it
+
         try:
             format_of(value)
         except ValueError as error:
@@ -61,12 +58,13 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
 
 
-@click.command()
+@click.command(cls=Repeatable)
+@config_option
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
     "-m",
     "--method",
-    type=click.Choice((Auto.name, *names())),
+    type=click.Choice((AUTO, *names())),
     help="auto: the one of r2, fista-tv and fbp that predicts views held out best and hides no structure; r2: "
     "Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels. Default: auto; r2 "
     "with --follow and with options of the fit.",
@@ -123,6 +121,13 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     help="Memory that -m fbp may use, such as 8G or 500M; more lies on the disk of the output meanwhile. Default: 70 % "
     "of what is free, within a container's limit.",
 )
+@click.option(
+    "--write-config",
+    type=click.Path(path_type=Path),
+    help="Write the options of this call as a recipe to this file (-: print it), and do nothing else.",
+)
+@click.option("--log", type=click.Path(path_type=Path), help="Write everything that happens to this text file.")
+@click.option("-v", "--verbose", is_flag=True, help="Print everything that happens, with its time, to stderr.")
 @json_option
 def recon(
     file: Path,
@@ -143,6 +148,9 @@ def recon(
     enough_gain: float | None,
     unfinished: bool,
     memory: int | None,
+    write_config: Path | None,
+    log: Path | None,
+    verbose: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -152,10 +160,18 @@ def recon(
     and a report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or
     iterations stops with the volume reached so far (exit code 4), the second discards it.
     """
+    from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
+    from beamline.reconstruct.finished import reconstruct_file
+    from beamline.reconstruct.follow import follow as follow_scan
+    from beamline.reconstruct.options import ReconOptions
+    from beamline.reconstruct.result import OutputPaths
+    from recon.voxels.direct import Fbp
+    from recon.voxels.enough_views import Goal
+
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
     if method is None:
-        method = DEFAULT if follow or set(options_of_a_method(context)) - {"budget"} else Auto.name
+        method = DEFAULT if follow or set(options_of_a_method(context)) - {"budget"} else AUTO
     refuse_contradictions(context, method, follow)
     if follow and values["flags"] == "judge":
         raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")
@@ -166,7 +182,9 @@ def recon(
         raise click.UsageError("--memory is for -m fbp; the other methods hold views and volume in memory.")
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
-    refuse_shared({"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume})
+    refuse_shared(
+        {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume, "--log": log}
+    )
     source, selection = chosen(file, seed, values)
     options = ReconOptions(
         source=source,
@@ -183,12 +201,22 @@ def recon(
         unfinished=unfinished,
         enough=enough,
         memory=memory,
-        command=repeated(sys.argv[1:]),
+        command=repeating(context, file, output),
+        recipe=recipe_text(context, method),
     )
+    if write_config is not None:
+        _write_recipe(write_config, options.recipe)
+        return
     clock = SystemClock()
     last: list[Event] = []
-    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
-        sink = fan_out(last.append, *(json_sinks or [terminal]))
+    with (
+        terminated_like_interrupted(),
+        json_events(as_json) as json_sinks,
+        Terminal(sys.stderr) as terminal,
+        _logged(log) as logged,
+    ):
+        shown = [LogLines(sys.stderr)] if verbose else [terminal]
+        sink = fan_out(last.append, *logged, *(json_sinks or shown))
         metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
     if not as_json:
         click.echo(results(last[-1].data))
@@ -225,6 +253,26 @@ def report_beside(output: Path) -> Path:
     return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
 
 
-def repeated(arguments: list[str]) -> str:
-    """The command line that repeats this call."""
-    return shlex.join(["beamline", *arguments])
+def _write_recipe(path: Path, text: str) -> None:
+    if str(path) == "-":
+        click.echo(text, nl=False)
+        return
+    with whole_file(path) as partial, named_on_failure(path):
+        partial.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def _logged(path: Path | None) -> Iterator[list[Sink]]:
+    """The sink that writes a log; none where none is wanted. An error in the block is its last line."""
+    if path is None:
+        yield []
+        return
+    refuse_existing(path)
+    with named_on_failure(path), path.open("x", encoding="utf-8") as file:
+        lines = LogLines(file)
+        lines(Event("state", SystemClock().now(), {"message": f"splatline {version()}: {shlex.join(sys.argv)}"}))
+        try:
+            yield [lines]
+        except (Exception, KeyboardInterrupt) as error:
+            lines(Event("failed", SystemClock().now(), {"message": user_message(error)}))
+            raise

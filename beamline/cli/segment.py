@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import shlex
-import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_option
+from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.segment.run import Segmented, SegmentOptions, settings_of
@@ -23,7 +22,7 @@ from recon.post.particles import NECK
 _PERCENT = FiniteRange(min=0, max=100)
 
 
-@click.command()
+@click.command(cls=Repeatable)
 @click.argument("volume", type=click.Path(path_type=Path))
 @click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
 @click.option("--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as the file says, else lengths are voxels.")
@@ -87,7 +86,7 @@ def segment(
         voxel_mm=None if voxel_um is None else voxel_um * 1e-3,
         margin=margin if crop == "square" else None,
         n_clusters=clusters,
-        command=shlex.join(["beamline", *sys.argv[1:]]),
+        command=repeating(click.get_current_context(), volume, output),
         **values,
     )
     with terminated_like_interrupted(), json_events(as_json) as sinks:

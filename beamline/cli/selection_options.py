@@ -6,16 +6,17 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
-from beamline.projections.read import FEW_PHOTONS
-from beamline.projections.selection import Noise, Selection
-from beamline.storage.readers.open import SourceOptions
-from recon.prep.correct import CorrectionSettings
+from recon.base.choices import FEW_PHOTONS, Noise
+
+if TYPE_CHECKING:
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.open import SourceOptions
 
 
 def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -76,6 +77,10 @@ def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
     """The scan and the part of it that the options in `said` name."""
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.open import SourceOptions
+    from recon.prep.correct import CorrectionSettings
+
     rest = dict(said)
     pixel_size_um = rest.pop("pixel_size_um")
     selection = Selection(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 from typing import Any, get_args
@@ -11,6 +10,7 @@ import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import SEED, json_option
+from beamline.cli.recipe import Repeatable, repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
@@ -23,7 +23,7 @@ from recon.methods import BASELINE, DEFAULT, names
 from recon.voxels.fbp import Filter
 
 
-@click.command()
+@click.command(cls=Repeatable)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
@@ -96,7 +96,7 @@ def study(
         truth=truth,
         draws=draws,
         seed=seed,
-        command=shlex.join(["beamline", *sys.argv[1:]]),
+        command=repeating(click.get_current_context(), file, output or Path(f"{file.stem}_{which}")),
     )
     with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         table = run_study(options, fan_out(*(json_sinks or [terminal])), SystemClock())

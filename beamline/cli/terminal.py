@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -119,6 +120,22 @@ def _closed_terminal_ignored() -> Iterator[None]:
     except OSError as error:
         if error.errno != errno.EIO:
             raise
+
+
+class LogLines:
+    """A sink that writes every event as a line: time, kind, and the sentence for people or else its values."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._lock = stream, threading.Lock()
+
+    def __call__(self, event: Event) -> None:
+        said = sentence(event) if event.event not in ("done", "recon_started") else None
+        if said is None:
+            said = ", ".join(f"{name} {value}" for name, value in event.data.items())
+        at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
+        with self._lock, _closed_terminal_ignored():
+            self._stream.write(f"{at}  {event.event}: {' '.join(said.split())}\n")
+            self._stream.flush()
 
 
 def rates(data: Mapping[str, Any]) -> str:

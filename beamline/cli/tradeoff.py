@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import POSITIVE, SEED, json_option
+from beamline.cli.recipe import Repeatable, repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
@@ -32,7 +32,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
     return wanted
 
 
-@click.command()
+@click.command(cls=Repeatable)
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
     "--truth",
@@ -84,7 +84,7 @@ def tradeoff(
         max_seconds=max_seconds,
         truth=truth,
         seed=seed,
-        command=shlex.join(["beamline", *sys.argv[1:]]),
+        command=repeating(click.get_current_context(), file, output or Path(f"{file.stem}_tradeoff")),
     )
     with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
         table = run_tradeoff(options, fan_out(*(json_sinks or [terminal])), SystemClock())

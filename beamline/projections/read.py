@@ -12,13 +12,11 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups
 from drivers.frame import FrameKind
+from recon.base.choices import FEW_PHOTONS
 from recon.prep.correct import References
 from recon.prep.counts import Photons, photon_transfer
 
 _BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
-
-FEW_PHOTONS = 100
-"""In a pixel of the open beam: below, counts are better than their logarithm (docs/exploration.md, "Few photons")."""
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.storage.readers.base import ScanSource
+from recon.base.choices import Noise as Noise
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
-
-Noise = Literal["auto", "log", "counts"]
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
 

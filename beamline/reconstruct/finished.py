@@ -86,7 +86,9 @@ def reconstruct_file(
         outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
         prepared = replace(prepared, view_weights=None)
     truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
-    context = ReportContext(facts, selection, options.command, options.seed, warn.messages, started)
+    context = ReportContext(
+        facts, selection, options.command, options.seed, warn.messages, started, recipe=options.recipe
+    )
     return write_result(outcome, prepared, truth, options.target, context, sink, clock)
 
 

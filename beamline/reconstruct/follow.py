@@ -87,7 +87,9 @@ def follow(
             made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
-    context = ReportContext(facts, options.selection, options.command, options.seed, warn.messages, started)
+    context = ReportContext(
+        facts, options.selection, options.command, options.seed, warn.messages, started, recipe=options.recipe
+    )
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
     growing.snapshots.remove()
     return metrics

@@ -38,6 +38,7 @@ class ReconOptions:
         enough: of a followed scan: when its views are enough; None: nobody asks.
         memory: bytes that FBP may use; None: 70 % of what is free.
         command: that repeats this, for the record.
+        recipe: its options that hold for any scan, as YAML, for the record.
     """
 
     source: SourceOptions
@@ -55,6 +56,7 @@ class ReconOptions:
     enough: Goal | None = None
     memory: int | None = None
     command: str = ""
+    recipe: str = ""
 
     @property
     def streaming(self) -> StreamingMethod:

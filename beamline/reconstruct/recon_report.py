@@ -123,6 +123,7 @@ class ReportContext:
     warnings: Sequence[str] = ()
     started: float = 0.0
     scan_flags: Sequence[str] = field(default_factory=tuple)
+    recipe: str = ""
 
 
 def label_of(method: str) -> str:
@@ -183,7 +184,9 @@ def compose(
         summary += f". Chosen: {made.chosen}"
     if made.next_decibel_text:
         summary += f". The next dB: {made.next_decibel_text}"
-    settings = {k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
+    settings = {
+        k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
+    }
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
         f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}. A "
@@ -214,6 +217,7 @@ def compose(
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[*_pictures(made, prepared, truth, volumes, left), *_flagged(context.facts.flagged)],
         command=context.command,
+        recipe=context.recipe,
         footnotes=footnotes,
     )
 

@@ -161,6 +161,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "seed": context.seed,
         **_flat("", made.settings),
         "command": context.command,
+        **({"recipe": context.recipe} if context.recipe else {}),
     }
 
 

@@ -40,7 +40,8 @@ class Report:
         frames: frames in the file of those triggered, e.g. "90/90".
         flags: warnings of the monitor and of the reconstruction.
         pictures: in order.
-        command: the exact command that repeats the reconstruction.
+        command: that repeats the reconstruction.
+        recipe: its options that hold for other scans; empty: none are shown.
         footnotes: definitions that the metrics need.
     """
 
@@ -54,6 +55,7 @@ class Report:
     pictures: Sequence[Picture]
     command: str
     footnotes: Sequence[str] = ()
+    recipe: str = ""
 
 
 def write_report(path: Path, report: Report, *, replace: bool = False) -> None:

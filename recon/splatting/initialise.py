@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
+from recon.base.choices import Start as Start
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.masks import masked
@@ -24,8 +24,6 @@ from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
 from recon.voxels.view_weights import angular_weights, covers_the_circle
-
-Start = Literal["fbp", "tv"]
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.binning import bin_views
+from recon.base.choices import Loss as Loss
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import noise_level
@@ -17,7 +18,6 @@ from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
 from recon.splatting.backend import Backend, ProjectionLoss
 
-Loss = Literal["l1", "l2", "poisson"]
 _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 
 # Images hold values of about one. No matter in the field can cause values beyond this limit, and in SSIM the sums of

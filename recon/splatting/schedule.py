@@ -10,14 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.choices import DEFAULT_STEPS as DEFAULT_STEPS
+from recon.base.choices import SHORT_STEPS as SHORT_STEPS
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem
-
-DEFAULT_STEPS = 400
-"""Steps of a fit that a finish on voxels follows."""
-
-SHORT_STEPS = 200
-"""Steps where the noise of the views hides what more would gain."""
 
 # At this step fits of 500 photons a pixel leave 1.2 to 1.4 times the noise, those of 1000 to 50 000 photons 2.0 to 7
 # times (eighteen slabs of seven samples). At 1.7 to 1.9 a disc with cracks loses 0.4 to 0.9 dB in the short fit, at 1.3

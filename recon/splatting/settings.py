@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from recon.base.choices import KERNEL
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
@@ -65,7 +66,7 @@ class FitSettings:
     coarse: int = 1
     coarse_until: float = 0.2
     rays: RayModel = field(default_factory=RayModel)
-    kernel: Kernel = Kernel.COMPACT
+    kernel: Kernel = KERNEL
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))

@@ -11,13 +11,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy import fft
 
+from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.back_project import (
@@ -32,7 +33,6 @@ from recon.voxels.view_weights import ray_weights
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-Filter = Literal["ram-lak", "shepp-logan", "hann"]
 
 _VIEWS = 32  # filtered at a time
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.cli.recon import repeated, report_beside
+from beamline.cli.recon import report_beside
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.storage.volumes.files import opened_volume
@@ -164,7 +164,6 @@ def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> N
 def test_names() -> None:
     assert report_beside(Path("runs/x/recon.h5")) == Path("runs/x/report.html")
     assert report_beside(Path("walnut_r2.h5")) == Path("walnut_r2.html")
-    assert repeated(["recon", "my scan.h5"]) == "beamline recon 'my scan.h5'"
 
 
 def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None:

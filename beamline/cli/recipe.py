@@ -1,0 +1,154 @@
+"""Recipes: the options of a reconstruction in a file, for other scans; and the command line that repeats a call."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import yaml
+from click.core import ParameterSource
+
+_RAW = "beamline.raw"
+_OF_ONE_CALL = (
+    "output", "as_json", "report", "config", "write_config", "log", "verbose", "checkpoint", "resume", "follow",
+    "unfinished", "truth", "angles", "angle_rows", "darks", "flats",
+)  # fmt: skip
+"""Options that are of one scan or one call, not of a recipe."""
+_NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "checkpoint")
+_PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML takes as they are
+
+
+class Repeatable(click.Command):
+    """A command that remembers its options as they were typed."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta[_RAW] = self.make_parser(ctx).parse_args(args=list(args))[0]
+        return super().parse_args(ctx, args)
+
+
+def given(ctx: click.Context) -> dict[click.Option, Any]:
+    """The options that the user gave, on the command line or in a recipe, as they were typed there."""
+    found = {}
+    for param in ctx.command.params:
+        source = ctx.get_parameter_source(param.name or "")
+        if isinstance(param, click.Option) and source == ParameterSource.COMMANDLINE:
+            found[param] = ctx.meta[_RAW][param.name]
+        elif isinstance(param, click.Option) and source == ParameterSource.DEFAULT_MAP:
+            found[param] = (ctx.default_map or {})[param.name]
+    return found
+
+
+def name_of(option: click.Option) -> str:
+    """The long name, without its dashes."""
+    return max(option.opts, key=len).lstrip("-")
+
+
+def recipe_text(ctx: click.Context, method: str) -> str:
+    """The recipe of this call, as YAML: the method, and the options given that hold for any scan."""
+    values = {name_of(option): value for option, value in given(ctx).items() if option.name not in _OF_ONE_CALL}
+    return "".join(f"{name}: {_scalar(value)}\n" for name, value in ({"method": method} | values).items())
+
+
+def _scalar(value: Any) -> str:
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text)
+
+
+def repeating(ctx: click.Context, argument: Path, output: Path) -> str:
+    """The command line that does the same again, from any folder: with absolute paths, and an output of its own.
+
+    Args:
+        argument: the file that the command is about.
+        output: of this call; the line names another one, as nothing is overwritten.
+    """
+    again = output.with_name(f"{output.stem}_again{output.suffix}").name
+    words = ["beamline", str(ctx.info_name), *_leading(ctx), str(argument.resolve())]
+    for option, value in given(ctx).items():
+        if option.name in _NOT_REPEATED:
+            continue
+        if option.is_flag:
+            on = str(value).lower() in ("true", "1", "yes", "on", "y", "t")
+            words += [max(option.opts if on else option.secondary_opts, key=len)] if on or option.secondary_opts else []
+            continue
+        for each in value if isinstance(value, list | tuple) else [value]:
+            words += [max(option.opts, key=len), _from_anywhere(str(each), option.type)]
+    words += ["--output", again]
+    return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
+
+
+def _leading(ctx: click.Context) -> list[str]:
+    """Arguments before the file, such as the name of a study."""
+    names = [str(param.name) for param in ctx.command.params if isinstance(param, click.Argument)]
+    return [str(ctx.params[name]) for name in names if isinstance(ctx.params[name], str)]
+
+
+def _from_anywhere(value: str, kind: object) -> str:
+    """A path made absolute, also in FILE:first:end."""
+    if isinstance(kind, click.Path):
+        return str(Path(value).resolve())
+    head, colon, tail = value.partition(":")
+    return f"{Path(head).resolve()}{colon}{tail}" if "." in head and Path(head).is_file() else value
+
+
+def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds --config: a recipe, whose options hold where the command line has none."""
+    return click.option(
+        "--config",
+        type=click.Path(path_type=Path),
+        is_eager=True,
+        expose_value=False,
+        callback=_take,
+        help="Recipe: options by their long names (YAML), or a volume of which the recipe is taken. The command line "
+        "goes before it.",
+    )(command)
+
+
+def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
+    if value is None:
+        return
+    options = {
+        name_of(option): option
+        for option in ctx.command.params
+        if isinstance(option, click.Option) and option.name not in _OF_ONE_CALL
+    }
+    found: dict[str, Any] = {}
+    for name, said in _read(value).items():
+        if name not in options:
+            raise click.BadParameter(f"{value}: {name!r} is no option of a recipe; expected {', '.join(options)}")
+        if not isinstance(said, str) or not said:
+            raise click.BadParameter(f"{value}: {name} is {said!r}; expected one value, as on the command line")
+        found[str(options[name].name)] = said
+    ctx.default_map = found
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    """What a recipe says, all values as text: YAML's own rules would make 3664 of 61:04."""
+    try:
+        text = _text(path)
+        said = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
+    except (OSError, UnicodeDecodeError) as error:
+        raise click.BadParameter(f"{path} cannot be read ({error})") from error
+    except yaml.YAMLError as error:
+        raise click.BadParameter(f"{path} is no YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(said, dict):
+        raise click.BadParameter(f"{path} is no recipe; expected lines such as method: fbp")
+    return said
+
+
+def _text(path: Path) -> str:
+    with path.open("rb") as file:
+        if file.read(4) != b"\x89HDF":
+            return path.read_text(encoding="utf-8")
+    from beamline.storage.writers.recon_file import opened_reconstruction
+
+    with opened_reconstruction(path) as record:
+        if "recipe" not in record.parameters:
+            raise click.BadParameter(f"{path} holds no recipe; an older version wrote it")
+        return str(record.parameters["recipe"])

@@ -1,0 +1,123 @@
+"""Recipes and the lines "to repeat": what they give is what the call gave."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.cli.recipe import repeating
+from beamline.cli.study import study
+from beamline.cli.tradeoff import tradeoff
+from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
+from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scans import write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+OPTIONS = ("-m", "sirt", "--iterations", "3", "--rows", "0:1", "--views", "fixed:10", "--axis", "20.5", "--no-report")
+
+
+def _made(folder: Path, *arguments: str) -> ReconRecord:
+    before = left(folder)
+    result = beamline(*arguments)
+    assert result.exit_code == 0, result.output
+    (name,) = [name for name in left(folder) - before if name.endswith(".h5")]
+    return read_reconstruction(folder / name)
+
+
+def _same(one: ReconRecord, other: ReconRecord) -> None:
+    np.testing.assert_array_equal(one.volume.data, other.volume.data)
+    assert one.parameters["recipe"] == other.parameters["recipe"]
+
+
+def test_the_line_to_repeat_repeats_from_any_folder(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.save("truth.npy", np.ones((1, 40, 40), np.float32) * np.arange(40, dtype=np.float32))
+    first = _made(folder, "recon", "scan.h5", *OPTIONS, "--truth", "truth.npy:0:1", "-o", "v.h5")
+    program, *line = shlex.split(str(first.parameters["command"]))
+    assert program == "beamline"
+    _same(first, _made(folder, *line))
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    monkeypatch.chdir(elsewhere)
+    again = _made(elsewhere, *line)
+    _same(first, again)
+    assert again.metrics["psnr"] == first.metrics["psnr"]
+
+
+def test_a_recipe_gives_the_same_from_a_file_and_from_a_volume(folder: Path) -> None:
+    first = _made(folder, "recon", "scan.h5", *OPTIONS, "-o", "v.h5")
+    assert sorted(str(first.parameters["recipe"]).splitlines()) == sorted(
+        ["method: sirt", "iterations: 3", "rows: 0:1", "views: fixed:10", "axis: 20.5"]
+    )
+    assert beamline("recon", "scan.h5", *OPTIONS, "--write-config", "r.yaml").exit_code == 0
+    assert (folder / "r.yaml").read_text() == first.parameters["recipe"]
+    assert beamline("recon", "scan.h5", *OPTIONS, "--write-config", "-").stdout == first.parameters["recipe"]
+    write_exchange(folder / "other.h5", SCAN)
+    _same(first, _made(folder, "recon", "other.h5", "--config", "r.yaml", "-o", "a.h5", "--no-report"))
+    from_volume = _made(folder, "recon", "scan.h5", "--config", "v.h5", "-o", "b.h5", "--no-report")
+    _same(first, from_volume)
+    _, *line = shlex.split(str(from_volume.parameters["command"]))
+    _same(first, _made(folder, *line))  # the recipe's options are in the line: it needs no recipe
+
+
+def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
+    (folder / "r.yaml").write_text("method: sirt\niterations: 3\n")
+    record = _made(folder, "recon", "scan.h5", "--config", "r.yaml", "--iterations", "2", "--no-report")
+    assert record.parameters["iterations"] == 2
+    assert record.parameters["recipe"] == "method: sirt\niterations: 2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("methods: fbp\n", "'methods' is no option of a recipe; expected method"),
+        ("output: v.h5\n", "'output' is no option of a recipe"),
+        ("method: [fbp, r2]\n", "expected one value"),
+        ("method: r3\n", "r3"),
+        ("rows: 5\n", "FIRST:END"),
+        ("method: fbp\niterations: 3\n", "--iterations is of sirt"),
+        ("just text\n", "is no recipe"),
+        ("a: b: c\n", "is no YAML"),
+        ("\x00", "is no YAML"),
+    ],
+)
+def test_a_recipe_that_is_wrong_is_refused_before_any_work(folder: Path, text: str, said: str) -> None:
+    (folder / "r.yaml").write_text(text)
+    result = beamline("recon", "scan.h5", "--config", "r.yaml")
+    assert result.exit_code == 2, result.output
+    assert said in " ".join(result.stderr.split())
+    assert left(folder) == {"scan.h5", "r.yaml"}
+
+
+def test_other_volumes_and_missing_files_hold_no_recipe(folder: Path) -> None:
+    for name in ("scan.h5", "none.yaml"):
+        result = beamline("recon", "scan.h5", "--config", name)
+        assert result.exit_code in (2, 5) and name in result.stderr, result.output
+    assert left(folder) == {"scan.h5"}
+
+
+def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "--no-report").exit_code == 0
+    lines = (folder / "log.txt").read_text().splitlines()
+    kinds = [line.split()[1] for line in lines]
+    assert kinds[0] == "state:" and kinds[-1] == "done:" and "recon_started:" in kinds
+    assert "residual" in lines[-1]
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5").exit_code == 5
+    assert beamline("recon", "none.h5", "-m", "fbp", "--log", "bad.txt").exit_code == 5
+    assert "none.h5 is not there" in (folder / "bad.txt").read_text().splitlines()[-1]
+    said = beamline("recon", "scan.h5", "-m", "fbp", "-v", "-o", "y.h5", "--no-report").stderr
+    assert [line.split()[1] for line in said.splitlines()] == kinds[1:]
+
+
+def test_lines_of_commands_with_arguments_and_flags(folder: Path) -> None:
+    context = study.make_context("study", ["random", "scan.h5", "--draws", "1", "-m", "fbp", "-m", "sirt", "--json"])
+    line = shlex.split(repeating(context, Path("scan.h5"), Path("s")))
+    scan = str(folder / "scan.h5")
+    rest = "--method fbp --method sirt --draws 1 --output s_again"
+    assert line == ["beamline", "study", "random", scan, *rest.split()]
+    context = tradeoff.make_context("tradeoff", ["scan.h5", "--full", "--darks", "d.tif"])
+    line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
+    assert line == ["beamline", "tradeoff", scan, "--darks", str(folder / "d.tif"), "--full", "--output", "t_again"]
