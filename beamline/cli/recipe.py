@@ -123,7 +123,9 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
         if name not in options:
             raise click.BadParameter(f"{value}: {name!r} is no option of a recipe; expected {', '.join(options)}")
         if not isinstance(said, str) or not said:
-            raise click.BadParameter(f"{value}: {name} is {said!r}; expected one value, as on the command line")
+            raise click.BadParameter(
+                f"{value}: {name} holds no text or several; expected one value, as on the command line"
+            )
         found[str(options[name].name)] = said
     ctx.default_map = found
 
@@ -135,7 +137,7 @@ def _read(path: Path) -> Mapping[str, Any]:
         said = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise click.BadParameter(f"{path} is no YAML: {' '.join(str(error).split())}") from error
     if not isinstance(said, dict):
         raise click.BadParameter(f"{path} is no recipe; expected lines such as method: fbp")
