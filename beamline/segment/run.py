@@ -18,6 +18,7 @@ from beamline.core.files import named_on_failure, refuse_existing, whole_file
 from beamline.core.version import version
 from beamline.segment.picture import picture_of
 from beamline.storage import hdf5
+from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import read_volume
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
@@ -152,6 +153,11 @@ def _read(options: SegmentOptions) -> tuple[Volume, str]:
     spacing: tuple[float, ...] | None = None
     first: tuple[float, ...] | None = None
     if path.is_file() and h5py.is_hdf5(path):
+        if dataset is None and _is_scan(path):
+            raise DataError(
+                f"{path} is a scan: its frames are no slices. Reconstruct it with `beamline recon`, and segment the "
+                "volume. Nothing was written."
+            )
         with hdf5.open_hdf5(path) as file:
             if dataset is None and isinstance(file.get(_SIGNAL), h5py.Dataset):
                 dataset = _SIGNAL
@@ -173,6 +179,14 @@ def _read(options: SegmentOptions) -> tuple[Volume, str]:
         centre = tuple(low + (n - 1) / 2 * edge for low, n, edge in zip(first, values.shape, (z, y, x), strict=True))
         grid = Grid(values.shape, x, centre, z)
     return Volume(values, grid), "px" if spacing is None else "mm"
+
+
+def _is_scan(path: Path) -> bool:
+    try:
+        with open_scan(path):
+            return True
+    except DataError:
+        return False
 
 
 def _axes_of(file: h5py.File, dataset: str | None) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
