@@ -66,12 +66,17 @@ def exit_code(error: BaseException) -> int:
         return InstrumentError.exit_code
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or damaged(error):
         return DataError.exit_code
     # click handles a closed pipe (`beamline info x | head`); an OSError without a number is a defect.
     if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
         return DataError.exit_code
     return BeamlineError.exit_code
+
+
+def damaged(error: BaseException) -> bool:
+    """HDF5 could not read or follow what a file holds; h5py has no class of its own for that."""
+    return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in str(error)
 
 
 def user_message(error: BaseException) -> str:
@@ -84,4 +89,6 @@ def user_message(error: BaseException) -> str:
             f"Out of memory ({str(error) or 'no details'}). No half result was kept. Take fewer --rows or --views, a "
             "coarser --bin, or recon -m fbp, which keeps within --memory."
         )
+    if damaged(error):
+        return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
     return "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or repr(error)

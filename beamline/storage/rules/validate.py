@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
@@ -58,6 +58,10 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     except DataError as error:
         if not any(finding.severity == "error" for finding in findings):  # else it is already said why
             findings.append(Finding("error", "readable", str(error)))
+    except (OSError, RuntimeError, KeyError) as error:
+        if not damaged(error):
+            raise
+        findings.append(Finding("error", "readable", user_message(error)))
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda finding: order.index(finding.severity))
 

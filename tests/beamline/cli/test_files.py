@@ -259,3 +259,13 @@ def test_escapes_in_the_texts_of_a_file_do_not_reach_the_terminal(folder: Path) 
         output = _beamline(command, "scan.h5").output
         assert "\x1b" not in output and "\x07" not in output
     assert "a\\x1b]0;owned" in _beamline("info", "scan.h5").stdout
+
+
+@pytest.mark.parametrize("command", ["info", "validate", "monitor"])
+def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command: str) -> None:
+    data = (folder / "scan.h5").read_bytes()
+    parts = data.split(b"EAIB")  # where HDF5 keeps the places of chunks
+    (folder / "scan.h5").write_bytes(b"EAIB".join([parts[0], *(part[:8] + b"?" + part[9:] for part in parts[1:])]))
+    result = _beamline(command, "scan.h5")
+    assert result.exit_code == 5, result.output
+    assert len(parts) > 1 and "damaged" in result.output
