@@ -210,14 +210,21 @@ def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
 
 
 def read_flags(file: h5py.File, n: int) -> FrameFlags:
-    """The flags of the first `n` frames of a scan file of ours, also of one that is being written."""
+    """The flags of the first `n` frames of a scan file of ours, also of one that is being written.
+
+    Raises:
+        ValueError: a dataset of them has another shape than the frames and the legend.
+    """
     legend, scores, regions = read_legend(file), None, None
     if SCORES in file and REGIONS in file:
-        scores, regions = _read(file, SCORES, n), _read(file, REGIONS, n)
-    return FrameFlags(_read(file, FLAGS, n).astype(np.uint64), legend, scores, regions)
+        scores, regions = _read(file, SCORES, (n, len(legend))), _read(file, REGIONS, (n, len(legend), 4))
+    return FrameFlags(_read(file, FLAGS, (n,)).astype(np.uint64), legend, scores, regions)
 
 
-def _read(file: h5py.File, path: str, n: int) -> NDArray[Any]:
+def _read(file: h5py.File, path: str, shape: tuple[int, ...]) -> NDArray[Any]:
     column = file[path]
     column.refresh()
-    return np.asarray(column[:n])
+    values = np.asarray(column[: shape[0]])
+    if values.shape != shape:
+        raise ValueError(f"{path} has shape {values.shape}, expected {shape}")
+    return values

@@ -36,6 +36,9 @@ ENERGY_UNITS = {"ev": 1e-3, "kev": 1.0}  # keV
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}  # s
 
 
+_FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
+
+
 class NotReadyError(DataError):
     """The file is just being created: nothing is wrong with it, try again."""
 
@@ -92,6 +95,22 @@ def is_hdf5(path: Path, follow: bool = False) -> bool:
     return False
 
 
+ALTERED = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, OverflowError, MemoryError)
+"""What h5py and numpy raise where a file is damaged, or holds other things than its names promise."""
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """What h5py raises in the block is a DataError: the file is damaged, or altered by something else."""
+    try:
+        yield
+    except ALTERED as error:
+        what = " ".join(str(error).split()) or "no more is known"
+        raise DataError(
+            f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was changed."
+        ) from error
+
+
 def reason(error: Exception) -> str:
     """Why the disk or the system did not do it, in its own words; HDF5 wraps them in addresses and offsets."""
     said = re.search(r"error message = '([^']*)'", str(error))
@@ -137,17 +156,25 @@ def attribute(item: h5py.HLObject, name: str) -> str:
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:
-    """What a path leads to; None where it leads nowhere, also by a link to a file that is not there."""
+    """What a path leads to; None where it leads nowhere, by a link to a file that is not there, or in a circle."""
     try:
         return group[path]
-    except (KeyError, OSError):
+    except (KeyError, OSError, RuntimeError):
         return None
 
 
 def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
-    """The dataset at a path; None where there is none."""
+    """The dataset at a path; None where there is none, or one that can hold nothing (a null dataspace).
+
+    Raises:
+        DataError: a list longer than any scan.
+    """
     item = resolve(group, path)
-    return item if isinstance(item, h5py.Dataset) else None
+    if not isinstance(item, h5py.Dataset) or item.shape is None:
+        return None
+    if item.ndim == 1 and item.size > _FRAMES:
+        raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
+    return item
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
@@ -173,13 +200,31 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
     return np.ravel(np.asarray(item[()], np.float64)) * factor
 
 
-def missing_links(item: h5py.Dataset) -> list[Path]:
-    """Files that a virtual dataset draws on and that are not there (HDF5 gives fill values without a word)."""
+def missing_links(item: h5py.Dataset) -> list[str]:
+    """Files, and datasets of its own file, that a virtual dataset draws on and that are not there, or of another shape.
+
+    For the first HDF5 gives fill values without a word, with the others it crashes or reads for ever.
+    """
     if not item.is_virtual:
         return []
-    folder = Path(item.file.filename).parent
-    names = {source.file_name for source in item.virtual_sources()} - {"."}
-    return sorted(folder / name for name in names if not (folder / name).is_file())
+    folder, lost = Path(item.file.filename).parent, set()
+    for source in item.virtual_sources():
+        if source.file_name == ".":
+            drawn = dataset(item.file, source.dset_name)
+            if drawn is None or drawn.shape[1:] != item.shape[1:]:
+                lost.add(source.dset_name)
+        elif not (folder / source.file_name).is_file():
+            lost.add(str(folder / source.file_name))
+    return sorted(lost)
+
+
+def require_possible(item: h5py.Dataset) -> None:
+    """DataError for frames [frame, row, col] of a size that no memory holds."""
+    if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
+        raise DataError(
+            f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
+            f"frames of {_PIXELS} pixels."
+        )
 
 
 def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:

@@ -60,7 +60,7 @@ def recover(path: Path) -> Recovered:
     """
     head = _checked(path)
     if not head.open_for_writing:
-        with hdf5.open_hdf5(path) as file:
+        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             _require_ours(path, file)
             if file[layout.FINISHED][()] and "exchange" in file:
                 return Recovered(path, False, int(file[layout.COMMITTED][()]), 0, None)
@@ -70,7 +70,8 @@ def recover(path: Path) -> Recovered:
             _require_ours(path, file)
             for name in layout.GROWING:
                 file[name][:]
-    except (OSError, RuntimeError, KeyError, DataError) as error:
+            hdf5.text(file[layout.STATUS][()]), len(file[layout.DATA]), _views_missing(file)  # it must be able to end
+    except (*hdf5.ALTERED, DataError) as error:
         _write_head(path, head)
         if isinstance(error, DataError):
             raise

@@ -66,9 +66,10 @@ class DataExchangeSource(ScanReader):
             if item.ndim != 3 or item.shape[1:] != self._parts[-1][1].shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.shape}" for _, part in self._parts)
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
+            hdf5.require_possible(item)
             lost = hdf5.missing_links(item)
             if lost:
-                raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there.")
+                raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(self._parts[-1][1]):
             raise DataError(f"{self.path} holds no projections: /exchange/data has shape {self._parts[-1][1].shape}.")
 

@@ -67,12 +67,19 @@ class NXtomoSource(ScanReader):
         for item in (self._places.data, self._places.image_key, finer):
             if item is not None:
                 require_real(item.dtype, f"{item.name} in {self.path}")
+        hdf5.require_possible(self._places.data)
         lost = hdf5.missing_links(self._places.data)
         if lost:
-            raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there ({len(lost)} missing).")
+            raise DataError(
+                f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
+            )
 
     def refresh(self) -> int:
         """Look again at a growing file; how many frames can be read now."""
+        with hdf5.readable(self.path):
+            return self._refreshed()
+
+    def _refreshed(self) -> int:
         places = self._places
         finer = hdf5.dataset(places.detector, "image_key_control")
         if self._ours:
@@ -82,6 +89,8 @@ class NXtomoSource(ScanReader):
             committed = self._file[layout.COMMITTED]
             committed.refresh()
             n = int(committed[()])
+            if n < 0:
+                raise ValueError(f"{n} frames are committed")
             if n > self.n:
                 for item in (places.data, key, places.angle):
                     if item is not None:
@@ -107,13 +116,18 @@ class NXtomoSource(ScanReader):
     def finished(self) -> bool:
         if not self._ours:
             return True
-        flag = self._file[layout.FINISHED]
-        flag.refresh()
-        return bool(flag[()])
+        with hdf5.readable(self.path):
+            flag = self._file[layout.FINISHED]
+            flag.refresh()
+            return bool(flag[()])
 
     @property
     def attributes(self) -> dict[str, str | float | int]:
         """What else the file says: sample, title, times, status, missing triggers."""
+        with hdf5.readable(self.path):
+            return self._said()
+
+    def _said(self) -> dict[str, str | float | int]:
         entry = self._places.entry
         said: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
@@ -140,12 +154,14 @@ class NXtomoSource(ScanReader):
 
     @property
     def flags(self) -> FrameFlags | None:
-        return read_flags(self._file, self.n) if self._ours else None
+        with hdf5.readable(self.path):
+            return read_flags(self._file, self.n) if self._ours else None
 
     @property
     def replaces(self) -> NDArray[np.int64] | None:
-        rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n] if self._ours else np.full(0, -1)
-        return rows if (rows >= 0).any() else None
+        with hdf5.readable(self.path):
+            rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n] if self._ours else np.full(0, -1)
+            return rows if (rows >= 0).any() else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the frames asked for, in that order."""
@@ -186,17 +202,18 @@ class NXtomoSource(ScanReader):
     def plan(self) -> Mapping[str, Any]:
         try:
             plan = json.loads(hdf5.text(_value(self._file, "/entry/record/plan")) or "{}") if self._ours else {}
-        except ValueError:
+        except (ValueError, RecursionError):
             return {}
         return plan if isinstance(plan, dict) else {}
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """The frames from `first` on, with all that the file knows about each."""
         self.require_counts()
-        time = self._seconds(self._places.entry, "frame_log/time")
-        trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
-        framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
-        replaces = self._column("frame_log/replaces", np.full(self.n, -1))
+        with hdf5.readable(self.path):
+            time = self._seconds(self._places.entry, "frame_log/time")
+            trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
+            framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
+            replaces = self._column("frame_log/replaces", np.full(self.n, -1))
         for i in range(first, self.n):
             yield Frame(
                 counts=self.read([i])[0],
@@ -216,7 +233,8 @@ class NXtomoSource(ScanReader):
             return default
         if self._ours:
             item.refresh()
-        return np.asarray(item[()])
+        values = np.asarray(item[()])
+        return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
         item = hdf5.dataset(group, path)

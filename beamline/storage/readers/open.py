@@ -99,9 +99,10 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
 
 def _open(path: Path, opening: Opening) -> ScanReader:
-    for kind in FORMATS:
-        if kind.recognises(path, opening):
-            return kind.open(path, opening)
+    with hdf5.readable(path):
+        for kind in FORMATS:
+            if kind.recognises(path, opening):
+                return kind.open(path, opening)
     if not hdf5.is_hdf5(path):
         raise DataError(f"{path} is neither HDF5 nor TIFF; a scan is one of these, or a folder or .zip of TIFFs.")
     known = ", ".join(kind.name for kind in FORMATS)

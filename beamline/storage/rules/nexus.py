@@ -20,7 +20,15 @@ Rule = Callable[[Places], Iterator[Finding]]
 
 def nexus_findings(file: h5py.File) -> list[Finding]:
     """What the rules find in every tomography entry of a file; [] for a file that has none."""
-    return [finding for places in find(file) for rule in RULES for finding in rule(places)]
+    return [finding for places in find(file) for rule in RULES for finding in _found(rule, places)]
+
+
+def _found(rule: Rule, places: Places) -> list[Finding]:
+    """What a rule finds; one that cannot even be asked is an error: the file is damaged, or altered."""
+    try:
+        return list(rule(places))
+    except hdf5.ALTERED as error:
+        return [Finding("error", "layout", f"{rule.__name__}: not laid out as it should be ({error}).")]
 
 
 def definition_said(places: Places) -> Iterator[Finding]:

@@ -210,6 +210,27 @@ def test_virtual_frames_of_a_file_that_is_gone_are_no_zeros(tmp_path: Path) -> N
         open_scan(path)
 
 
+@pytest.mark.parametrize("drawn", [h5py.Empty("u2"), np.zeros((3, 3, 3, 3), np.uint16), None], ids=str)
+def test_virtual_frames_of_a_dataset_that_was_replaced_are_refused(
+    write: Write, frames: list[Frame], drawn: object
+) -> None:
+    """HDF5 crashes on a null dataspace there, and reads for ever where the source has more dimensions."""
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        del file["entry/instrument/detector/data"]
+        if drawn is not None:
+            file["entry/instrument/detector/data"] = drawn
+    with pytest.raises(DataError, match=r"/entry/instrument/detector/data\b.* is not there"):
+        open_scan(path)
+
+
+def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "f.h5", "w") as file:
+        file.create_dataset("exchange/data", (3, 10**9, 10**9), "u2", chunks=(1, 10, 10))
+    with pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"):
+        open_scan(tmp_path / "f.h5")
+
+
 def test_a_file_that_is_not_there_yet_can_be_waited_for(tmp_path: Path) -> None:
     with pytest.raises(NotReadyError, match="is not there"):
         open_scan(tmp_path / "soon.h5", follow=True)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import shutil
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -17,6 +20,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recover import recover
 from beamline.storage.rules.validate import reconstruction_blockers, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
@@ -419,3 +423,35 @@ def test_a_damaged_scan_is_not_ingested(write: Write, frames: list[Frame], tmp_p
     with pytest.raises(DataError, match=r"Frame 6 of .* checksum differs"):
         ingest(path, tmp_path / "copy.h5")
     assert [left.name for left in tmp_path.iterdir()] == ["scan.h5"]
+
+
+ALTERATIONS = {
+    "a null dataspace": h5py.Empty("f4"),
+    "a text": "words",
+    "other dimensions": np.zeros((3, 3, 3, 3)),
+    "a link in a circle": None,
+    "nothing": np.zeros(0),
+    "a negative number": np.int64(-5),
+    "a huge number": np.int64(2**62),
+    "nested lists": "[" * 3000,
+}
+
+
+@pytest.mark.parametrize(
+    "where",
+    ["instrument/detector/image_key", "frame_log/flags", "progress/frames_committed", "progress/status", "record/plan"],
+)
+def test_altered_files_are_described_or_refused_in_words(
+    write: Write, frames: list[Frame], where: str, tmp_path: Path
+) -> None:
+    whole = write(frames)
+    for what, value in ALTERATIONS.items():
+        path = tmp_path / f"{what}.h5"
+        shutil.copy(whole, path)
+        with h5py.File(path, "r+") as file:
+            del file["entry"][where]
+            file["entry"][where] = h5py.SoftLink(f"/entry/{where}") if value is None else value
+        assert isinstance(validate(path, deep=lambda n, of: None), list)
+        for ask in (describe, recover, partial(ingest, out=tmp_path / f"copy of {what}.h5")):
+            with suppress(DataError):
+                ask(path)
