@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from recon.base.binning import bin_views
 from recon.base.choices import AUTO
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Depth, Method, MethodResult, Progress, ReconProblem, RunControl, Traits
 from recon.base.method import TrialSettings as Trial
@@ -77,7 +79,7 @@ class Auto:
     name: ClassVar[str] = AUTO
     label: ClassVar[str] = "Automatic choice"
     colour: ClassVar[str] = "tab:green"
-    traits: ClassVar[Traits] = Traits(device=True, budget=True)
+    traits: ClassVar[Traits] = Traits(device=True, budget=True, halo=max(R2.traits.halo, FistaTv.traits.halo))
 
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
@@ -87,20 +89,22 @@ class Auto:
         Raises:
             ValueError: no candidate takes these views or data.
         """
-        chosen, because = self._choose(problem, control)
+        decide = control.decide or Decisions(problem.seed)
+        at, because = decide("method", lambda: self._choose(problem, control))
+        chosen = self.candidates[at]
         device = problem.device if chosen.traits.device else "cpu"
         found = chosen.run(replace(problem, device=device), control)
         settings = {**found.settings, "chosen_method": chosen.name, "chosen_because": because}
         return replace(found, settings=settings, method=chosen.name)
 
-    def _choose(self, problem: ReconProblem, control: RunControl) -> tuple[Method, str]:
+    def _choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
         part, where = part_of(problem)
         if part is None:
-            return self.candidates[0], where
+            return 0, where
         at, residuals = predicts_best(part, self.candidates, control)
         if at is None:
-            return self.candidates[0], residuals
-        return self.candidates[at], f"residual of views held out, {where}: {residuals}"
+            return 0, residuals
+        return at, f"residual of views held out, {where}: {residuals}"
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
@@ -108,6 +112,9 @@ class Auto:
     @classmethod
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[Trial]:
         return [Trial("method")]
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return max(method.memory(geometry, grid, weighted) for method in self.candidates)
 
     def work(self, n_views: int, binning: int) -> float:
         return sum(method.work(n_views, binning) for method in self.candidates)

@@ -67,6 +67,9 @@ class Grey:
     def trials(cls, gaussians, depth):
         return [TrialSettings("method"), TrialSettings("shade", {"shade": 0.7})]
 
+    def memory(self, geometry, grid, weighted):
+        return 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
+
     def work(self, n_views, binning):
         return 1.0
 """

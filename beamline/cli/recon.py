@@ -118,8 +118,8 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     "--memory",
     metavar="SIZE",
     callback=memory_size,
-    help="Memory that -m fbp may use, such as 8G or 500M; more lies on the disk of the output meanwhile. Default: 70 % "
-    "of what is free, within a container's limit.",
+    help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
+    "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
 )
 @click.option(
     "--write-config",
@@ -165,7 +165,6 @@ def recon(
     from beamline.reconstruct.follow import follow as follow_scan
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.result import OutputPaths
-    from recon.voxels.direct import Fbp
     from recon.voxels.enough_views import Goal
 
     settings = {name: values.pop(name) for name in SETTINGS}
@@ -178,8 +177,8 @@ def recon(
     enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
     if enough is not None and not follow:
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")
-    if memory is not None and method != Fbp.name:
-        raise click.UsageError("--memory is for -m fbp; the other methods hold views and volume in memory.")
+    if memory is not None and (follow or budget is not None):
+        raise click.UsageError("--memory does not go with --follow or --budget, which hold everything in memory.")
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,6 +14,10 @@ import psutil
 
 _CPUINFO, _STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+# Of a control group: its line in _OWN_CGROUP, its tree, the files of its limit and of what it uses, and in memory.stat
+# the file cache that counts as used and is given up first.
+_CGROUP_2 = (r"0::/(.*)", "", "memory.max", "memory.current", "inactive_file")
+_CGROUP_1 = (r"\d+:memory:/(.*)", "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 
 
 def machine() -> dict[str, str | int]:
@@ -92,28 +97,28 @@ def _high_water(status: str) -> int | None:
 
 
 def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
-    """What each limit above this process leaves (cgroup v2), which psutil does not know.
+    """What each limit above this process leaves (cgroup v1 and v2), which psutil does not know.
 
     A container may see its own limit at the root.
     """
-    inner = ""
+    lines: list[str] = []
     with suppress(OSError):
-        for line in own.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("0::/"):
-                inner = line.removeprefix("0::/")
-    folder = root / inner
-    for place in (folder, *folder.parents):
-        if not place.is_relative_to(root):
-            return
-        with suppress(OSError, ValueError):  # no limit is the word "max"
-            limit, used = (int((place / name).read_text("ascii")) for name in ("memory.max", "memory.current"))
-            yield max(limit - used + _reclaimable(place / "memory.stat"), 0)
+        lines = own.read_text(encoding="utf-8", errors="replace").splitlines()
+    for pattern, tree, most, now, cache in (_CGROUP_2, _CGROUP_1):
+        top = root / tree
+        folder = top / next((found[1] for line in lines if (found := re.fullmatch(pattern, line))), "")
+        for place in (folder, *folder.parents):
+            if not place.is_relative_to(top):
+                break
+            with suppress(OSError, ValueError):  # no limit is the word "max", or more than there is
+                limit, used = (int((place / name).read_text("ascii")) for name in (most, now))
+                yield max(limit - used + _entry(place / "memory.stat", cache), 0)
 
 
-def _reclaimable(stat: Path) -> int:
-    """The file cache that counts as used and is given up first."""
+def _entry(stat: Path, wanted: str) -> int:
+    """The value of a line "name value" of a file; 0 where it has none."""
     for line in stat.read_text("ascii").splitlines():
         name, _, value = line.partition(" ")
-        if name == "inactive_file":
+        if name == wanted:
             return int(value)
     return 0

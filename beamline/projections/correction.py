@@ -86,7 +86,10 @@ class ScanCorrection:
             DataError: as `at_once`; photons are counted: their weights would have to be in memory.
         """
         if self.photons is not None:
-            raise DataError(f"{self._source.path}: photons are counted, which needs all views in memory.")
+            raise DataError(
+                f"{self._source.path}: photons are counted, which needs all views in "
+                "memory. Give --noise log, or --bin 2."
+            )
         parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._references is None else 2
         stream, columns, alive = None, (0, 0), []
         if self._references is not None:

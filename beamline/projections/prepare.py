@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
-from recon.base.masks import areas, masked
+from recon.base.masks import RayWeights, areas, masked
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate, find_axis
 from recon.prep.correct import Projections
@@ -65,6 +66,8 @@ class PreparedProjections:
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
+        shares_of: `shares` of some rows [view, row, col], where line integrals lie on disk and these are made when
+            wanted; None: as `shares` says.
     """
 
     projections: Projections
@@ -82,9 +85,40 @@ class PreparedProjections:
     measured: NDArray[np.bool_] | None = None
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
+    shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
+
+    @property
+    def on_disk(self) -> bool:
+        """Line integrals lie on disk, where rays that weigh nothing were filled from their neighbours."""
+        return isinstance(self.projections.data, np.memmap)
+
+    def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
+        """The same views in some detector rows, which `geometry` is of; line integrals stay where they are."""
+
+        def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if array is None else array[..., rows, :]
+
+        found, held = self.projections, self.held_out
+        if held is not None:
+            held = held[0][:, rows], held[1].rows(rows.start, rows.stop)
+        shares = cut(self.shares) if self.shares_of is None else self.shares_of(rows)
+        return replace(
+            self,
+            projections=replace(found, data=found.data[:, rows], masked=found.masked[rows], weights=cut(found.weights)),
+            geometry=geometry,
+            held_out=held,
+            measured=cut(self.measured),
+            shares=shares,
+            shares_of=None,
+        )
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
-        """Weights [view, row, col], read-only; None: one for all rays.
+        """Weights [view, row, col] as `ray_factors` says, read-only."""
+        factors = self.ray_factors(others)
+        return None if factors is None else factors[...]
+
+    def ray_factors(self, others: int = 0) -> RayWeights | None:
+        """Weights [view, row, col], of which no more is made than is asked for; None: one for all rays.
 
         Args:
             others: views after these, which weigh 1, as a usual ray of these does.
@@ -104,7 +138,7 @@ class PreparedProjections:
         if not factors:
             return None
         shape = (self.geometry.n_views + others, *self.geometry.detector_shape)
-        return np.broadcast_to(functools.reduce(np.multiply, factors), shape)
+        return RayWeights(tuple(np.broadcast_to(factor, shape) for factor in factors))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +196,12 @@ def prepare_projections(
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
     regions = usable.regions
+    shares_of = None
     if spill is not None:
+        rows = rows_of(source, selection)
+        shares_of = partial(
+            _shares_of, regions, projections.view_ids, rows, selection.binning, projections.data.shape[2]
+        )
         usable = replace(usable, regions=Regions())
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     held_out = None
@@ -172,7 +211,11 @@ def prepare_projections(
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
     found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
     found = replace(
-        found, geometry=jumps.corrected(found.geometry, projections.view_ids), jumps=jumps.said, noise=correction.noise
+        found,
+        geometry=jumps.corrected(found.geometry, projections.view_ids),
+        jumps=jumps.said,
+        noise=correction.noise,
+        shares_of=shares_of,
     )
     if spill is not None:
         _fill_unknown(found, regions, rows_of(source, selection), selection.binning)
@@ -193,6 +236,14 @@ def _fill_unknown(found: PreparedProjections, regions: Regions, rows: slice, bin
             known *= seen[view][:, None]
         if not known.all():
             data[view] = masked(data[view : view + 1], known[None])[0][0]
+
+
+def _shares_of(
+    regions: Regions, view_ids: NDArray[np.int64], rows: slice, binning: int, cols: int, part: slice
+) -> NDArray[np.float32] | None:
+    """Weights of the rays in the regions of flags, in some of the binned rows."""
+    within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)
+    return regions.weights(view_ids, within, binning, (part.stop - part.start, cols))
 
 
 def _axis_beside_jumps(

@@ -21,16 +21,17 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.result import write_result
-from beamline.reconstruct.slabs import fbp_on_disk, prepare_within
+from beamline.reconstruct.slabs import in_slabs, prepare_within
 from drivers.clock import Clock
 from recon.auto import Auto
 from recon.base.method import DataUse, Method, Progress, RunControl
+from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.methods import with_trait
+from recon.reconstruction import Reconstruction
 from recon.splatting.backend import backend_for
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
-from recon.voxels.direct import Fbp
 from recon.warm_up import warm_up
 
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
@@ -64,7 +65,7 @@ def reconstruct_file(
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
         facts = facts_of(source)
-        prepared, on_disk = prepare_within(source, options, sink, clock, warn)
+        prepared, slabs = prepare_within(source, options, sink, clock, warn)
     selection = options.selection
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
@@ -81,8 +82,9 @@ def reconstruct_file(
             outcome, prepared, factor = _within_budget(job, options.budget)
             selection = replace(selection, binning=selection.binning * factor)
         else:
-            outcome = _by_fit(job, options.method) if isinstance(options.method, R2) else _by_method(job, on_disk)
-    if on_disk and prepared.view_weights is not None:  # for the record: FBP takes all rays alike, and so do its figures
+            outcome = _by_slabs(job, slabs) if slabs else _at_once(job)
+    if slabs and options.method.traits.direct and prepared.view_weights is not None:
+        # For the record: FBP takes all rays alike, and so do its figures.
         outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
         prepared = replace(prepared, view_weights=None)
     truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
@@ -157,23 +159,29 @@ class _Job:
         except ValueError as error:
             raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
 
-    def run(self, method: Method, control: RunControl) -> recon.Reconstruction:
+    def run(self, method: Method, control: RunControl) -> Reconstruction:
         """Run a method, with views held out if it takes any, until it ends or is stopped."""
-        prepared, data, geometry = self.prepared, self.prepared.projections.data, self.prepared.geometry
+        return self.run_on(method, self.prepared, self.grid, control)
+
+    def run_on(self, method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
+        """Run a method on these views."""
+        data, geometry = prepared.projections.data, prepared.geometry
         held_out: Sequence[int] = ()
         if method.traits.held_out:
             data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-        weights = prepared.ray_weights(len(held_out))
+        # Rays that weigh nothing were filled on disk, as a direct method does it.
+        filled = method.traits.direct and prepared.on_disk
+        weights = None if filled else prepared.ray_weights(len(held_out))
         control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
         with self.refused(f" by {method.name}"):
             # Compilation must not count in the time of the run, nor in its estimate of the time left.
             warm_up(method, prepared.geometry, device=self.options.device)
             return recon.reconstruct(
-                data, geometry, method, grid=self.grid, seed=self.options.seed, device=self.options.device,
+                data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
                 use=DataUse(weights, held_out), control=control,
             )  # fmt: skip
 
-    def outcome(self, result: recon.Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:
+    def outcome(self, result: Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:
         """The result with its own settings, `settings`, and whether it ended early."""
         return ReconOutcome(
             volume=result.volume,
@@ -186,20 +194,38 @@ class _Job:
         )
 
 
-def _by_method(job: _Job, on_disk: bool) -> ReconOutcome:
-    """Run a method that has no presets and no checkpoints."""
+def _at_once(job: _Job) -> ReconOutcome:
+    """Run a method on the whole volume."""
     method = job.options.method
-    if on_disk and isinstance(method, Fbp):
-        with job.refused(f" by {method.name}"):
-            warm_up(method, job.prepared.geometry)
-            result = fbp_on_disk(method, job.options, job.prepared, job.listener(), job.clock)
-    else:
-        result = job.run(method, RunControl(on_progress=job.listener()))
+    return _by_fit(job, method) if isinstance(method, R2) else _by_method(job, method)
+
+
+def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
+    """Run a method slab by slab."""
+    options = job.options
+    if isinstance(options.method, R2) and options.quality is not None:
+        count = default_count(Grid.of_field(job.prepared.geometry, job.grid.voxel_size))
+        options = replace(options, method=options.method.with_quality(options.quality, count))
+    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
+
+    def said(text: str) -> None:
+        job.sink(Event("state", job.clock.now(), {"state": "slab", "message": text}))
+
+    result = in_slabs(job.run_on, job.prepared, options, slabs, control, said)
+    return job.outcome(result, job.stop_latch.stopped, _chosen(result))
+
+
+def _chosen(result: Reconstruction) -> str:
+    """The method that another one chose, and why; empty where none did."""
+    because = result.settings.get("chosen_because")
+    return "" if because is None else f"{result.method}: {because}"
+
+
+def _by_method(job: _Job, method: Method) -> ReconOutcome:
+    """Run a method that has no presets and no checkpoints."""
+    result = job.run(method, RunControl(on_progress=job.listener()))
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    chosen = ""
-    if "chosen_because" in result.settings:
-        chosen = f"{result.method}: {result.settings['chosen_because']}"
-    return job.outcome(result, job.stop_latch.cut(reached, planned), chosen)
+    return job.outcome(result, job.stop_latch.cut(reached, planned), _chosen(result))
 
 
 def _by_fit(job: _Job, method: R2) -> ReconOutcome:

@@ -16,10 +16,9 @@ from beamline.storage import hdf5
 from beamline.storage.volume_file import read_volume
 from recon.assess import metrics
 from recon.base.geometry import Geometry
+from recon.base.masks import RayWeights
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import residual_norms
-
-F32 = NDArray[np.float32]
 
 _RESIDUAL_VIEWS = 16
 _RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
@@ -111,18 +110,18 @@ def measure(
         values["snr"], values["cnr"] = metrics.snr_cnr(metrics.sampled(volume.data), mask)
     n = prepared.geometry.n_views
     some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
-    weights = prepared.ray_weights()
+    weights = prepared.ray_factors()
     values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights)
     if prepared.held_out is not None:
         data, unseen = prepared.held_out
-        weights = prepared.ray_weights(unseen.n_views)
-        later = None if weights is None else weights[n:]
+        weights = prepared.ray_factors(unseen.n_views)
+        later = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
         values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later)
     return {name: float(value) for name, value in values.items()}
 
 
 def _residual(
-    volume: Volume, data: NDArray[np.float32], geometry: Geometry, views: NDArray[np.int64], weights: F32 | None
+    volume: Volume, data: NDArray[np.float32], geometry: Geometry, views: NDArray[np.int64], weights: RayWeights | None
 ) -> float:
     """Of these views, rays that were not measured left out: what the volume does not explain of them."""
     left = total = 0.0

@@ -27,7 +27,7 @@ def odd_views_warning(made: ReconOutcome, prepared: PreparedProjections, selecti
     """The warning that parts of views are not in the volume; empty where there are none, and of direct methods."""
     if by_name(made.method).traits.direct:
         return ""
-    found = odd_views.odd_views(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_weights())
+    found = odd_views.odd_views(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
     if not found:
         return ""
     first, side = (selection.rows or (0, 0))[0], selection.binning

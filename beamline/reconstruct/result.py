@@ -17,6 +17,7 @@ from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compo
 from beamline.reconstruct.remarks import hiding_warning, odd_views_warning
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
+from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import ReconRecord, Value
 from drivers.clock import Clock
@@ -64,7 +65,7 @@ def write_result(
 
     left = unexplained(
         made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed),
-        prepared.ray_weights(),
+        prepared.ray_factors(),
     )  # fmt: skip
     metrics = {made.method: judged(made.volume, made.seconds)}
     hiding = ""
@@ -80,7 +81,10 @@ def write_result(
     volumes = {made.method: made.volume}
     if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
         before = clock.now()
-        data = direct(prepared.projections.data, prepared.geometry, made.volume.grid, made.filter)
+        grid, out = made.volume.grid, None
+        if isinstance(made.volume.data, np.memmap):
+            out = scratch_array(target.output.parent, grid.shape)
+        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, out=out)
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     own = metrics[made.method]

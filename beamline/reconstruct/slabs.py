@@ -1,10 +1,10 @@
-"""FBP within a memory: views and volume lie on disk, and sixteen slices at a time in memory."""
+"""Slabs: a scan that does not fit into the memory lies on disk, and a method reconstructs it slab by slab."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,56 +20,122 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
 from drivers.clock import Clock
 from drivers.frame import FrameKind
-from recon.base.method import Progress
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.method import Method, Progress, RunControl
+from recon.base.slabs import Slab, part_of, slabs_of
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
+from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
-from recon.voxels.fbp import fbp, fbp_memory
+from recon.voxels.odd_views import odd_views_memory
+from recon.voxels.unexplained import unexplained_memory
 
 SHARE = 0.7
-"""Of the memory that is free, what a reconstruction by FBP may take by default."""
+"""Of the memory that is free, what a reconstruction may take by default."""
 
 _BATCH = 0.25  # of that, what views take while they are corrected
 _COPIES = 4  # float32 copies of a view while it is corrected
+_ROWS = 16  # slabs are multiples of so many, which FBP makes together
+_REGIONS = 2**24  # voxels, at most, of the regions by which volumes are judged, see `metrics.sampled`
+_ASIDE = 64_000_000  # bytes of figures that nobody counts
+_LOOKED_AT = 8  # views by which the rows with most matter are found
+
+Run = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
+"""Reconstructs views on a grid."""
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Bytes that FBP of a scan needs.
+    """Bytes that a reconstruction needs.
 
     Attributes:
-        views: how many are chosen.
-        shape: (rows, cols) of a view, binned.
+        method: with its settings.
+        geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
-        block: of sixteen slices, their views and whatever makes them.
+        weighted: rays have weights.
     """
 
-    views: int
-    shape: tuple[int, int]
+    method: Method
+    geometry: Geometry
     raw: int
-    block: int
+    weighted: bool
+
+    @classmethod
+    def of(cls, method: Method, views: int, shape: tuple[int, int], itemsize: int) -> Needs:
+        """Before any frame is read: of so many views [row, col] of pixels of `itemsize` bytes."""
+        alike = Geometry.parallel(np.linspace(0, math.pi, views, endpoint=False), shape)
+        return cls(method, alike, views * math.prod(shape) * itemsize, not method.traits.direct)
+
+    @property
+    def rows(self) -> int:
+        return self.geometry.detector_shape[0]
 
     @property
     def line_integrals(self) -> int:
-        return 4 * self.views * self.shape[0] * self.shape[1]
+        return 4 * self.geometry.n_views * math.prod(self.geometry.detector_shape)
 
     @property
     def volume(self) -> int:
-        return 4 * self.shape[0] * self.shape[1] ** 2
+        return 4 * math.prod(Grid.matching(self.geometry).shape)
 
     @property
     def at_once(self) -> int:
         """With everything in memory."""
-        return self.raw + self.line_integrals + self.volume + self.block
+        return self.raw + self.line_integrals + self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
 
     @property
     def view(self) -> int:
         """While one view is corrected."""
-        return self.raw // self.views + _COPIES * self.line_integrals // self.views
+        return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
+
+    def slab(self, height: int) -> int:
+        """A slab of so many slices of its own, with its views and weights; figures of the volume need less."""
+        seen = min(height + 2 * self.method.traits.halo, self.rows)
+        part = self.geometry.rows(0, seen)
+        rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
+        return rays + self._of_share(seen).memory(part, self._grid(seen), self.weighted)
+
+    @property
+    def figures(self) -> int:
+        """The figures of merit of a volume on disk, beyond what is taken as part of the program; FBP needs less."""
+        odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
+        found = min(self.volume // 4, _REGIONS) + max(odd, unexplained_memory(self.geometry))
+        return found if found > _ASIDE else 0
+
+    @property
+    def least(self) -> int:
+        """The least memory that suffices."""
+        return max(self.slab(_ROWS), self.view, self.figures)
+
+    def height(self, memory: int) -> int:
+        """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
+        for count in range(1, self.rows // _ROWS + 2):
+            height = math.ceil(self.rows / count / _ROWS) * _ROWS
+            if self.slab(height) <= memory:
+                return height
+        return _ROWS
+
+    def _grid(self, rows: int) -> Grid:
+        cols = self.geometry.detector_shape[1]
+        return Grid((rows, cols, cols), self.geometry.sample_pitch)
+
+    def _of_share(self, rows: int) -> Method:
+        return of_share(self.method, rows / self.rows)
+
+
+def of_share(method: Method, share: float) -> Method:
+    """The method for a part of the volume: as many Gaussians and seconds as belong to it."""
+    if not isinstance(method, R2):
+        return method
+    count = method.gaussians
+    if isinstance(count, int):
+        count = max(1, round(share * count))
+    return replace(method, gaussians=count, seconds=None if method.seconds is None else share * method.seconds)
 
 
 def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
-    """What FBP of the views chosen needs, before any frame is read.
+    """What a reconstruction of the views chosen needs, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
@@ -78,19 +144,19 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     rows, frames = rows_of(source, selection), np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     views = choose_views(source, frames, selection).size
     shape = (rows.stop - rows.start) // selection.binning, source.shape[1] // selection.binning
-    itemsize = source.dtype.itemsize if selection.binning == 1 else 4
-    return Needs(views, shape, views * shape[0] * shape[1] * itemsize, fbp_memory(views, shape[1]))
+    return Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4)
 
 
 def spill_of(
     source: ScanSource, options: ReconOptions, told: Callable[[int, int], None], warn: Callable[[str], None]
 ) -> Spill | None:
-    """Where the views go if they do not fit into the memory; None where they do, and for a cone.
+    """Where the views go if they do not fit into the memory; None where they do, and where slabs are not possible.
 
     Raises:
-        DataError: sixteen slices do not fit, or the disk is too full.
+        DataError: the smallest slab does not fit, or the disk is too full.
+        ConfigError: an option needs everything in memory.
     """
-    if not isinstance(options.method, Fbp) or cone_of(source, options.selection) is not None:
+    if cone_of(source, options.selection) is not None:
         return None
     try:
         needs = needs_of(source, options)
@@ -99,26 +165,48 @@ def spill_of(
     memory = round(SHARE * free_memory()) if options.memory is None else options.memory
     if needs.at_once <= memory:
         return None
-    if needs.block + needs.view > memory:
-        raise DataError(
-            f"{source.path}: FBP of sixteen slices of {needs.views} views of {needs.shape[1]} columns takes "
-            f"{size(needs.block + needs.view)} of memory, {size(memory)} may be used. Give --memory "
-            f"{math.ceil((needs.block + needs.view) / 1e6)}M if there is as much, or --bin "
-            f"{2 * options.selection.binning}. "
-            "Nothing was written."
-        )
-    batch = max(1, int(min(_BATCH * memory, memory - needs.block) / needs.view))
+    _refuse_whole(source, options, needs, memory)
+    refuse_smallest(source, replace(needs, weighted=False), memory, options.selection.binning)
+    batch = max(1, int(_BATCH * memory / needs.view))
     warn(
         f"All at once would take {size(needs.at_once)}, {size(memory)} of memory may be used: views and volume lie on "
         f"the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."
     )
-    return Spill(scratch_array(options.target.output.parent, (needs.views, *needs.shape)), batch, told)
+    shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
+    return Spill(scratch_array(options.target.output.parent, shape), batch, told)
+
+
+def _refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory: int) -> None:
+    whole = {
+        "--budget": options.budget is not None,
+        "--checkpoint and --resume": options.checkpoints.wanted,
+        "--early-stop": isinstance(options.method, R2) and options.method.early_stop,
+    }
+    for option, given in whole.items():
+        if given:
+            raise ConfigError(
+                f"{option} needs the whole scan in memory: {source.path} takes {size(needs.at_once)}, {size(memory)} "
+                f"may be used. Leave it out, or give --bin {2 * options.selection.binning} or --rows."
+            )
+
+
+def refuse_smallest(source: ScanSource, needs: Needs, memory: int, binning: int) -> None:
+    """Raises DataError where the smallest slab does not fit, with what would."""
+    if needs.least <= memory:
+        return
+    cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
+    raise DataError(
+        f"{source.path}: {needs.method.name} of the smallest slab of {needs.geometry.n_views} views of "
+        f"{needs.geometry.detector_shape[1]} columns{' with weights' if needs.weighted else ''} takes "
+        f"{size(needs.least)} of memory, {size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if "
+        f"there is as much, or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+    )
 
 
 def prepare_within(
     source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn
-) -> tuple[PreparedProjections, bool]:
-    """As `prepare_projections`, and whether line integrals lie on disk."""
+) -> tuple[PreparedProjections, list[Slab]]:
+    """As `prepare_projections`, and the slabs if line integrals lie on disk; none: all at once."""
     began = clock.now()
 
     def told(n: int, total: int) -> None:
@@ -130,21 +218,94 @@ def prepare_within(
     def said(text: str) -> None:
         sink(Event("state", clock.now(), {"state": "memory", "message": text}))
 
+    memory = round(SHARE * free_memory()) if options.memory is None else options.memory
     spill = spill_of(source, options, told, said)
-    return prepare_projections(source, options.selection, warn, spill), spill is not None
+    prepared = prepare_projections(source, options.selection, warn, spill)
+    if spill is None:
+        return prepared, []
+    geometry, method = prepared.geometry, options.method
+    if not geometry.is_straight:
+        raise DataError(f"{source.path}: its views are rolled or tilted, which needs the whole scan in memory.")
+    weighted = not method.traits.direct and prepared.ray_factors() is not None
+    needs = Needs(method, geometry, 0, weighted)
+    refuse_smallest(source, needs, memory, options.selection.binning)
+    return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)
 
 
-def fbp_on_disk(
-    method: Fbp, options: ReconOptions, prepared: PreparedProjections, listen: Callable[[Progress], None], clock: Clock
+def in_slabs(
+    run: Run,
+    prepared: PreparedProjections,
+    options: ReconOptions,
+    slabs: Sequence[Slab],
+    control: RunControl,
+    said: Callable[[str], None],
 ) -> Reconstruction:
-    """FBP from views on disk to a volume on disk; the same as in memory to the bit."""
-    geometry, grid, begin = prepared.geometry, Grid.matching(prepared.geometry), clock.now()
-    volume = scratch_array(options.target.output.parent, grid.shape)
+    """A method's volume on disk, slab by slab.
 
-    def told(done: int, of: int) -> None:
-        nan = float("nan")
-        listen(Progress(done, of, clock.now() - begin, nan, nan, 0, geometry.n_views, unit="slices"))
+    The slab with most matter comes first; what it decides by its data the others follow, so that slabs fit together.
+    From slab to slab the volume fades.
 
-    fbp(prepared.projections.data, geometry, grid, method.filter, told, volume)
-    settings = {"filter": method.filter}
-    return Reconstruction(Volume(volume, grid), clock.now() - begin, (), method.name, None, settings)
+    Args:
+        run: reconstructs a slab.
+        control: of all slabs together.
+        said: is told of each slab.
+
+    Raises:
+        DataError: there is no slab to show.
+    """
+    grid, begin = Grid.matching(prepared.geometry), control.now()
+    volume = Volume(scratch_array(options.target.output.parent, grid.shape), grid)
+    first: Reconstruction | None = None
+    decided, done = Decisions(options.seed), 0
+    for n, slab in enumerate(busiest_first(prepared, grid, slabs)):
+        if control.should_stop is not None and control.should_stop():
+            break
+        said(f"Slab {n + 1} of {len(slabs)}: slices {slab.own.start} to {slab.own.stop - 1}.")
+        decide = Decisions(options.seed, decided.made)
+        watch = _of_all(control, begin, done, slab, grid.shape[0])
+        one = replace(control, decide=decide, on_progress=watch)
+        found = _one(run, prepared, options.method, slab, one, volume)
+        done += slab.own.stop - slab.own.start
+        if first is None and found is not None:
+            first, decided = found, decide
+    if first is None:
+        raise DataError("The views are zero everywhere, or the reconstruction was stopped before there was a slab.")
+    settings = {**first.settings, "slabs": len(slabs), "slab_halo": options.method.traits.halo}
+    return replace(first, seconds=control.now() - begin, settings=settings)
+
+
+def _one(
+    run: Run, prepared: PreparedProjections, method: Method, slab: Slab, control: RunControl, volume: Volume
+) -> Reconstruction | None:
+    """Add a slab to the volume. Returns the reconstruction, with that volume; None of views that are zero."""
+    rows, geometry, box = part_of(prepared.geometry, volume.grid, slab.slices)
+    part = prepared.of_rows(rows, geometry)
+    if not part.projections.data.any():
+        return None
+    found = run(of_share(method, box.shape[0] / volume.grid.shape[0]), part, box, control)
+    for k, share in enumerate(slab.share):
+        volume.data[slab.slices.start + k] += share * found.volume.data[k]
+    return replace(found, volume=volume, gaussians=None, checkpoint=None)
+
+
+def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[Slab]:
+    """The slabs, the one whose rows hold most matter before all others."""
+    data = prepared.projections.data
+    some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
+    matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
+    best = int(np.argmax(matter))
+    return [slabs[best], *slabs[:best], *slabs[best + 1 :]]
+
+
+def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: int) -> Callable[[Progress], None] | None:
+    """A listener to one slab that says how far all slices are, where `done` are there before it."""
+    listen = control.on_progress
+    if listen is None:
+        return None
+
+    def watch(progress: Progress) -> None:
+        share = progress.step / progress.steps if progress.steps else 0.0
+        at = done + round((slab.own.stop - slab.own.start) * share)
+        listen(replace(progress, step=at, steps=slices, seconds=control.now() - begin, unit="slices"))
+
+    return watch

@@ -246,11 +246,15 @@ def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
     steps = [max(1, n // _LOOKED_AT) for n in data.shape]
     few = data[:: steps[0], :: steps[1], :: steps[2]]
     low, high = grey_window([few[::2, ::2, ::2]])
-    bright = np.clip(few - (low + high) / 2, 0, high - low)
-    total = float(bright.sum(dtype=np.float64))
+    marginals = [np.zeros(n) for n in few.shape]
+    for k, image in enumerate(few):  # a copy of all slices would be as large as they are
+        bright = np.clip(image - (low + high) / 2, 0, high - low)
+        marginals[0][k] = bright.sum(dtype=np.float64)
+        marginals[1] += bright.sum(axis=1, dtype=np.float64)
+        marginals[2] += bright.sum(axis=0, dtype=np.float64)
+    total = float(marginals[0].sum())
     if total == 0:
         return data.shape[0] // 2, data.shape[1] // 2, data.shape[2] // 2
-    marginals = (bright.sum(axis=axes, dtype=np.float64) for axes in ((1, 2), (0, 2), (0, 1)))
     centre = (step * float(m @ np.arange(m.size)) / total for step, m in zip(steps, marginals, strict=True))
     return tuple(round(at) for at in centre)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +15,20 @@ Mask = NDArray[np.bool_]
 Image = NDArray[np.float32]
 NEIGHBOURS = np.array([(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)])
 Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Mask]]
+
+
+@dataclass(frozen=True, eq=False)
+class RayWeights:
+    """Weights of rays [view, row, col] as a product, of which no more is made than is asked for.
+
+    Attributes:
+        factors: float32 [view, row, col] each, one at least; see numpy.broadcast_to.
+    """
+
+    factors: tuple[Image, ...]
+
+    def __getitem__(self, part: Any) -> Image:
+        return functools.reduce(np.multiply, (factor[part] for factor in self.factors))
 
 
 def plan_fill(mask: Mask) -> Fill:

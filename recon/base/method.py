@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
@@ -76,6 +77,7 @@ class RunControl:
         checkpoint_every: s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.
         now: a clock in s.
+        decide: takes what the method decides by its data, and may follow another run; None: the run decides alone.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -84,6 +86,7 @@ class RunControl:
     checkpoint_every: float = 60.0
     resume: Mapping[str, NDArray[Any]] | None = None
     now: Callable[[], float] = time.perf_counter
+    decide: Decisions | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +138,7 @@ class Traits:
         presets: a quality preset chooses its settings.
         budget: a time budget chooses its settings, see `recon.assess.plans`.
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid.
+        halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
     """
 
     direct: bool = False
@@ -144,6 +148,7 @@ class Traits:
     presets: bool = False
     budget: bool = False
     any_grid: bool = False
+    halo: int = 0
 
 
 @dataclass(frozen=True)
@@ -196,6 +201,10 @@ class Method(Protocol):
             gaussians: how many a fit starts from by default.
             depth: "quick" has fewer trials, and shorter ones.
         """
+        ...
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        """Bytes that `run` takes at most beside the projections, and their weights where they are `weighted`."""
         ...
 
     def work(self, n_views: int, binning: int) -> float:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.decisions import Decisions
 from recon.base.masks import masked
 from recon.base.method import ReconProblem
 from recon.base.noise import noise_level, ring_offsets
@@ -54,8 +55,9 @@ class _FromModel:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled)
         if self.by_content and not isinstance(weight, NoiseBalance):
-            self.iterations = preferred_sweeps(problem, x, weight, self.iterations)
-            heavy = bregman_weight(problem, weight) if self.iterations == SWEEPS else None
+            mu, least = weight, self.iterations
+            self.iterations = problem.decide("sweeps", lambda: preferred_sweeps(problem, x, mu, least))
+            heavy = problem.decide("heavy", lambda: bregman_weight(problem, mu)) if self.iterations == SWEEPS else None
             if heavy is not None:
                 self.iterations = 2 * SWEEPS
                 return bregman(problem, x, heavy, sweeps=SWEEPS, subsets=SUBSETS, tv_steps=TV_STEPS)
@@ -76,6 +78,7 @@ def finish(
     sweeps: int | None = None,
     settings: FitSettings | None = None,
     should_stop: Callable[[], bool] | None = None,
+    decide: Decisions | None = None,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -102,11 +105,12 @@ def finish(
         should_stop: called after each sweep; True ends the iteration. Between the two attempts it keeps the first where
             it explains the views of a parallel beam, which see all matter, better than the fit, else the fit. Of such
             views it keeps the first during the second, too.
+        decide: takes what follows from the whole of the data.
 
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
     """
-    fit = settings or FitSettings()
+    fit, decide = settings or FitSettings(), decide or Decisions(problem.seed)
     projector = Projector(problem.geometry, volume.grid)
     data, known = masked(problem.projections, problem.use.weights)
     model = project(gaussians, problem.geometry, truncation=fit.truncation, model=fit.rays).numpy()
@@ -122,7 +126,7 @@ def finish(
     def refined(views: F32, unmodelled: float | None = None) -> Finished:
         method = _FromModel(SWEEPS if sweeps is None else sweeps, sweeps is None, unmodelled)
         refined = solve(
-            method, projector, views, weight=known, start=start, on_iteration=lambda *_: stopped(), seed=problem.seed
+            method, projector, views, weight=known, start=start, on_iteration=lambda *_: stopped(), decide=decide
         )
         return Finished(refined, method.iterations)
 
@@ -130,10 +134,10 @@ def finish(
     model -= projector.forward(start.data)
     noise, unlike = noise_level(whitened(data, known)), _deviation(model, known)
     found = refined(data)
-    if unlike <= _DIFFERENT * noise:
+    if decide("alike", lambda: unlike <= _DIFFERENT * noise):
         return found
     left = _deviation(data - projector.forward(found.volume.data), known)
-    if left <= min(fitted, EXPLAINED * noise):
+    if decide("explained", lambda: left <= min(fitted, EXPLAINED * noise)):
         return found
     beyond = leaves_the_field(data, problem.geometry)
     bent = beyond or problem.geometry.is_cone  # however well voxels explain the views
@@ -145,7 +149,8 @@ def finish(
     other = refined(data, 0.0 if smooth else unlike / noise)
     if stopped() and not bent:  # cut short
         return found
-    return other if _deviation(data - projector.forward(other.volume.data), known) <= _ALIKE * left else found
+    after = _deviation(data - projector.forward(other.volume.data), known)
+    return other if decide("other", lambda: after <= _ALIKE * left) else found
 
 
 def _deviation(left: F32, weights: F32 | None) -> float:

@@ -12,14 +12,16 @@ from recon.assess.plans import PRESETS, Quality
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import PRECISION, Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import Start
+from recon.splatting.initialise import Start, default_count
 from recon.splatting.schedule import DEFAULT_STEPS
 from recon.splatting.settings import FitSettings
 from recon.splatting.stream import Clock, StreamingFit
 from recon.splatting.train import run_fit
+from recon.voxels.voxel_problem import iterative_memory
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
@@ -52,7 +54,7 @@ class R2:
     label: ClassVar[str] = "R²-Gaussian"
     colour: ClassVar[str] = "tab:blue"
     traits: ClassVar[Traits] = Traits(
-        device=True, held_out=True, checkpoints=True, presets=True, budget=True, any_grid=True
+        device=True, held_out=True, checkpoints=True, presets=True, budget=True, any_grid=True, halo=16
     )
 
     steps: int | None = None
@@ -129,6 +131,11 @@ class R2:
         found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
         found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
         return [*found, TrialSettings(PRECISION)]
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or default_count(grid)
+        of_gaussians = 1000 * min(count, math.prod(grid.shape))
+        return of_gaussians + iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)
 
     def work(self, n_views: int, binning: int) -> float:
         count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or 0

@@ -14,7 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Depth, MethodResult, Progress, ReconProblem, RunControl, Traits, TrialSettings
 from recon.base.volume import Grid, Volume
-from recon.voxels.fbp import Filter, fbp
+from recon.voxels.fbp import Filter, fbp, fbp_memory
 from recon.voxels.fdk import fdk
 from recon.voxels.view_weights import covers_the_circle
 
@@ -59,6 +59,10 @@ class Fbp:
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return [TrialSettings("method")]
 
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        views, (rows, cols) = geometry.n_views, geometry.detector_shape
+        return 4 * (math.prod(grid.shape) + 2 * weighted * views * rows * cols) + fbp_memory(views, cols)
+
     def work(self, n_views: int, binning: int) -> float:
         return n_views / binning**3
 
@@ -69,11 +73,12 @@ def direct(
     grid: Grid,
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
+    out: F32 | None = None,
 ) -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone calls `on_block`, and `fdk`."""
+    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone takes `on_block` and `out`, and `fdk`."""
     if geometry.is_cone:
         return fdk(projections, geometry, grid, filter)
-    return fbp(projections, geometry, grid, filter, on_block)
+    return fbp(projections, geometry, grid, filter, on_block, out)
 
 
 def has_direct_method(geometry: Geometry) -> bool:

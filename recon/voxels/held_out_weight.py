@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
@@ -64,9 +65,14 @@ def choose_weight(
     problem: VoxelProblem, start: F32, *, modelled: bool, unmodelled: float | None = None
 ) -> NoiseBalance | float:
     """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`."""
-    balance = NoiseBalance.of(problem, start, modelled, unmodelled)
-    found = preferred_weight(problem, balance.first) if unmodelled is None else None
-    return balance if found is None else found
+
+    def chosen() -> list[float]:
+        balance = NoiseBalance.of(problem, start, modelled, unmodelled)
+        found = preferred_weight(problem, balance.first) if unmodelled is None else None
+        return [balance.first, balance.noise] if found is None else [found]
+
+    first, *noise = problem.decide("weight", chosen)
+    return NoiseBalance(first, noise[0], unmodelled is not None) if noise else first
 
 
 def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
@@ -165,6 +171,7 @@ class _Trial:
                 weight=None if problem.weight is None else cut(problem.weight),
                 rng=np.random.default_rng(0),
                 go_on=lambda *_: True,
+                decide=Decisions(),
             )
 
         seen, unseen = split_views(geometry)

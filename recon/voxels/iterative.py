@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Protocol
+from dataclasses import fields, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.decisions import Decisions
 from recon.base.masks import masked
 from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
@@ -47,7 +48,7 @@ def solve(
     start: Volume | None = None,
     nonnegative: bool = True,
     on_iteration: Callable[[int, float], object] | None = None,
-    seed: int = 0,
+    decide: Decisions | None = None,
 ) -> Volume:
     """Line integrals to a volume on the projector's grid.
 
@@ -62,7 +63,7 @@ def solve(
         on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point
             where its correction was computed: the volume it leaves is better. CGLS, ASD-POCS: of the volume itself.
             The iterations end where it returns something true.
-        seed: of the order of views and subsets.
+        decide: takes what follows from the whole data, and has the seed of the order of views and subsets.
 
     Raises:
         ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
@@ -72,7 +73,8 @@ def solve(
         raise ValueError(f"at least one iteration is needed, got {method.iterations}")
     data, rays = _checked(projector, projections, weight)
     lines = _start(projector, start)
-    units = _Units.of(projector, data, rays)
+    decide = decide or Decisions()
+    units = _Units(*decide("units", lambda: _Units.of(projector, data, rays)))
     inside = units.enter(projector, data, rays, lines)
 
     def go_on(iteration: int, residual: float) -> bool:
@@ -83,8 +85,9 @@ def solve(
         data,
         rays,
         nonnegative,
-        np.random.default_rng(seed),
+        np.random.default_rng(decide.seed),
         go_on,
+        decide,
     )
     found = method.iterate(problem, lines)
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
@@ -107,14 +110,14 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
         return control.should_stop is not None and control.should_stop()
 
     filled, known = masked(problem.projections, problem.use.weights)
+    decide = control.decide or Decisions(problem.seed)
     projector = Projector(geometry, problem.grid)
-    volume = solve(method, projector, filled, weight=known, on_iteration=report, seed=problem.seed)
+    volume = solve(method, projector, filled, weight=known, on_iteration=report, decide=decide)
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     return MethodResult(volume, {**settings, "seed": problem.seed}, tuple(history))
 
 
-@dataclass(frozen=True)
-class _Units:
+class _Units(NamedTuple):
     """Powers of two near the lengths, line integrals and weights at hand: to change to them rounds nothing."""
 
     length: int

@@ -93,17 +93,18 @@ class NoiseBalance:
         first_weight = share * (1 + (_KNOWN_BEFORE * (unmodelled or 0.0)) ** 2)
         return cls(first_weight, noise * _by_views(problem.projector.geometry), unmodelled is not None)
 
-    def after_sweep(self, residual: F32) -> None:
-        """Adapt the weight to the residual (some views [view, col, row], whitened)."""
+    def after_sweep(self, residual: F32) -> float:
+        """Adapt the weight to the residual (some views [view, col, row], whitened), and return it."""
         self._sweeps += 1
         deviation = median_deviation(residual)
         if not (deviation > 0 and self.noise > 0):
-            return
+            return self.value
         self._least = min(self._least, deviation / self.noise)
         factor = float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
         if self._sweeps >= _SETTLED and not self.counted and self._least > EXPLAINED:
             factor = min(1 + _FOUND**2 * (self._least**2 - EXPLAINED**2), _MOST_BY_FOUND)
         self.value = self.first * factor
+        return self.value
 
 
 def _by_views(geometry: Geometry) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
 from recon.base.geometry import Geometry
+from recon.base.masks import RayWeights
 from recon.base.noise import median_deviation
-from recon.base.volume import Volume
+from recon.base.slabs import part_of
+from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
 
 F32 = NDArray[np.float32]
@@ -20,6 +23,8 @@ LIMIT = 12.0
 """Standard deviations of what is usual at a place: three clean real scans stay below 9.4 (docs/exploration.md)."""
 
 _CELLS = 128  # columns of cells, at least, where the detector has so many pixels
+_BLUR = 4  # pixels that a blur by one reaches
+_BAND, _TOGETHER = 16, 32  # rows that are projected together; views that are compared together
 _BROAD = 3  # cells a side, over which a difference is averaged
 _AROUND, _BESIDE = 12, 3  # views on either side that say what is usual, without so many next to the one that is judged
 _OUTLIER = 3.0  # times the median of these, which one of them may add
@@ -45,7 +50,11 @@ class OddView:
 
 
 def odd_views(
-    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None = None, limit: float = LIMIT
+    volume: Volume,
+    projections: F32,
+    geometry: Geometry,
+    weights: F32 | RayWeights | None = None,
+    limit: float = LIMIT,
 ) -> tuple[OddView, ...]:
     """Views in which something was in the beam, or the sample was elsewhere, for few views: p - A x, seen by place.
 
@@ -67,16 +76,13 @@ def odd_views(
     if n < _LEAST_VIEWS:
         return ()
     order = np.argsort(geometry.angles, kind="stable")
-    rows, cols = geometry.detector_shape
-    side = max(1, min(cols // _CELLS, rows))
-    looks = (_difference(volume, projections, geometry, weights, int(i), side) for i in order)
-    differences, edges = (np.stack(each) for each in zip(*looks, strict=True))
-    squares = differences**2
+    side = _side(geometry)
+    differences, edges = (each[order] for each in _differences(volume, projections, geometry, weights, side))
     found = []
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
         near = [k for k in range(first, first + _LEAST_VIEWS) if abs(k - place) > _BESIDE]
-        around = squares[near]
+        around = differences[near] ** 2
         usual = np.minimum(around, _OUTLIER**2 * (1 + np.median(around, axis=0))).mean(axis=0)
         score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD) + edges[place] ** 2, 1))
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
@@ -89,32 +95,84 @@ def odd_views(
     return tuple(sorted(found, key=lambda odd: odd.view))
 
 
-def _difference(
-    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None, view: int, side: int
+def odd_views_memory(geometry: Geometry) -> int:
+    """Bytes that `odd_views` takes beside projections and volume, about."""
+    views, (rows, cols) = geometry.n_views, geometry.detector_shape
+    side, height = _side(geometry), min(_band(geometry), rows)
+    band = (height + 2 * _BLUR) * cols * (cols + 2 * views + 8 * _TOGETHER)
+    return 4 * (band + 7 * views * (rows // side) * (cols // side))
+
+
+def _side(geometry: Geometry) -> int:
+    rows, cols = geometry.detector_shape
+    return max(1, min(cols // _CELLS, rows))
+
+
+def _band(geometry: Geometry) -> int:
+    """Rows that are projected together: whole cells."""
+    return _side(geometry) * max(1, _BAND // _side(geometry))
+
+
+def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slice, F32, F32]]:
+    """Views, rows, the volume's projection [view, row, col] there and its sharp part: in bands if rows are slices."""
+    rows, band = geometry.detector_shape[0], _band(geometry)
+    shifted = geometry.is_cone or bool(geometry.shifts[:, 1].any())
+    if shifted or volume.grid != Grid.matching(geometry):
+        for view in range(geometry.n_views):
+            model = project(volume, geometry.select(np.array([view])))
+            yield slice(view, view + 1), slice(0, rows), model, _sharp(model)
+        return
+    for first in range(0, rows, band):
+        part = slice(first, min(first + band, rows))
+        around = slice(max(first - _BLUR, 0), min(part.stop + _BLUR, rows))
+        _, views, grid = part_of(geometry, volume.grid, around)
+        every = project(Volume(volume.data[around], grid), views)
+        own = slice(first - around.start, part.stop - around.start)
+        for view in range(0, geometry.n_views, _TOGETHER):
+            models = every[view : view + _TOGETHER]
+            yield slice(view, view + _TOGETHER), part, models[:, own], _sharp(models)[:, own]
+
+
+def _sharp(models: F32) -> F32:
+    """What a blur by a pixel takes from projections [view, row, col]."""
+    return np.abs(models - gaussian_filter(models, (0, 1, 1), truncate=_BLUR))
+
+
+def _differences(
+    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | RayWeights | None, side: int
 ) -> tuple[F32, F32]:
-    """Of one view from the volume, averaged over cells, in standard deviations of noise; what edges explain of it."""
-    measured = projections[view]
-    rendered = project(volume, geometry.select(np.array([view])))[0]
-    left = measured - rendered
-    known = np.ones_like(left) if weights is None else (weights[view] > 0).astype(np.float32)
-    light = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
-    cells, lit = _cells(left * light, side), _cells(known, side)
-    third = np.diff(_cells(measured * light, side), 3, axis=1)  # of the view: what is finest in the sample counts too
-    noise = median_deviation(third) / math.sqrt(20.0)
-    if not lit.any() or not noise > 0:
-        return np.zeros_like(cells), np.zeros_like(cells)
-    common = float(np.median(_cells(left * known, side)[lit > 0]))
-    cells -= np.float32(common) * _cells(light, side)
-    sharp = _cells(np.abs(rendered - gaussian_filter(rendered, 1.0)) * light, side)
-    # Sums over the cells that are there and lit, by their own noise: there are fewer at an edge, and of a single row.
-    there = uniform_filter(lit, _BROAD, mode="constant")
-    scale = np.divide(_BROAD / noise, np.sqrt(there), out=np.zeros_like(there), where=there > 0)
-    difference, edges = (uniform_filter(each, _BROAD, mode="constant") * scale for each in (cells, _SHARP * sharp))
-    return difference.astype(np.float32), edges.astype(np.float32)
+    """[view, cell, cell] each, averaged over cells, in standard deviations of noise: of the views from the volume, and
+    what edges explain of that."""
+    rows, cols = (n // side for n in geometry.detector_shape)
+    # Means over cells: of the difference in light, what edges explain of it, the pixels that are known, the view in
+    # light, the light, and the difference.
+    cells, edges, lit, seen, light, left = (np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6))
+    for views, part, model, sharp in _projected(volume, geometry):
+        measured = projections[views, part]
+        difference = measured - model
+        known = np.ones_like(model) if weights is None else (weights[views, part] > 0).astype(np.float32)
+        bright = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
+        there = views, slice(part.start // side, part.stop // side)
+        cells[there], lit[there] = _cells(difference * bright, side), _cells(known, side)
+        seen[there], light[there] = _cells(measured * bright, side), _cells(bright, side)
+        left[there], edges[there] = _cells(difference * known, side), _cells(sharp * bright, side)
+    for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
+        third = np.diff(seen[view], 3, axis=1)  # of the view: what is finest in the sample counts too
+        noise = median_deviation(third) / math.sqrt(20.0)
+        if not lit[view].any() or not noise > 0:
+            cell[...], edge[...] = 0, 0
+            continue
+        cell -= np.float32(np.median(left[view][lit[view] > 0])) * light[view]
+        # Sums over the cells that are there and lit, by their own noise: fewer at an edge, and of a single row.
+        there = uniform_filter(lit[view], _BROAD, mode="constant")
+        scale = np.divide(_BROAD / noise, np.sqrt(there), out=np.zeros_like(there), where=there > 0)
+        cell[...] = uniform_filter(cell, _BROAD, mode="constant") * scale
+        edge[...] = uniform_filter(_SHARP * edge, _BROAD, mode="constant") * scale
+    return cells, edges
 
 
-def _cells(image: F32, side: int) -> F32:
+def _cells(images: F32, side: int) -> F32:
     """Means of squares of pixels; rows and columns left over at the ends count for nothing."""
-    rows, cols = (n // side for n in image.shape)
-    whole = image[: rows * side, : cols * side]
-    return np.asarray(whole.reshape(rows, side, cols, side).mean(axis=(1, 3)), np.float32)
+    rows, cols = (n // side for n in images.shape[1:])
+    whole = images[:, : rows * side, : cols * side]
+    return np.asarray(whole.reshape(-1, rows, side, cols, side).mean(axis=(2, 4)), np.float32)

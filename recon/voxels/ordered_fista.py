@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ def ordered_fista(
     projectors = [projector.subset(views) if count > 1 else projector for views in parts]
     step = 1 / _curvature(problem, projectors, parts)
     prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, tv_steps)
-    gradient, ahead, scale = np.empty_like(x), Momentum(x), problem.scale
+    gradient, ahead, scale = np.empty_like(x), Momentum(x, problem.decide), problem.scale
     for k in range(sweeps):
         error, seen = 0.0, []
         for at, s in enumerate(problem.rng.permutation(count)):
@@ -71,7 +72,7 @@ def ordered_fista(
             if at + 1 < count:
                 ahead(x)
         if isinstance(weight, NoiseBalance):
-            weight.after_sweep(np.concatenate(seen))
+            weight.value = problem.decide("balance", partial(weight.after_sweep, np.concatenate(seen)))
         if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == sweeps:
             break
         ahead(x)

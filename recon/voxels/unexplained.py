@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, gaussian_filter
 
 from recon.base.geometry import Geometry
+from recon.base.masks import RayWeights
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
-from recon.voxels.fbp import fbp
+from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
 
 F32 = NDArray[np.float32]
@@ -49,7 +50,7 @@ def unexplained(
     projections: F32,
     geometry: Geometry,
     rng: np.random.Generator,
-    weights: F32 | None = None,
+    weights: F32 | RayWeights | None = None,
 ) -> Unexplained | None:
     """Filtered back-projection of the residual p - A x, over the noise that the same views have with random signs.
 
@@ -65,11 +66,10 @@ def unexplained(
     Returns:
         None for cones, rolled or tilted views, fewer than 16 views, other slices, and where there is no matter.
     """
-    rows, cols = geometry.detector_shape
-    same = volume.grid == Grid.matching(geometry)
+    rows, same = geometry.detector_shape[0], volume.grid == Grid.matching(geometry)
     if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
         return None
-    n = min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
+    n = _looked_at(geometry)
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(rows) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), rows - n)
@@ -96,6 +96,20 @@ def unexplained(
     noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
     significance = np.divide(found, noise, out=np.zeros_like(found), where=noise > 0)
     return Unexplained(float(np.mean(np.abs(significance[matter]) > _SIGMAS)), first, significance)
+
+
+def unexplained_memory(geometry: Geometry) -> int:
+    """Bytes that `unexplained` takes beside projections and volume, about."""
+    n, views, cols = _looked_at(geometry), geometry.n_views, geometry.detector_shape[1]
+    slices = (1 + _FLIPS) * n
+    gridded = is_gridded(replace(geometry, detector_shape=(slices, cols)), Grid((slices, cols, cols)), "hann")
+    return 4 * n * cols * (13 * cols + 8 * views) + (fbp_memory(views, cols) if gridded else 80 * views * cols)
+
+
+def _looked_at(geometry: Geometry) -> int:
+    """Rows."""
+    rows, cols = geometry.detector_shape
+    return min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
 
 
 def _smoothed(images: F32) -> F32:

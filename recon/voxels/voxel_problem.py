@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import TrialSettings
+from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.fbp import Filter
+from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.sweeps import Sweeps
 
@@ -30,6 +33,7 @@ class VoxelProblem:
         nonnegative: voxels below zero are clipped.
         rng: for the order of views and subsets.
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
+        decide: takes what follows from sums over the whole volume or all rays.
     """
 
     projector: Projector
@@ -38,6 +42,7 @@ class VoxelProblem:
     nonnegative: bool
     rng: np.random.Generator
     go_on: Callable[[int, float], bool]
+    decide: Decisions = field(default_factory=Decisions)
 
     @property
     def scale(self) -> float:
@@ -81,14 +86,15 @@ class Momentum:
     O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes.
     """
 
-    def __init__(self, start: F32) -> None:
+    def __init__(self, start: F32, decide: Decisions) -> None:
+        self._decide = decide
         self._last, self._from, self._t = start.copy(), start.copy(), 1.0
 
     def __call__(self, x: F32) -> None:
         """From the point x that a step has reached to the one where the next step starts, in place."""
         combine(1.0, self._from, -1.0, x, self._from)  # back along the step
         combine(1.0, x, -1.0, self._last, self._last)  # from the last point reached to this one
-        if dot(self._from, self._last) > 0:
+        if self._decide("restart", lambda: dot(self._from, self._last) > 0):
             self._t = 1.0
         after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
         change, self._last = self._last, self._from
@@ -118,6 +124,19 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6
             return math.inf  # no ray meets the box
         x = product / product.max()
     return bound
+
+
+def iterative_memory(
+    geometry: Geometry, grid: Grid, volumes: float, rays: float, weights: float, *, filtered: bool = False
+) -> int:
+    """Bytes of so many volumes, copies of the projections and, of those, of their weights.
+
+    Args:
+        filtered: the method makes a filtered back-projection, too.
+    """
+    n_rays = geometry.n_views * math.prod(geometry.detector_shape)
+    beside = fbp_memory(geometry.n_views, geometry.detector_shape[1]) if filtered else 0
+    return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside
 
 
 def iteration_trials(numbers: Sequence[int]) -> list[TrialSettings]:

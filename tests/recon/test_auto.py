@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon.auto import Auto, Score, best_of
+from recon.base.decisions import Decisions
 from recon.base.method import MethodResult, ReconProblem, RunControl
 from recon.base.volume import Volume
 from recon.voxels.direct import Fbp
@@ -57,6 +58,13 @@ def test_it_takes_the_method_that_predicts_unseen_views_best_and_says_so(data: F
     assert found.settings["rows"] == 40  # the whole scan in the end
     assert found.settings["chosen_method"] == "fbp"
     assert "held out, rows " in found.settings["chosen_because"]
+
+
+def test_another_slab_takes_the_method_that_the_first_one_chose(data: F32) -> None:
+    auto, first = Auto((Scaled(factor=0.5), Scaled(factor=1.0))), Decisions()
+    recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=first))
+    control = recon.RunControl(decide=Decisions(0, first.made))
+    assert recon.reconstruct(0.5 * data, VIEWS, auto, control=control).settings["factor"] == 1.0  # alone it is 0.5
 
 
 def test_a_blurred_volume_is_not_preferred_to_a_sharp_one(data: F32, truth: F32) -> None:

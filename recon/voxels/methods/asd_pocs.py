@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.geometry import Geometry
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import difference_weights
-from recon.voxels.voxel_problem import VoxelProblem, density_unit, iteration_trials
+from recon.voxels.voxel_problem import VoxelProblem, density_unit, iteration_trials, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -38,7 +41,7 @@ class AsdPocs:
     name: ClassVar[str] = "asd-pocs"
     label: ClassVar[str] = "ASD-POCS"
     colour: ClassVar[str] = "tab:purple"
-    traits: ClassVar[Traits] = Traits()
+    traits: ClassVar[Traits] = Traits(halo=8)
 
     iterations: int = 10
     relaxation: float = 1.0
@@ -54,11 +57,11 @@ class AsdPocs:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-        projector = problem.projector
+        projector, decide = problem.projector, problem.decide
         sweeps = problem.single_views()
         weights = difference_weights(projector.grid)
         scale = problem.scale
-        goal = self.goal if self.goal is not None else 0.15 * _baseline(problem)
+        goal = self.goal if self.goal is not None else decide("goal", lambda: 0.15 * _baseline(problem))
         before, slope = np.empty_like(x), np.empty_like(x)
         step = 0.0
         for k in range(self.iterations):
@@ -73,14 +76,16 @@ class AsdPocs:
             if not problem.go_on(k + 1, error) or k + 1 == self.iterations:
                 break  # the last thing done to the volume is to fit the data, as published
             before[...] = x
-            smoothing = 1e-4 * density_unit(x)
+            smoothing = 1e-4 * decide("unit", partial(density_unit, x))
             for _ in range(self.tv_steps if smoothing > 0 else 0):
                 norm = tv_cpu.gradient(x, smoothing, weights, slope)
-                if norm == 0:
+                pace = decide("pace", partial(_share, step, norm))
+                if pace == 0:
                     break
-                combine(1.0, x, -step / norm, slope, x)
+                combine(1.0, x, -pace, slope, x)
             combine(1.0, x, -1.0, before, before)
-            if math.sqrt(dot(before, before)) > self.ratio * swept and error > goal:
+            undone = math.sqrt(dot(before, before)) > self.ratio * swept
+            if decide("shorter", partial(bool, undone and error > goal)):
                 step *= self.alpha_decay
         return x
 
@@ -91,8 +96,15 @@ class AsdPocs:
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return iteration_trials({"quick": (10,), "full": (5, 20, 50)}[depth])
 
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return iterative_memory(geometry, grid, 5.1, 7.8, 4.1 * weighted, filtered=True)
+
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3
+
+
+def _share(step: float, norm: float) -> float:
+    return step / norm if norm > 0 else 0.0
 
 
 def _baseline(problem: VoxelProblem) -> float:

@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from operator import truediv
 from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import VoxelProblem, iteration_trials
+from recon.voxels.voxel_problem import VoxelProblem, iteration_trials, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -40,6 +45,8 @@ class Cgls:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
+        # The directions of other rays with other weights would not do.
+        decide = problem.decide if problem.weight is None else Decisions()
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)
         replace_by_residual(problem.data, residual, None, root)
@@ -52,12 +59,12 @@ class Cgls:
             image = projector.forward_lines(direction)
             if root is not None:
                 image *= root
-            step = gamma / dot(image, image)
+            step = decide("step", partial(truediv, gamma, dot(image, image)))
             combine(1.0, x, step, direction, x)
             combine(1.0, residual, -step, image, residual)
             s = _weighed_adjoint(projector, residual, root, s)
             before, gamma = gamma, dot(s, s)
-            combine(1.0, s, gamma / before, direction, direction)
+            combine(1.0, s, decide("turn", partial(truediv, gamma, before)), direction, direction)
             if not problem.go_on(k + 1, math.sqrt(dot(residual, residual)) / scale):
                 break
         if problem.nonnegative:
@@ -70,6 +77,9 @@ class Cgls:
     @classmethod
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return iteration_trials({"quick": (5, 15), "full": (5, 10, 20, 40)}[depth])
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3

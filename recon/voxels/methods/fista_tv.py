@@ -10,13 +10,21 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.geometry import Geometry
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import ordered_fista
 from recon.voxels.sweeps import interleaved
-from recon.voxels.voxel_problem import VoxelProblem, density_unit, iteration_trials, largest_eigenvalue
+from recon.voxels.voxel_problem import (
+    VoxelProblem,
+    density_unit,
+    iteration_trials,
+    iterative_memory,
+    largest_eigenvalue,
+)
 
 F32 = NDArray[np.float32]
 
@@ -36,7 +44,7 @@ class FistaTv:
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
     colour: ClassVar[str] = "tab:red"
-    traits: ClassVar[Traits] = Traits(budget=True)
+    traits: ClassVar[Traits] = Traits(budget=True, halo=12)
 
     iterations: int = 20
     tv_weight: float | None = None
@@ -62,7 +70,10 @@ class FistaTv:
         if self.tv_weight is None:
             weight = choose_weight(problem, x, modelled=False)
         else:
-            weight = self.tv_weight * density_unit(x) * largest_eigenvalue(projector, problem.weight)
+            share = self.tv_weight
+            weight = problem.decide(
+                "weight", lambda: share * density_unit(x) * largest_eigenvalue(projector, problem.weight)
+            )
         return ordered_fista(
             problem, x, weight, sweeps=self.iterations, subsets=self.subsets, tv_steps=self.tv_steps
         )  # fmt: skip
@@ -73,6 +84,9 @@ class FistaTv:
     @classmethod
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return iteration_trials({"quick": (5, 20), "full": (5, 10, 20, 40)}[depth])
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return iterative_memory(geometry, grid, 7.3, 3.0, 4.8 * weighted, filtered=True)
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3

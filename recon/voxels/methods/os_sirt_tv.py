@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.geometry import Geometry
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
-from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iteration_trials
+from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iteration_trials, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -36,7 +39,7 @@ class OsSirtTv:
     name: ClassVar[str] = "os-sirt-tv"
     label: ClassVar[str] = "OS-SIRT-TV"
     colour: ClassVar[str] = "tab:orange"
-    traits: ClassVar[Traits] = Traits(budget=True)
+    traits: ClassVar[Traits] = Traits(budget=True, halo=20)
 
     iterations: int = 40
     subsets: int = 9
@@ -59,18 +62,18 @@ class OsSirtTv:
         prox = TotalVariationProx(x.shape, weights, problem.nonnegative, self.tv_steps)
         scale = problem.scale
         weight: NoiseBalance | float | None = None
-        ahead = Momentum(x) if self.momentum else None
+        ahead = Momentum(x, problem.decide) if self.momentum else None
         for k in range(self.iterations):
             error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
             if self.tv_weight is None:
                 weight = weight or choose_weight(problem, x, modelled=False)
                 if isinstance(weight, NoiseBalance):
-                    weight.after_sweep(sweeps.residual)
+                    weight.value = problem.decide("balance", partial(weight.after_sweep, sweeps.residual))
                 mu = weight.value if isinstance(weight, NoiseBalance) else weight
-                prox(x, float(mu * sweeps.pace))
+                prox(x, float(mu * problem.decide("pace", lambda: sweeps.pace)))
             else:
                 # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
-                prox(x, self.tv_weight * density_unit(x))
+                prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
             go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
             if not go_on or k + 1 == self.iterations:
                 break
@@ -84,6 +87,9 @@ class OsSirtTv:
     @classmethod
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return iteration_trials({"quick": (5, 15), "full": (5, 10, 20, 40)}[depth])
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return iterative_memory(geometry, grid, 8.1 + 2 * self.momentum, 5.2, 8.2 * weighted, filtered=True)
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3

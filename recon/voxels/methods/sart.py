@@ -10,9 +10,11 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.geometry import Geometry
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
-from recon.voxels.voxel_problem import VoxelProblem, iteration_trials
+from recon.voxels.voxel_problem import VoxelProblem, iteration_trials, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -52,6 +54,9 @@ class Sart:
     @classmethod
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return iteration_trials({"quick": (2, 6), "full": (1, 3, 10, 30)}[depth])
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return iterative_memory(geometry, grid, 3.5, 6.6, 4.1 * weighted)
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3

@@ -10,9 +10,11 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.geometry import Geometry
 from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
-from recon.voxels.voxel_problem import VoxelProblem, iteration_trials
+from recon.voxels.voxel_problem import VoxelProblem, iteration_trials, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -49,6 +51,9 @@ class Sirt:
     @classmethod
     def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
         return iteration_trials({"quick": (20, 60), "full": (10, 30, 100, 300)}[depth])
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return iterative_memory(geometry, grid, 4.1, 3.1, 3.1 * weighted)
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3

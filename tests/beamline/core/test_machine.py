@@ -105,3 +105,11 @@ def test_memory_is_asked_without_loading_what_computes() -> None:
     code = "import sys, beamline.core.machine as m; m.free_memory(); print({'torch', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_a_limit_of_the_first_version_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    groups = pretend(monkeypatch, tmp_path, own="4:memory:/jobs/7\n0::/\n") / "memory/jobs"
+    write(groups / "memory.limit_in_bytes", "3000000\n")
+    write(groups / "memory.usage_in_bytes", "2500000\n")
+    write(groups / "memory.stat", "inactive_file 1\ntotal_inactive_file 400000\n")
+    assert free_memory() == 3_000_000 - 2_500_000 + 400_000

@@ -1,8 +1,9 @@
-"""FBP within a memory: the same volume to the bit, within the memory, with nothing left beside it."""
+"""Slabs within a memory: the same volume, within the memory, with nothing left beside it."""
 
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 
 from beamline.reconstruct.slabs import Needs
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.voxels.fbp import fbp_memory
+from recon.voxels.direct import Fbp
+from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
@@ -82,19 +84,69 @@ def test_no_more_memory_is_taken_than_was_given(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.usefixtures("tall")
+@pytest.mark.parametrize(
+    ("method", "more", "memory", "near"),
+    [
+        ("sirt", ["--iterations", "4"], "20M", 1e-6),
+        ("fista-tv", ["--iterations", "5", "--tv-weight", "0.002"], "24M", 2e-3),
+    ],
+)
+def test_slabs_of_iterative_methods(tmp_path: Path, method: str, more: list[str], memory: str, near: float) -> None:
+    """Rows of SIRT are independent. The weight of total variation is that of the slab with most matter."""
+    for name, given in (("whole.h5", "1G"), ("parts.h5", memory)):
+        result = beamline("recon", "scan.h5", "-m", method, *more, "--no-report", "--memory", given, "-o", name)
+        assert result.exit_code == 0, result.output
+    assert "Slab 2 of" in result.stderr and "slices" in result.stderr
+    whole, parts = (read_reconstruction(Path(name)) for name in ("whole.h5", "parts.h5"))
+    assert int(str(parts.parameters["slabs"])) > 1
+    assert np.abs(parts.volume.data - whole.volume.data).max() < near * whole.volume.data.max()
+    assert parts.metrics.keys() == whole.metrics.keys()
+    assert parts.metrics["residual"] == pytest.approx(whole.metrics["residual"], rel=0.02)
+    assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
+
+
+@pytest.mark.parametrize(("method", "memory", "shape"), [("os-sirt-tv", 44, (320, 96)), ("cgls", 56, (200, 256))])
+def test_slabs_take_no_more_memory_than_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, memory: int, shape: tuple[int, int]
+) -> None:
+    """All that numpy allocates, with the figures of merit; all at once takes three times as much."""
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=shape, axis_col=shape[1] / 2)
+    write_exchange(Path("scan.h5"), scan)
+    options = ("recon", "scan.h5", "-m", method, "--iterations", "2", "--no-report")
+    assert beamline(*options, "--rows", "0:16", "-o", "first.h5").exit_code == 0  # loads and compiles
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        result = beamline(*options, "--memory", f"{memory}M", "-o", "out.h5")
+        peak = tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+    assert result.exit_code == 0 and "lie on the disk" in result.stderr, result.output
+    assert peak < 1e6 * memory
+
+
+@pytest.mark.usefixtures("tall")
 def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
     result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "1M", "-o", "out.h5")
     assert result.exit_code == 5, result.output
     assert "Give --memory 3M if there is as much, or --bin 2" in result.stderr
     assert left(tmp_path) == {"scan.h5"}
-    result = beamline("recon", "scan.h5", "-m", "sirt", "--memory", "1G")
-    assert result.exit_code == 2 and "for -m fbp" in result.stderr
+    result = beamline("recon", "scan.h5", "-m", "os-sirt-tv", "--memory", "3M", "-o", "out.h5")
+    assert result.exit_code == 5 and "os-sirt-tv of the smallest slab" in result.stderr and "-m fbp" in result.stderr
+    result = beamline("recon", "scan.h5", "--budget", "10s", "--memory", "1G")
+    assert result.exit_code == 2 and "does not go with" in result.stderr
+    result = beamline("recon", "scan.h5", "-m", "r2", "--checkpoint", "fit.h5", "--memory", "3M", "-o", "out.h5")
+    assert result.exit_code == 2 and "needs the whole scan in memory" in result.stderr
+    assert left(tmp_path) == {"scan.h5"}
     result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "lots")
     assert result.exit_code == 2 and "such as 8G" in result.stderr
 
 
 def test_what_is_needed_grows_with_the_scan() -> None:
-    full = Needs(1800, (2048, 2048), 1800 * 2048**2 * 2, fbp_memory(1800, 2048))
+    full = Needs.of(Fbp(), 1800, (2048, 2048), 2)
     assert full.line_integrals == 1800 * 2048**2 * 4 and full.volume == 2048**3 * 4
     assert 60e9 < full.at_once < 90e9
-    assert full.block < 3e9
+    assert full.least < 4e9 and full.slab(full.height(8_000_000_000)) < 8e9
+    tv = replace(Needs.of(OsSirtTv(), 1800, (2048, 2048), 2), weighted=False)
+    assert 64 <= tv.height(32_000_000_000) < 256 and tv.slab(tv.height(32_000_000_000)) < 32e9

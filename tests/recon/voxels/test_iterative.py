@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.sparse.linalg import lsqr, svds
 
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.volume import Grid, Volume
@@ -112,7 +113,7 @@ def test_sart_takes_one_view_after_the_other_in_random_order() -> None:
             rows_inverse = np.where(rows > 1e-3 * rows.max(), 1 / np.maximum(rows, 1e-9), 0)
             back = matrices[v].T @ (rows_inverse * (views[v].ravel() - matrices[v] @ x))
             x = np.maximum(x + 0.9**sweep * columns_inverse * back, 0)
-    found = solve(Sart(iterations=2, decay=0.9), projector, views, seed=3)
+    found = solve(Sart(iterations=2, decay=0.9), projector, views, decide=Decisions(3))
     np.testing.assert_allclose(found.data.ravel(), x, atol=2e-5)
 
 

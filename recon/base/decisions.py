@@ -1,0 +1,33 @@
+"""Decisions: numbers that a method takes from its data, kept so that other slabs of the same scan follow them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class Decisions:
+    """What a run decides by its data, by name and in order.
+
+    A weight of total variation, a step or a restart that follows from sums over a whole volume would differ from slab
+    to slab, and show as a seam. So one slab decides, and the others follow: `Decisions(seed, first.made)`. What was not
+    decided before is decided then.
+
+    Attributes:
+        seed: of every random choice.
+        made: so far, by name; plain numbers and lists of them.
+    """
+
+    def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
+        self.seed = seed
+        self.made: dict[str, list[Any]] = {}
+        self._followed = followed or {}
+
+    def __call__(self, name: str, decide: Callable[[], T]) -> T:
+        """The next decision of this name: as it was decided before, else what `decide` returns."""
+        before, made = self._followed.get(name, ()), self.made.setdefault(name, [])
+        made.append(before[len(made)] if len(made) < len(before) else decide())
+        value: T = made[-1]
+        return value

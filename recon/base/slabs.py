@@ -1,0 +1,67 @@
+"""Slabs: slices of a volume that are reconstructed by themselves, from the detector rows of a parallel beam."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+
+_ON_A_ROW = 1e-6  # rows
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A slab, and what a method sees for it.
+
+    Attributes:
+        own: slices of the volume that are its own.
+        slices: these and the halo beside them, which are reconstructed.
+        fade: slices on either side of the edge between two slabs over which one gives way to the other.
+    """
+
+    own: slice
+    slices: slice
+    fade: int
+
+    @property
+    def share(self) -> NDArray[np.float32]:
+        """[slice]: how much of each slice reconstructed is the volume's; those of all slabs add up to 1."""
+        at, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
+        share = np.ones(at.size)
+        if self.slices.start < self.own.start:
+            share *= np.clip((at - self.own.start) / width + 0.5, 0, 1)
+        if self.own.stop < self.slices.stop:
+            share *= np.clip((self.own.stop - at) / width + 0.5, 0, 1)
+        return share.astype(np.float32)
+
+
+def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
+    """Slabs of `height` slices each, the last one of fewer, with a halo wherever there are further slices."""
+    parts = (slice(first, min(first + height, slices)) for first in range(0, slices, height))
+    fade = min(halo, height) // 2
+    return [Slab(own, slice(max(own.start - halo, 0), min(own.stop + halo, slices)), fade) for own in parts]
+
+
+def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geometry, Grid]:
+    """The detector rows that show these slices in any view, the geometry of these rows, and the slices' grid in it.
+
+    Views that are shifted along the axis see further slices at the edges of these rows, which the grid does not hold.
+
+    Args:
+        geometry: a parallel beam, straight.
+        grid: of the whole volume.
+    """
+    z = grid.coordinates()[0][slices] / geometry.pixel_pitch + geometry.axis_row
+    shifts, last = geometry.shifts[:, 1], geometry.detector_shape[0] - 1
+    first = min(max(math.floor(z.min() + shifts.min() + _ON_A_ROW), 0), last)
+    end = min(max(math.ceil(z.max() + shifts.max() - _ON_A_ROW), first), last) + 1
+    views = geometry.rows(first, end)
+    moved = (first + views.axis_row - geometry.axis_row) * geometry.pixel_pitch
+    middle = grid.centre[0] + ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
+    shape, centre = (slices.stop - slices.start, *grid.shape[1:]), (middle - moved, *grid.centre[1:])
+    return slice(first, end), views, replace(grid, shape=shape, centre=centre)

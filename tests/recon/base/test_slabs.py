@@ -1,0 +1,78 @@
+"""Slabs: they cover the volume, and the rows that show them see of the volume what the whole views see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import recon
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.method import Method, RunControl
+from recon.base.slabs import part_of, slabs_of
+from recon.base.volume import Grid
+from recon.voxels.projector import Projector, seen_rays
+
+
+@given(st.integers(1, 200), st.integers(1, 50), st.integers(0, 24))
+def test_shares_of_all_slabs_add_up_to_one(slices: int, height: int, halo: int) -> None:
+    total = np.zeros(slices)
+    for slab in slabs_of(slices, height, halo):
+        assert slab.own.start - slab.slices.start <= halo and slab.share.size == slab.slices.stop - slab.slices.start
+        total[slab.slices] += slab.share
+    np.testing.assert_allclose(total, 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.3])
+@pytest.mark.parametrize("axis_row", [None, 11.25])
+def test_rows_of_a_slab_see_what_whole_views_see(
+    rng: np.random.Generator, shift: float, axis_row: float | None
+) -> None:
+    shifts = np.zeros((6, 2))
+    shifts[::2, 1] = shift
+    angles = np.arange(6) / 2
+    geometry = Geometry.parallel(angles, (24, 20), 0.3, axis_row=axis_row, shifts=shifts)
+    grid = Grid.matching(geometry)
+    volume = rng.random(grid.shape, np.float32)
+    whole = Projector(geometry, grid).forward(volume)
+    for slices in (slice(0, 9), slice(7, 15), slice(20, grid.shape[0])):
+        rows, views, box = part_of(geometry, grid, slices)
+        part = Projector(views, box).forward(np.ascontiguousarray(volume[slices]))
+        inside = seen_rays(views, box)  # rays between the outer slices of the slab
+        assert inside.sum() >= 6 * (box.shape[0] - 2)
+        np.testing.assert_allclose(part[inside], whole[:, rows][inside], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        recon.Sirt(iterations=3),
+        recon.Sart(iterations=2),
+        recon.Cgls(iterations=4),
+        recon.AsdPocs(iterations=3),
+        recon.OsSirtTv(iterations=12),
+        recon.OsSirtTv(iterations=8, tv_weight=0.01, momentum=True),
+        recon.FistaTv(iterations=10),
+        recon.FistaTv(iterations=6, tv_weight=2e-3),
+    ],
+    ids=lambda method: method.name,
+)
+def test_slabs_that_follow_fit_together(method: Method, rng: np.random.Generator) -> None:
+    """Seams below 1e-3 of the peak; the volume in slabs is that of all rows."""
+    geometry = Geometry.parallel(np.arange(36) * np.pi / 36, (60, 40))
+    grid = Grid.matching(geometry)
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    truth = 0.5 * (np.hypot(x, y) < 17) + 0.5 * ((x - 4) ** 2 + y**2 + (z / 2) ** 2 < 64) - 0.3 * (np.abs(z - x) < 1.5)
+    views = Projector(geometry, grid).forward(truth.astype(np.float32))
+    views += rng.normal(0, 0.02 * views.max(), views.shape).astype(np.float32)
+    decide = Decisions(3)
+    whole = recon.reconstruct(views, geometry, method, control=RunControl(decide=decide)).volume.data
+    found = np.zeros_like(whole)
+    for slab in slabs_of(60, 24, method.traits.halo):
+        rows, part, box = part_of(geometry, grid, slab.slices)
+        control = RunControl(decide=Decisions(3, decide.made))
+        volume = recon.reconstruct(views[:, rows], part, method, grid=box, control=control).volume.data
+        found[slab.slices] += slab.share[:, None, None] * volume
+    assert np.abs(found - whole).max() < (1e-3 if method.traits.halo else 1e-6) * whole.max()
