@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -72,6 +73,7 @@ def reconstruct_file(
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
+    options.target.require_room(4 * math.prod(Grid.matching(prepared.geometry).shape))
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -9,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing, remove
+from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
@@ -37,11 +41,28 @@ class OutputPaths:
     replace: bool = False
 
     def refuse_existing(self) -> None:
-        """Raise DataError before any work where a result is in the way."""
+        """Raise DataError before any work where a result is in the way, or its folder cannot be written to."""
         if not self.replace:
             refuse_existing(self.output)
             if self.report is not None:
                 refuse_existing(self.report)
+        try:
+            with tempfile.TemporaryFile(dir=self.output.parent):
+                pass
+        except OSError as error:
+            raise DataError(
+                f"{self.output.parent} cannot be written to ({error.strerror or error}). Name an output elsewhere with "
+                "-o. Nothing was read."
+            ) from error
+
+    def require_room(self, n_bytes: int) -> None:
+        """Raise DataError before the work where the disk has no room for a volume of so many bytes."""
+        free = shutil.disk_usage(self.output.parent).free
+        if n_bytes > free:
+            raise DataError(
+                f"The volume takes {size(n_bytes)}, the disk of {self.output} has {size(free)} free. Free some space, "
+                "name an output elsewhere with -o, or give --bin. Nothing was written."
+            )
 
 
 def write_result(

@@ -100,11 +100,15 @@ class Acquisition:
         except GeneratorExit:  # closed by the caller; no device has failed
             devices_work = True
             raise
+        except (BeamlineError, DeviceError):
+            self._warn_discrepancies()
+            raise
         finally:
             failures = self._make_safe(home if devices_work and not self._stop.aborting else None)
             for error in failures[1:] if all_taken else failures:
                 self._emit("warning", {"message": _in_words(error)})
         if failures:
+            self._warn_discrepancies()
             raise failures[0]
         self._raise_outcome()
 
@@ -257,6 +261,11 @@ class Acquisition:
                 "or reconstruct without them; a longer period_s leaves the camera more time.",
                 self.missing,
             )
+
+    def _warn_discrepancies(self) -> None:
+        """Say what is missing where the scan ends with another error, which would hide it."""
+        if text := self._discrepancies():
+            self._emit("warning", {"message": text.strip()})
 
     def _discrepancies(self) -> str:
         """Sentences on missing, extra and doubtful frames so far, each after a space."""

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -120,6 +120,25 @@ def test_bad_input_is_one_sentence_a_code_and_no_output(folder: Path, case: str,
     assert "Traceback" not in result.output
     assert len([line for line in result.stderr.splitlines() if line.startswith(("beamline:", "Error:"))]) == 1
     assert left(folder) == before
+
+
+def test_a_disk_that_is_too_small_is_told_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(NamedTuple):
+        free: int
+
+    monkeypatch.setattr("beamline.reconstruct.result.shutil.disk_usage", lambda _: Full(2 * 40 * 40 * 4 - 1))
+    result = beamline("recon", "scan.h5", "-m", "fbp")
+    assert result.exit_code == 5
+    assert "The volume takes 12.8 kB, the disk of scan_fbp.h5 has 12.8 kB free" in result.stderr
+    assert "slices" not in result.stderr  # no work was begun
+    assert left(folder) == {"scan.h5"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no folder that nobody can write to")
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(folder: Path) -> None:
+    result = beamline("recon", "scan.h5", "-m", "fbp", "-o", "/proc/out.h5")
+    assert result.exit_code == 5
+    assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
 OTHER_TAKERS = {"--device": "auto, r2", "--budget": "auto, r2, fista-tv, os-sirt-tv"}

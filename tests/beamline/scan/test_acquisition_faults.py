@@ -53,6 +53,15 @@ def test_a_stage_that_stops_short_fails_with_its_own_words() -> None:
     assert_safe(instrument, home=False)
 
 
+def test_an_error_of_a_device_does_not_hide_what_was_lost_before_it() -> None:
+    instrument = FakeInstrument(Faults(lost={5 + 2}, extra_after={5 + 3}, stall_at=8700))
+    run = Run(instrument, instrument.timeline(n=12))
+    assert isinstance(run.error, DeviceError) and "stopped short" in str(run.error)
+    (told,) = [data["message"] for event, data in run.events if event == "warning"]
+    assert told.startswith("1 of 12 projections are missing: 2 (from 30° to 30°). 1 were exposed but never delivered")
+    assert "1 frames came without a trigger" in told
+
+
 def test_a_shutter_that_does_not_open_is_noticed_before_a_frame_is_taken() -> None:
     instrument = FakeInstrument(Faults(stuck_shutter=True))
     run = Run(instrument, instrument.timeline())
