@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,7 +14,7 @@ from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
 from recon.base.kernel import Kernel
-from recon.base.method import Method
+from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting, taking, with_trait
 
 SETTINGS = {
@@ -29,6 +29,7 @@ _TRAITS = {
 }  # fmt: skip
 """Options for methods with a trait, and the trait."""
 
+_ROW_SETTINGS = ("steps", "gaussians", "finish", "iterations", "tv_weight")
 _PLANS = ("budget", "quality")
 _TIMED = ("steps", "seconds", "gaussians")
 _OF_A_FIT = (*_TIMED, "start", "loss", "kernel", "device", "early_stop", "finish", "checkpoint", "resume")
@@ -59,6 +60,28 @@ def method_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
+
+
+def row_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options of methods that hold for every row of a table: how long each works, and from what."""
+    for option in reversed(_OF_ROWS):
+        command = option(command)
+    return command
+
+
+def row_settings(methods: Sequence[str], options: dict[str, Any]) -> dict[str, dict[str, Plain]]:
+    """Settings by method, of the options of `row_options` that were given; takes all of these out of `options`.
+
+    Raises:
+        UsageError: an option that none of the methods takes.
+    """
+    given = {name: value for name in _ROW_SETTINGS if (value := options.pop(name)) is not None}
+    for name in given:
+        if not set(methods) & set(owners := takers(name)):
+            raise click.UsageError(f"{_option(name)} is of {', '.join(owners)}; no row is by one of these.")
+    return {
+        method: {SETTINGS[name]: value for name, value in given.items() if method in takers(name)} for method in methods
+    }
 
 
 def method_with(name: str, options: Mapping[str, Any]) -> Method:
@@ -124,13 +147,32 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
+_STEPS = click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
+    f"{SHORT_STEPS} where the noise of the views hides what more would gain and a finish follows.",
+)
+_GAUSSIANS = click.option("--gaussians", type=click.IntRange(min=1), help="Number of Gaussians at the start.")
+_FINISH = click.option(
+    "--finish",
+    type=click.IntRange(min=0),
+    help="Sweeps on voxels after the fit, which bring back edges, cracks and pores. Default: 8, "
+    "or 16 or 24 where views held out are explained the better; 0: none.",
+)
+_ITERATIONS = click.option(
+    "--iterations",
+    type=click.IntRange(min=1),
+    help="Iterations of an iterative method. Default: depends on the method.",
+)
+_TV_WEIGHT = click.option(
+    "--tv-weight",
+    type=POSITIVE,
+    help="Weight of the total variation, relative to the density of the sample.",
+)
+_OF_ROWS = (_STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
 _OPTIONS = (
-    click.option(
-        "--steps",
-        type=click.IntRange(min=1),
-        help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
-        f"{SHORT_STEPS} where the noise of the views hides what more would gain and a finish follows.",
-    ),
+    _STEPS,
     click.option(
         "--seconds",
         type=POSITIVE,
@@ -147,7 +189,7 @@ _OPTIONS = (
         type=click.Choice(list(PRESETS)),
         help="Preset of steps and Gaussians.",
     ),
-    click.option("--gaussians", type=click.IntRange(min=1), help="Number of Gaussians at the start."),
+    _GAUSSIANS,
     click.option(
         "--start",
         type=click.Choice(get_args(Start)),
@@ -175,12 +217,7 @@ _OPTIONS = (
         is_flag=True,
         help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
     ),
-    click.option(
-        "--finish",
-        type=click.IntRange(min=0),
-        help="Sweeps on voxels after the fit, which bring back edges, cracks and pores. Default: 8, "
-        "or 16 or 24 where views held out are explained the better; 0: none.",
-    ),
+    _FINISH,
     click.option(
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
@@ -192,14 +229,6 @@ _OPTIONS = (
         type=click.Path(path_type=Path, dir_okay=False),
         help="Continue the fit from this checkpoint of the same data and options.",
     ),
-    click.option(
-        "--iterations",
-        type=click.IntRange(min=1),
-        help="Iterations of an iterative method. Default: depends on the method.",
-    ),
-    click.option(
-        "--tv-weight",
-        type=POSITIVE,
-        help="Weight of the total variation, relative to the density of the sample.",
-    ),
+    _ITERATIONS,
+    _TV_WEIGHT,
 )

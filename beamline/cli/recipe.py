@@ -68,7 +68,7 @@ def repeating(ctx: click.Context, argument: Path, output: Path) -> str:
         argument: the file that the command is about.
         output: of this call; the line names another one, as nothing is overwritten.
     """
-    again = output.with_name(f"{output.stem}_again{output.suffix}").name
+    again = f"{output.stem}_again{output.suffix}"
     words = ["beamline", str(ctx.info_name), *_leading(ctx), str(argument.resolve())]
     for option, value in given(ctx).items():
         if option.name in _NOT_REPEATED:

@@ -9,6 +9,7 @@ from typing import Any, get_args
 import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.method_options import row_options, row_settings
 from beamline.cli.options import SEED, json_option
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.cli.selection_options import chosen, selection_options
@@ -39,6 +40,7 @@ from recon.voxels.fbp import Filter
 @click.option(
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use."
 )
+@row_options
 @selection_options
 @click.option(
     "--filter",
@@ -85,13 +87,16 @@ def study(
     the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
+    methods = tuple(dict.fromkeys(methods))
+    settings = row_settings(methods, values)
     source, selection = chosen(file, seed, values)
     options = StudyOptions(
         source=source,
         selection=selection,
         study=STUDIES[which],
         folder=output or Path(f"{file.stem}_{which}"),
-        methods=tuple(dict.fromkeys(methods)),
+        methods=methods,
+        settings=settings,
         filter=ramp,
         truth=truth,
         draws=draws,

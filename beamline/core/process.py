@@ -13,7 +13,10 @@ from enum import Enum, auto
 from types import TracebackType
 from typing import Any, Self, TextIO
 
+import psutil
+
 _POLL = 0.2  # real s between two questions whether the process should stop
+_BEHIND: int = getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", 10)  # which only Windows has
 _LAST_LINES = 5.0  # real s to read what a killed process has left; a child of its own may hold the pipe open
 
 
@@ -39,6 +42,7 @@ class ChildProcess:
         environment: of the process; None: as ours.
         tether: give it a stdin that stays open as long as this process lives, so that it can notice when we die.
         on_end: is called after its last line, in the same thread.
+        behind: it gets less processor time than others (nice 10; Windows: the class below normal).
 
     Raises:
         OSError: the command cannot be started.
@@ -53,6 +57,7 @@ class ChildProcess:
         *,
         tether: bool = False,
         on_end: Callable[[], None] = lambda: None,
+        behind: bool = False,
     ) -> None:
         self._on_line, self._on_end = on_line, on_end
         self._silent_since = time.monotonic()
@@ -68,6 +73,9 @@ class ChildProcess:
             start_new_session=True,  # POSIX
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # Windows
         )
+        if behind:
+            with suppress(psutil.Error):  # it has ended already, or the system does not allow it
+                psutil.Process(self._process.pid).nice(_BEHIND)
         self._reader = threading.Thread(target=self._read, name=f"output of process {self._process.pid}", daemon=True)
         self._reader.start()
 

@@ -120,7 +120,7 @@ class LiveReconstruction:
         self._process: ChildProcess | None = None
         try:
             with log.open("x", encoding="utf-8") as stderr:
-                self._process = ChildProcess(command, stderr, self._pass_on, on_end=self._say_if_early)
+                self._process = ChildProcess(command, stderr, self._pass_on, on_end=self._say_if_early, behind=True)
         except OSError as error:
             message = f"The live reconstruction could not be started ({error}). The scan goes on without it."
             emit("warning", {"message": message})

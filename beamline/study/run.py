@@ -6,9 +6,8 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -50,6 +49,7 @@ class StudyOptions:
         study: what is asked.
         folder: for the results; must not exist.
         methods: names in `recon.methods`.
+        settings: of these methods, by name; methods left out have their own.
         filter: of the FBP of all views that rows are compared with.
         truth: FILE or FILE:first:end to compare with, too.
         draws: how often random views are drawn.
@@ -62,6 +62,7 @@ class StudyOptions:
     study: Study
     folder: Path
     methods: Sequence[str]
+    settings: Mapping[str, Mapping[str, Plain]] = field(default_factory=dict)
     filter: Filter = "shepp-logan"
     truth: str | None = None
     draws: int = 3
@@ -131,7 +132,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
             with named_on_failure(work / "views.npy"):
                 np.save(work / "views.npy", prepared.projections.data)
             del prepared  # from here on the views are in the file alone
-            rig = _Rig(work, geometry, options.seed)
+            rig = _Rig(work, geometry, options.seed, options.settings)
             whole = Row(REFERENCE, np.arange(geometry.n_views)[:, None])
             reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
             if reference is None:
@@ -173,6 +174,9 @@ def _planned(options: StudyOptions, geometry: Geometry, facts: Mapping[str, str]
         + ("truth" if truth else "FBP of all views")
         + "); a smoother volume has more.",
     ]
+    for method, settings in options.settings.items():
+        if settings:
+            notes.append(f"{method}: {', '.join(f'{name} {value}' for name, value in settings.items())}.")
     if truth:
         notes.insert(1, "PSNR truth and SSIM truth are against the truth.")
     return StudyTable(
@@ -192,11 +196,12 @@ class _Rig:
     work: Path
     geometry: Geometry
     seed: int
+    settings: Mapping[str, Mapping[str, Plain]]
 
     def reconstructed(
-        self, row: Row, method: str, settings: Mapping[str, Plain] = MappingProxyType({})
+        self, row: Row, method: str, settings: Mapping[str, Plain] | None = None
     ) -> tuple[F32 | None, Outcome]:
-        """The volume of a row; None where the method failed."""
+        """The volume of a row, by `settings` instead of those of the method; None where the method failed."""
         assert row.groups is not None
         # Opened here and closed with the return: Windows removes no file that is open.
         data, angles = averaged(np.load(self.work / "views.npy", mmap_mode="r"), self.geometry.angles, row.groups)
@@ -206,13 +211,20 @@ class _Rig:
             Data(data, geometry, None, None).save(self.work / "data.npz")
         del data
         kept = self.work / "volume.npy"
-        trial = Trial("method", method, row.n_views, settings=dict(settings))
+        trial = Trial(
+            "method",
+            method,
+            row.n_views,
+            settings=dict(self.settings.get(method, {}) if settings is None else settings),
+        )
         outcome = run_trial(trial, self.work, self.seed, keep=kept)
         return (np.load(kept), outcome) if outcome.status == "done" else (None, outcome)
 
     def compile(self, methods: Sequence[str]) -> None:
         """Compile the kernels of these methods; the folder has the data of a row."""
-        compile_kernels([Trial("method", method, 2) for method in methods], self.work)
+        compile_kernels(
+            [Trial("method", method, 2, settings=dict(self.settings.get(method, {}))) for method in methods], self.work
+        )
 
 
 def _each(

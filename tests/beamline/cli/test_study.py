@@ -83,6 +83,16 @@ def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: 
     assert f"{peak:.2f}" in page.text and any("asks for 360 views" in text for text in page.text)
 
 
+def test_every_method_gets_the_options_that_it_takes(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    methods = ("-m", "r2", "-m", "sirt", "-m", "fbp")
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", *methods, "--steps", "50", "--iterations", "7")
+    assert result.exit_code == 0, result.output
+    settings = {trial.method: trial.settings for trial, _ in seen[1:]}
+    assert settings == {"r2": {"steps": 50}, "sirt": {"iterations": 7}, "fbp": {}}
+    assert "r2: steps 50." in result.stdout and "sirt: iterations 7." in result.stdout
+
+
 def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:
     write_exchange(folder / "many.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 0.5)), shape=(2, 40)))
     result = _beamline("window-average", "many.h5", "--axis", "20.7", "-m", "fbp", "--json")
@@ -144,6 +154,7 @@ def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: p
         (("sector", "scan.h5", "-m", "magic"), 2, "magic"),
         (("sector", "scan.h5", "--truth", "missing.npz"), 2, "missing.npz"),
         (("sector", "scan.h5", "-o", "."), 5, "never overwritten"),
+        (("sector", "scan.h5", "-m", "fbp", "--steps", "5"), 2, "no row is by one of these"),
         (("fixed-views", "scan.h5"), 5, "30 views are too few"),
     ],
 )

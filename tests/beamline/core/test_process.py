@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from beamline.core.process import ChildProcess, Ending, json_object
@@ -137,3 +138,10 @@ def test_a_program_that_is_not_there_is_an_error(tmp_path: Path) -> None:
 )
 def test_only_objects_are_taken_from_lines(line: str, found: dict[str, Any] | None) -> None:
     assert json_object(line) == found
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_a_process_may_stand_behind_all_others(behind: bool) -> None:
+    with ChildProcess([sys.executable, "-c", SLEEPS], sys.stderr, lambda line: None, behind=behind) as process:
+        nice = psutil.Process(process._process.pid).nice()
+        assert (nice != psutil.Process().nice()) == behind
