@@ -152,7 +152,9 @@ def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunCon
         scores.append(Score(i, method, _residuals(volume, judge), partial(_hides, volume, trial)))
         if control.on_progress is not None:
             last = scores[-1].residual
-            control.on_progress(Progress(i + 1, len(methods), control.now() - begin, last, last, 0, n))
+            control.on_progress(
+                Progress(i + 1, len(methods), control.now() - begin, last, last, 0, n, unit="methods tried")
+            )
     if len(scores) < min(2, len(methods)) and stopped():
         return None, "stopped before the choice"
     if not scores:

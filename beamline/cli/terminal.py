@@ -161,7 +161,7 @@ def fit(data: Mapping[str, Any]) -> str:
     """n/N, rate, views, Gaussians (iterations have none), residuals and time left, of a `progress` event of a fit."""
     step, steps = data["step"], data["steps"]
     word = data.get("unit") or ("steps" if data["n_gaussians"] else "iterations")
-    parts = [f"{step}/{steps} {word}"] if steps else []
+    parts = [f"{step}/{steps} {word}"] if steps else [f"{step} {word}"] if data.get("unit") else []
     parts += [f"{data['per_s']:.3g} {word}/s"] if data.get("per_s") else []
     parts += [f"{data['n_views']} views"]
     parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []

@@ -32,7 +32,7 @@ from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.clock import Clock
 from drivers.frame import FrameKind
-from recon.base.method import DataUse, Progress, ReconProblem
+from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
@@ -278,7 +278,9 @@ class ScanFollower:
             data, geometry = prepared.projections.data, prepared.geometry
             use = DataUse(prepared.ray_weights())
             problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
-            volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, stop_latch)
+            say = progress_events(self._sink, self._clock)
+            control = RunControl(stop_latch, say, now=self._clock.now)
+            volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, control)
         settings: dict[str, object] = {
             **asdict(self._fit.settings),
             "finish": sweeps,

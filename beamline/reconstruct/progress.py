@@ -31,7 +31,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
         left = None
         if progress.steps and rate:
             left = (progress.steps - progress.step) / rate
-        elif seconds is not None and not progress.steps:
+        elif seconds is not None and not progress.steps and not progress.unit:
             left = max(0.0, seconds - spent)
         sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress), "per_s": rate, "eta_s": left}))
 

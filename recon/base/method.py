@@ -30,7 +30,7 @@ class Progress:
     """Where a reconstruction stands.
 
     Attributes:
-        step, steps: done and planned, or iterations (0 for a fit without an end, while views still arrive).
+        step, steps: done and planned, or iterations (0: not known, such as of a fit while views still arrive).
         seconds: since the start, by the caller's clock.
         loss: running mean of the loss, in normalised units.
         residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.

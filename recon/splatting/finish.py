@@ -7,7 +7,6 @@ ends, they are in its residual. On voxels a few sweeps over the views bring them
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,14 +15,14 @@ from numpy.typing import NDArray
 
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
-from recon.base.method import ReconProblem
+from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.noise import noise_level, ring_offsets
 from recon.base.volume import Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
-from recon.voxels.held_out_weight import bregman_weight, choose_weight, preferred_sweeps
+from recon.voxels.held_out_weight import bregman_weight, choose_weight, preferred_sweeps, sweeps_by_noise
 from recon.voxels.iterative import solve
 from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
 from recon.voxels.ordered_fista import bregman, ordered_fista
@@ -43,24 +42,55 @@ _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
+class _Watch:
+    """Tells of sweeps, and asks whether to stop; `ended`: the last answer was yes."""
+
+    def __init__(self, control: RunControl, n_views: int) -> None:
+        self._control, self._n_views = control, n_views
+        self._begin, self._trials, self.ended = control.now(), 0, False
+
+    def asked(self) -> bool:
+        self.ended = self._control.should_stop is not None and self._control.should_stop()
+        return self.ended
+
+    def trial(self) -> bool:
+        self._trials += 1
+        return self.sweep(self._trials, 0, "sweeps of trials")
+
+    def sweep(self, number: int, of: int, unit: str = "sweeps on voxels") -> bool:
+        if self._control.on_progress is not None:
+            nan, seconds = math.nan, self._control.now() - self._begin
+            self._control.on_progress(Progress(number, of, seconds, nan, nan, 0, self._n_views, unit=unit))
+        return self.asked()
+
+
 @dataclass
 class _FromModel:
     """The refinement as an iterative method of `recon.voxels.iterative.solve`, which makes as many more sweeps as views
-    held out prefer where `by_content`."""
+    held out prefer where `by_content`, and none where `watch` ends the trials of it."""
 
     iterations: int
     by_content: bool
+    watch: _Watch
     unmodelled: float | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled)
-        if self.by_content and not isinstance(weight, NoiseBalance):
-            mu, least = weight, self.iterations
+        ask, least = self.by_content and not self.watch.ended, self.iterations
+        if ask and self.unmodelled is None and isinstance(weight, NoiseBalance):
+            first = weight.first
+            self.iterations = problem.decide("sweeps", lambda: sweeps_by_noise(problem, x, first, least))
+        elif ask and not isinstance(weight, NoiseBalance):
+            mu = weight
             self.iterations = problem.decide("sweeps", lambda: preferred_sweeps(problem, x, mu, least))
-            heavy = problem.decide("heavy", lambda: bregman_weight(problem, mu)) if self.iterations == SWEEPS else None
+            once = self.iterations > SWEEPS or self.watch.ended
+            heavy = None if once else problem.decide("heavy", lambda: bregman_weight(problem, mu))
             if heavy is not None:
                 self.iterations = 2 * SWEEPS
                 return bregman(problem, x, heavy, sweeps=SWEEPS, subsets=SUBSETS, tv_steps=TV_STEPS)
+        if self.watch.ended:
+            self.iterations = 0
+            return x
         return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
 
 
@@ -77,8 +107,7 @@ def finish(
     problem: ReconProblem,
     sweeps: int | None = None,
     settings: FitSettings | None = None,
-    should_stop: Callable[[], bool] | None = None,
-    decide: Decisions | None = None,
+    control: RunControl | None = None,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -102,15 +131,15 @@ def finish(
         problem: the views that were fitted, without roll and tilt, and the weights of their rays.
         sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and `bregman_weight`.
         settings: of the fit; None: the defaults.
-        should_stop: called after each sweep; True ends the iteration. Between the two attempts it keeps the first where
-            it explains the views of a parallel beam, which see all matter, better than the fit, else the fit. Of such
-            views it keeps the first during the second, too.
-        decide: takes what follows from the whole of the data.
+        control: is told of each sweep, also of those of trials, and asked after it whether to stop. A stop between the
+            two attempts keeps the first where it explains the views of a parallel beam, which see all matter, better
+            than the fit, else the fit. Of such views it keeps the first during the second, too.
 
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
     """
-    fit, decide = settings or FitSettings(), decide or Decisions(problem.seed)
+    fit, control = settings or FitSettings(), control or RunControl()
+    decide = control.decide or Decisions(problem.seed)
     projector = Projector(problem.geometry, volume.grid)
     data, known = masked(problem.projections, problem.use.weights)
     model = project(gaussians, problem.geometry, truncation=fit.truncation, model=fit.rays).numpy()
@@ -120,13 +149,19 @@ def finish(
     data = data - ring_offsets(data - model)
     start = Volume(np.maximum(volume.data, 0), volume.grid)
 
-    def stopped() -> bool:
-        return should_stop is not None and should_stop()
+    watch = _Watch(control, problem.geometry.n_views)
 
     def refined(views: F32, unmodelled: float | None = None) -> Finished:
-        method = _FromModel(SWEEPS if sweeps is None else sweeps, sweeps is None, unmodelled)
+        method = _FromModel(SWEEPS if sweeps is None else sweeps, sweeps is None, watch, unmodelled)
         refined = solve(
-            method, projector, views, weight=known, start=start, on_iteration=lambda *_: stopped(), decide=decide
+            method,
+            projector,
+            views,
+            weight=known,
+            start=start,
+            on_iteration=lambda sweep, _: watch.sweep(sweep, method.iterations),
+            on_trial=watch.trial,
+            decide=decide,
         )
         return Finished(refined, method.iterations)
 
@@ -134,6 +169,8 @@ def finish(
     model -= projector.forward(start.data)
     noise, unlike = noise_level(whitened(data, known)), _deviation(model, known)
     found = refined(data)
+    if found.sweeps == 0:
+        return Finished(volume, 0)
     if decide("alike", lambda: unlike <= _DIFFERENT * noise):
         return found
     left = _deviation(data - projector.forward(found.volume.data), known)
@@ -141,13 +178,13 @@ def finish(
         return found
     beyond = leaves_the_field(data, problem.geometry)
     bent = beyond or problem.geometry.is_cone  # however well voxels explain the views
-    if stopped():
+    if watch.asked():
         return Finished(volume, 0) if bent or left > fitted else found
     # Matter beyond the field is smooth in the views, and explained by the Gaussians; an error of voxels is at edges.
     smooth = noise == 0 or beyond
     data -= model
     other = refined(data, 0.0 if smooth else unlike / noise)
-    if stopped() and not bent:  # cut short
+    if watch.asked() and not bent:  # cut short
         return found
     after = _deviation(data - projector.forward(other.volume.data), known)
     return other if decide("other", lambda: after <= _ALIKE * left) else found

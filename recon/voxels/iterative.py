@@ -48,6 +48,7 @@ def solve(
     start: Volume | None = None,
     nonnegative: bool = True,
     on_iteration: Callable[[int, float], object] | None = None,
+    on_trial: Callable[[], object] | None = None,
     decide: Decisions | None = None,
 ) -> Volume:
     """Line integrals to a volume on the projector's grid.
@@ -63,6 +64,8 @@ def solve(
         on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point
             where its correction was computed: the volume it leaves is better. CGLS, ASD-POCS: of the volume itself.
             The iterations end where it returns something true.
+        on_trial: called after each sweep of a trial, by which a method chooses its weight on some rows; the trials end
+            where it returns something true, and the iterations follow.
         decide: takes what follows from the whole data, and has the seed of the order of views and subsets.
 
     Raises:
@@ -88,6 +91,7 @@ def solve(
         np.random.default_rng(decide.seed),
         go_on,
         decide,
+        lambda: on_trial is None or not on_trial(),
     )
     found = method.iterate(problem, lines)
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
@@ -112,7 +116,9 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     filled, known = masked(problem.projections, problem.use.weights)
     decide = control.decide or Decisions(problem.seed)
     projector = Projector(geometry, problem.grid)
-    volume = solve(method, projector, filled, weight=known, on_iteration=report, decide=decide)
+    volume = solve(
+        method, projector, filled, weight=known, on_iteration=report, on_trial=control.should_stop, decide=decide
+    )
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     return MethodResult(volume, {**settings, "seed": problem.seed}, tuple(history))
 

@@ -34,6 +34,7 @@ class VoxelProblem:
         rng: for the order of views and subsets.
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
         decide: takes what follows from sums over the whole volume or all rays.
+        trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
     """
 
     projector: Projector
@@ -43,6 +44,7 @@ class VoxelProblem:
     rng: np.random.Generator
     go_on: Callable[[int, float], bool]
     decide: Decisions = field(default_factory=Decisions)
+    trial_goes_on: Callable[[], bool] = lambda: True
 
     @property
     def scale(self) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
@@ -23,6 +23,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -75,15 +76,40 @@ def test_more_sweeps_or_a_second_run_are_made_where_no_number_is_given(
     looks, g = Mock(return_value=False), _blob()
     data = project(g, VIEWS).numpy()
     data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)  # so that one attempt is enough
-    found = finish(_of(g), g, _problem(data), sweeps, should_stop=looks)
+    found = finish(_of(g), g, _problem(data), sweeps, control=RunControl(looks))
     assert looks.call_count == found.sweeps == made
+
+
+@pytest.mark.parametrize(("sweeps", "made"), [(None, 3), (2, 2)])
+def test_where_the_weight_follows_the_noise_views_held_out_are_asked_for_more_sweeps_too(
+    sweeps: int | None, made: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    balance = NoiseBalance(first=1.0, noise=1.0)
+    monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: balance)
+    monkeypatch.setattr("recon.splatting.finish.sweeps_by_noise", lambda *_: 3)
+    g = _blob()
+    data = project(g, VIEWS).numpy()
+    data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)
+    assert finish(_of(g), g, _problem(data), sweeps).sweeps == made
+
+
+def test_a_stop_during_the_trials_of_a_weight_keeps_the_fit() -> None:
+    g, told = _blob(), list[Progress]()
+    data = project(g, VIEWS).numpy()
+    data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)
+    fitted = _of(g)
+    found = finish(fitted, g, _problem(data), control=RunControl(lambda: len(told) >= 3, told.append))
+    assert found.sweeps == 0
+    np.testing.assert_array_equal(found.volume.data, fitted.data)
+    assert [(p.step, p.steps, p.unit) for p in told] == [(n, 0, "sweeps of trials") for n in (1, 2, 3)]
 
 
 def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
     g, missing = _blob(8.0), _box()
     data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)  # no noise: voxels explain all but that
-    looks = iter([False, False, False, True])  # three sweeps, then between
-    once = finish(_of(g), g, _problem(data), 3, should_stop=lambda: next(looks)).volume
+    told, looks = list[Progress](), iter([False, True])  # after the third sweep, then between
+    stop = RunControl(lambda: bool(told) and told[-1].step == told[-1].steps and next(looks), told.append)
+    once = finish(_of(g), g, _problem(data), 3, control=stop).volume
     assert next(looks, None) is None
     truth = _of(g).data + missing
     assert psnr(truth, once.data) > psnr(truth, _of(g).data) + 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from unittest.mock import Mock
 
@@ -24,6 +25,7 @@ from recon.voxels.held_out_weight import (
     preferred_weight,
     slab_of,
     split_views,
+    sweeps_by_noise,
 )
 from recon.voxels.iterative import solve
 from recon.voxels.noise_balance import NoiseBalance
@@ -143,24 +145,36 @@ def _views() -> Mock:
 class _Asked:
     """An iteration that only asks how many sweeps views held out prefer."""
 
+    ask: Callable[[VoxelProblem, F32, float, int], int]
     iterations: int = 4
     sweeps: int = 0
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        self.sweeps = preferred_sweeps(problem, x, NoiseBalance.of(problem, x, True).first / 4, self.iterations)
+        self.sweeps = self.ask(problem, x, NoiseBalance.of(problem, x, True).first / 4, self.iterations)
         return x
 
 
+@pytest.mark.parametrize("ask", [preferred_sweeps, sweeps_by_noise])
 @pytest.mark.parametrize(("blur", "slices", "more"), [(2.0, ROWS, True), (0.0, ROWS, False), (2.0, ROWS // 2, False)])
 def test_more_sweeps_are_made_from_a_volume_that_lacks_detail(
-    foam: tuple[F32, Geometry, Grid, F32], blur: float, slices: int, more: bool
+    foam: tuple[F32, Geometry, Grid, F32],
+    blur: float,
+    slices: int,
+    more: bool,
+    ask: Callable[[VoxelProblem, F32, float, int], int],
 ) -> None:
     """And none from the truth, which they can only spoil, nor where slices are not those of rows."""
     data, geometry, grid, truth = foam
     start = gaussian_filter(truth, blur).reshape(slices, -1, COLS, COLS).mean(axis=1)
     fewer = replace(grid, shape=(slices, COLS, COLS), slice_pitch=ROWS / slices)
-    solve(asked := _Asked(), Projector(geometry, fewer), data, start=Volume(start, fewer))
+    solve(asked := _Asked(ask), Projector(geometry, fewer), data, start=Volume(start, fewer))
     assert (asked.sweeps > 4) == more and asked.sweeps in (4, 8, 12)
+
+
+def test_a_cone_and_few_views_are_not_asked_for_more_sweeps() -> None:
+    few, cone = Geometry.parallel(np.linspace(0, 3, 15), (4, 8)), Geometry.cone(np.linspace(0, 6, 40), (4, 8), 1, 9, 20)
+    for geometry in (few, cone):
+        assert sweeps_by_noise(Mock(**{"projector.geometry": geometry}), np.zeros(0, np.float32), 1.0, 8) == 8
 
 
 def test_one_view_of_eight_is_held_out_and_the_others_are_not() -> None:
