@@ -29,6 +29,7 @@ from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
 from recon.splatting.splat import voxelize
 from recon.voxels.direct import has_direct_method
+from recon.voxels.held_out_weight import choice_sweeps
 from recon.voxels.ordered_fista import subsets_of
 
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
@@ -36,7 +37,8 @@ _RESERVE = 0.02  # of the budget, for what no part has measured
 _LATE = 0.1  # of the time used, when it is over, is what a volume of all pixels may take
 _SLAB = 16  # slices
 _FINISH_SHARE = 0.8  # of what is left after placing, at most: it adds more than most of the steps before it
-# What goes before the sweeps of a finish, in sweeps: the largest eigenvalue of a subset, projections and an FBP.
+# What goes before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a
+# subset, projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 # Of the time a trial may take so much by prediction, and in fact a quarter more.
@@ -259,7 +261,8 @@ def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Callable[
     sweep = sweep_seconds(geometry, grid, now)
     if geometry.is_cone:
         sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
-    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
+    eigenvalue = _EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS)
+    before = (eigenvalue + _FIRST_SWEEPS + choice_sweeps(geometry)) * sweep
     if not before + 2 * sweep <= seconds:
         return 0, 0.0
     sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS

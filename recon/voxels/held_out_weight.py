@@ -64,6 +64,17 @@ def busiest_rows(data: F32, height: int) -> slice:
     return slice(first, first + height)
 
 
+def choice_sweeps(geometry: Geometry) -> float:
+    """What `choose_weight` costs, in sweeps over all rows: three trials, seldom more; 0 where nothing is held out."""
+    if not _can_hold_out(geometry):
+        return 0.0
+    return 3 * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+
+
+def _can_hold_out(geometry: Geometry) -> bool:
+    return not geometry.is_cone and geometry.n_views >= LEAST_VIEWS
+
+
 def choose_weight(
     problem: VoxelProblem, start: F32, *, modelled: bool, unmodelled: float | None = None
 ) -> NoiseBalance | float:
@@ -91,7 +102,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     held out: a cone, fewer than 16 views, or data without noise; and where `problem.trial_goes_on` ends the trials.
     """
     geometry = problem.projector.geometry
-    if geometry.is_cone or geometry.n_views < LEAST_VIEWS or not first > 0:
+    if not (_can_hold_out(geometry) and first > 0):
         return None
     error = _Trial.of(problem)
     heavier, here = error(2 * first), error(first)
@@ -140,8 +151,7 @@ def sweeps_by_noise(problem: VoxelProblem, start: F32, weight: float, sweeps: in
     39.6 dB after 8, 37.5 after 24); a battery, where fits of few views are far off, does (33.3, 36.1). So views held
     out have to be predicted better by three per cent, which parts the two (docs/exploration.md).
     """
-    geometry = problem.projector.geometry
-    if geometry.is_cone or geometry.n_views < LEAST_VIEWS or not weight > 0:
+    if not (_can_hold_out(problem.projector.geometry) and weight > 0):
         return sweeps
     errors = _errors_by_round(problem, start, weight, sweeps, lambda last, now: now <= last)
     return _ROUNDS * sweeps if len(errors) == _ROUNDS and errors[-1] < _MUCH_NEARER * errors[0] else sweeps
