@@ -50,6 +50,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
             frozenset({"encoder_error", "backlash", "stage_wobble", "runout"}),
             "errors of the stage depend on the stage's angle, and the sample slips on the stage",
         ),
+        "pixel_area": Entry(Domain.OPTICAL_DEPTH, "a pixel counts the light on its whole area"),
         "floaters": Entry(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
         "phase_fringes": Entry(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
         "harmonics": Entry(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),

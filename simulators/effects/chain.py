@@ -47,6 +47,14 @@ class PoseEffect(Effect, Protocol):
 
 
 @runtime_checkable
+class AreaEffect(Effect, Protocol):
+    @property
+    def offsets(self) -> Sequence[tuple[float, float]]:
+        """(row, col) of each ray of a pixel, in pixels from its middle: its light is the mean over them."""
+        ...
+
+
+@runtime_checkable
 class ImageEffect(Effect, Protocol):
     def apply(self, image: Image, shot: Shot) -> Image:
         """The changed image, float64 [row, col] in the effect's domain. The effect may work in place."""
@@ -60,7 +68,7 @@ class Anomaly(Effect, Protocol):
         ...
 
 
-AnyEffect: TypeAlias = SamplingEffect | PoseEffect | ImageEffect
+AnyEffect: TypeAlias = SamplingEffect | PoseEffect | AreaEffect | ImageEffect
 
 
 @dataclass(frozen=True)
@@ -113,6 +121,11 @@ class Chain:
             if isinstance(effect, PoseEffect):
                 pose = effect.pose(pose, times, shot)
         return pose
+
+    @property
+    def rays(self) -> Sequence[tuple[float, float]]:
+        """(row, col) of each ray of a pixel, in pixels from its middle."""
+        return next((effect.offsets for effect in self.effects if isinstance(effect, AreaEffect)), [(0.0, 0.0)])
 
     def apply(self, domain: Domain, image: Image, shot: Shot, on_step: StepHook = nullcontext) -> Image:
         """The image after the effects of one domain."""

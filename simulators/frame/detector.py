@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,10 @@ class Detector:
     def centred(cls, shape: tuple[int, int], pitch: float, sod: float = math.inf) -> Detector:
         """Rotation axis and z = 0 in the middle of the frame."""
         return cls(shape, pitch, (shape[1] - 1) / 2, (shape[0] - 1) / 2, sod)
+
+    def aimed(self, row: float, col: float) -> Detector:
+        """The rays that pass so many pixels beside those through the pixels' middles."""
+        return replace(self, axis_col=self.axis_col - col, axis_row=self.axis_row - row)
 
     def u(self) -> NDArray[np.float64]:
         return (np.arange(self.shape[1], dtype=np.float64) - self.axis_col) * self.pitch

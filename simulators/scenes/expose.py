@@ -6,6 +6,7 @@ Without effects a frame is photons x exposure x exp(-line integral) / conversion
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,13 +90,22 @@ def _transmission(
     open_beam: float,
     on_step: StepHook,
 ) -> Image:
-    """open_beam x exp(-line integral) with the sample's pose at one moment of each row."""
+    """open_beam x exp(-line integral) with the sample's pose at one moment of each row, mean over a pixel's rays."""
     pose = scene.chain.pose(Pose(angles), times, shot)
-    with on_step("line_integrals"):
-        depth = scene.sample.line_integrals(pose, shot.detector)
-    depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, shot.later(float(times[0])), on_step)
-    with on_step("beer_lambert"):
-        return _transmitted(depth, open_beam)
+    now, rays = shot.later(float(times[0])), scene.chain.rays
+
+    def through(row: float, col: float) -> Image:
+        detector = shot.detector.aimed(row, col)
+        with on_step("line_integrals"):
+            depth = scene.sample.line_integrals(pose, detector)
+        depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, replace(now, detector=detector), on_step)
+        with on_step("beer_lambert"):
+            return _transmitted(depth, open_beam / len(rays))
+
+    photons = through(*rays[0])
+    for ray in rays[1:]:
+        photons += through(*ray)
+    return photons
 
 
 def _transmitted(depth: Image, open_beam: float) -> Image:

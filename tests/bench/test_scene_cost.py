@@ -35,6 +35,7 @@ TYPICAL: dict[str, dict[str, Any]] = {
     "stage_wobble": {"harmonics": [[2, 20.0, 0.0]]},
     "runout": {"radial": [[2, 0.2, 0.0]], "radial_random_um": 0.05},
     "jump": {"view": 0, "shift_um": [8.0, 0.0, 4.0]},
+    "pixel_area": {},
     "floaters": {"distance": [0.1, 0.5], "count": 4, "size": [0.02, 0.06]},
     "phase_fringes": {"delta_beta": 5.0, "distance": 10.0, "energy": 8.3485},
     "harmonics": {"share": 0.005},

@@ -19,6 +19,7 @@ PARAMETERS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "runout": {"radial": [[2, 10.0, 0.0]], "radial_random_um": 3.0},
         "afterglow": {"shares": [0.2], "decay_times": [1.0]},
         "jump": {"view": 1, "shift_um": [30.0, 0.0, 10.0]},
+        "pixel_area": {},
         "floaters": {"distance": [0.3, 0.3], "count": 2},
         "phase_fringes": {"delta_beta": 3.0, "distance": 5000.0, "energy": 20.0},
         "harmonics": {"share": 0.1},
