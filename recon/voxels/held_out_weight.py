@@ -28,7 +28,6 @@ _SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3  # of a trial
 _HALVINGS = 5  # at most
 _ROUNDS = 3  # of sweeps, at most
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
-_MUCH_NEARER = 0.97  # of the residual after the first round, where the weight follows the noise
 _LEVEL = 0.002  # residuals of views held out that differ by less are equal
 
 # Weights of the two runs of `bregman`, in that of one run, and by how much the residual of views held out has to fall:
@@ -149,12 +148,12 @@ def sweeps_by_noise(problem: VoxelProblem, start: F32, weight: float, sweeps: in
 
     Most samples come no nearer by more sweeps, and leave a fit that is better than total variation alone (a teapot:
     39.6 dB after 8, 37.5 after 24); a battery, where fits of few views are far off, does (33.3, 36.1). So views held
-    out have to be predicted better by three per cent, which parts the two (docs/exploration.md).
+    out have to be predicted better by one per cent, which parts the two (docs/exploration.md).
     """
     if not (_can_hold_out(problem.projector.geometry) and weight > 0):
         return sweeps
     errors = _errors_by_round(problem, start, weight, sweeps, lambda last, now: now <= last)
-    return _ROUNDS * sweeps if len(errors) == _ROUNDS and errors[-1] < _MUCH_NEARER * errors[0] else sweeps
+    return _ROUNDS * sweeps if len(errors) == _ROUNDS and errors[-1] < _NEARER * errors[0] else sweeps
 
 
 def _errors_by_round(

@@ -1,7 +1,7 @@
 """Explain: the steps of one frame of a scene in order, with their cost, and the effects that are not computed.
 
-Steps are timed where they run. Effects of motion make the others run several times: the cost of such an effect is the
-time of a frame with it less that of a frame without it.
+Steps are timed where they run. Effects that change the rays of a frame, such as motion, make the others run several
+times: the cost of such an effect is the time of a frame with it less that of a frame without it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from simulators.effects.catalogue import CATALOGUE
-from simulators.effects.chain import Chain
+from simulators.effects.chain import Chain, ImageEffect
 from simulators.frame.domain import Domain
 from simulators.frame.shot import Shot
 from simulators.scenes.expose import expose
@@ -71,15 +71,15 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCo
     Args:
         now: s, of a clock for short times.
     """
-    motion = [effect for effect in scene.chain.effects if effect.domain is Domain.MOTION]
-    rest = [effect for effect in scene.chain.effects if effect.domain is not Domain.MOTION]
-    # From the standing sample to the whole scene, with one more effect of motion each.
-    variants = [replace(scene, chain=Chain.of([*motion[:n], *rest])) for n in range(len(motion) + 1)]
+    # What changes the rays of a frame is no step of its own: it costs what a frame takes longer with it.
+    aims = [effect for effect in scene.chain.effects if not isinstance(effect, ImageEffect)]
+    rest = [effect for effect in scene.chain.effects if isinstance(effect, ImageEffect)]
+    variants = [replace(scene, chain=Chain.of([*aims[:n], *rest])) for n in range(len(aims) + 1)]
     rounds = [_round(variants, shot, now) for _ in range(repeats + 1)][1:]
     seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
     sizes, peaks = _sizes(variants[0], shot), [_peak(each, shot) for each in variants]
     costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
-    for n, effect in enumerate(motion):
+    for n, effect in enumerate(aims):
         more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
         costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))
     order = [effect.name for effect in rest]
