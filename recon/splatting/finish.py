@@ -129,7 +129,8 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, without roll and tilt, and the weights of their rays.
-        sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and `bregman_weight`.
+        sweeps: 1 or more; None: 8, or as views held out prefer, see `sweeps_by_noise`, `preferred_sweeps`
+            and `bregman_weight`.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. A stop between the
             two attempts keeps the first where it explains the views of a parallel beam, which see all matter, better
