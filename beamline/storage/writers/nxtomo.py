@@ -1,7 +1,8 @@
 """NXtomoWriter: a scan's file while it grows, in a state that a reader can trust after every frame.
 
 The file is written SWMR (single writer, multiple readers): what was flushed can be read by others at once, and
-survives the death of this process. `frames_committed` is advanced last, so that it never counts half a row.
+survives the death of this process; every second it is brought to the disk (fsync), where it survives a loss of power.
+`frames_committed` is advanced last, so that it never counts half a row.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.layout import ScanInfo
+from beamline.storage.writers.to_disk import ToDisk, to_disk
 from drivers.clock import Clock
 from drivers.frame import Frame
 from drivers.protocols import BeamReading
@@ -104,6 +106,7 @@ class NXtomoWriter:
                 ) from error
             raise
         self._table = layout.Rows(self._file)
+        self._to_disk = ToDisk(self._file.id.get_vfd_handle())
         self._progress = self._file[layout.COMMITTED]
 
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
@@ -145,6 +148,7 @@ class NXtomoWriter:
         self._progress[()] = self._rows
         self._progress.flush()
         self._committed = self._rows
+        self._to_disk()
 
     def close(self, status: str = "complete", missing: Sequence[int] = (), beam: Sequence[BeamReading] = ()) -> None:
         """Finish: missing triggers, end time and status, then `finished`, then the /exchange view. Twice is once.
@@ -197,6 +201,8 @@ class NXtomoWriter:
         self._file[layout.STATUS][()] = status.encode()
         self._file.flush()
         self._file[layout.FINISHED][()] = 1
+        self._file.flush()
+        self._to_disk.finish()
         self._file.close()
 
     def _let_go(self) -> None:
@@ -246,6 +252,8 @@ class NXtomoWriter:
         with file:
             layout.settle(file)
             add_exchange_view(file)
+            file.flush()
+            to_disk(file.id.get_vfd_handle())
 
     def _remark_no_view(self, why: str) -> None:
         self.remarks.append(

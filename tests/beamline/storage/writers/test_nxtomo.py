@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -19,7 +21,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
-from beamline.storage.writers import layout
+from beamline.storage.writers import layout, to_disk
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, StandingClock
@@ -341,3 +343,71 @@ def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
     with pytest.raises(DataError, match=r"s\.h5 cannot be created \(No space left on device\)"):
         NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, begun = [], threading.Event()
+
+    def fsync(handle: int) -> None:
+        calls.append((handle, writer.rows))
+        begun.set()
+
+    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
+    with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
+        handle = writer._file.id.get_vfd_handle()
+        for frame in frames:
+            begun.clear()
+            writer.append(frame, digest(frame.counts))
+            assert begun.wait(5.0)
+    assert [rows for _, rows in calls[:14]] == list(range(1, 15))
+    assert calls[-2] == (handle, 14)  # before the file is closed, and then with the /exchange view
+
+
+def test_a_disk_that_did_not_take_what_was_flushed_is_told(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fsync(handle: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    with pytest.raises(DataError, match=r"could not take the frame .*Input/output error"):
+        for frame in frames:
+            writer.append(frame, digest(frame.counts))
+            if (thread := writer._to_disk._thread) is not None:
+                thread.join()
+    assert writer.rows <= 2
+    writer.close("failed")
+
+
+def test_a_disk_that_hangs_does_not_hold_the_writer(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs = threading.Event()
+    calls: list[int] = []
+
+    def fsync(handle: int) -> None:
+        calls.append(handle)
+        hangs.wait(10.0)
+
+    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    assert (writer.committed, len(calls)) == (14, 1)
+    hangs.set()
+    writer.close()
+    assert len(calls) > 2
+
+
+def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fsync(handle: int) -> None:
+        raise OSError(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    to_disk.to_disk(0)

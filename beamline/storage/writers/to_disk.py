@@ -1,0 +1,67 @@
+"""ToDisk: what was flushed is brought to the disk (fsync) beside the work, so that a loss of power cannot take it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+import time
+
+SECONDS = 1.0  # between two calls, at least
+
+_NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
+
+
+def to_disk(handle: int) -> None:
+    """Wait until what was written to an open file is on the disk. OSError where the disk did not take it."""
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in _NO_SUCH_CALL:
+            raise
+
+
+class ToDisk:
+    """Calls `to_disk` in a thread, one call at a time: a writer that waited for it would be as slow as both together.
+
+    The thread is a daemon: a disk that hangs does not keep the program from ending.
+    """
+
+    def __init__(self, handle: int) -> None:
+        self._handle = handle
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+        self._begun = time.monotonic()
+
+    def __call__(self) -> None:
+        """Begin a call, unless one is under way or began less than SECONDS ago.
+
+        Raises:
+            OSError: the disk did not take what an earlier call was for.
+        """
+        if self._error is not None:
+            raise self._error
+        under_way = self._thread is not None and self._thread.is_alive()
+        if under_way or time.monotonic() - self._begun < SECONDS:
+            return
+        self._begun = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="to disk", daemon=True)
+        self._thread.start()
+
+    def finish(self) -> None:
+        """Wait until everything is on the disk.
+
+        Raises:
+            OSError: it did not take it.
+        """
+        if self._thread is not None:
+            self._thread.join()
+        if self._error is not None:
+            raise self._error
+        to_disk(self._handle)
+
+    def _run(self) -> None:
+        try:
+            to_disk(self._handle)
+        except OSError as error:
+            self._error = error
