@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
+from typing import TypedDict
 
 import click
 
@@ -23,12 +24,13 @@ from beamline.core.stop import StopRequest
 from beamline.core.text import count
 from beamline.instrument.connect import describe
 from beamline.instrument.operator import ask_operator
-from beamline.scan.live_process import LiveCommand, follow_command, live_plan
+from beamline.scan.live_process import LiveCommand, finished_command, follow_command, live_plan
 from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
 from beamline.storage.flag_legend import counted
 from drivers.clock import SystemClock
+from recon.base.choices import AUTO
 from recon.methods import streams
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")
@@ -41,7 +43,7 @@ _SAID_WITHIN = 0.2  # s
     "--dry-run", "dry", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
 )
 @set_option
-@click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
+@click.option("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
 @json_option
 @click.option(
     "-o",
@@ -66,11 +68,11 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
             return
         stop = StopRequest()
         with stop_signals(stop), Terminal(sys.stderr) as terminal:
-            live = _live(config, no_live)
             sinks: list[Sink] = [terminal, *json_sinks]
             result = run_scan(
-                config, output, sinks, stop, live=live, ask=lambda request: terminal.ask(request, ask_operator)
-            )
+                config, output, sinks, stop, **_commands(config, no_live),
+                ask=lambda request: terminal.ask(request, ask_operator),
+            )  # fmt: skip
     if not as_json:
         click.echo(_results(result))
     if faults := _faults(result):
@@ -102,17 +104,20 @@ def _dry_run(config: Config, json_sinks: Sequence[Sink]) -> None:
         sink(Event("done", SystemClock().now(), worked.data()))
 
 
-def _live(config: Config, no_live: bool) -> LiveCommand | None:
+class _Commands(TypedDict, total=False):
+    live: LiveCommand
+    afterwards: LiveCommand
+
+
+def _commands(config: Config, no_live: bool) -> _Commands:
+    """How the scan is reconstructed: while it runs, when it is complete, or not at all."""
     if no_live or not config.recon.live:
-        return None
-    if not streams(config.recon.method):
-        click.echo(
-            f"No live reconstruction: {config.recon.method} needs the complete scan. Run `beamline recon` after it.",
-            err=True,
-        )
-        return None
+        return {}
+    if config.recon.method == AUTO or not streams(config.recon.method):
+        click.echo(f"{config.recon.method} needs the complete scan: the volume comes after it.", err=True)
+        return {"afterwards": finished_command(config)}
     _, camera, _ = describe(config)
-    return follow_command(config, live_plan(camera.shape, plan_of(config).angles.size, free_memory()))
+    return {"live": follow_command(config, live_plan(camera.shape, plan_of(config).angles.size, free_memory()))}
 
 
 @contextmanager

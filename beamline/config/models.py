@@ -11,12 +11,13 @@ from beamline.config.monitor import MonitorSection
 from beamline.config.references import ReferencesSection
 from beamline.config.section import Section
 from beamline.plan.plan import Mode, Place
-from recon.methods import DEFAULT, names
+from recon.base.choices import AUTO
+from recon.methods import DEFAULT, names, streams
 
 if TYPE_CHECKING:
     MethodName = str
 else:
-    MethodName = Literal[names()]
+    MethodName = Literal[(AUTO, *names())]
 
 
 class Sample(Section):
@@ -142,8 +143,9 @@ class StopWhen(Section):
 
 class Recon(Section):
     live: bool = True
+    """A volume while the scan runs; by a method that needs the whole scan, when it is complete."""
     method: MethodName = DEFAULT
-    """Of the live volume; one that needs the whole scan is run afterwards, by `beamline recon`."""
+    """r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."""
     seconds: PositiveFloat = 30.0
     """Time for the fit after the last view."""
     axis: Literal["auto"] | FiniteFloat = "auto"
@@ -155,6 +157,8 @@ class Recon(Section):
     def _somebody_looks(self) -> Self:
         if self.stop_when is not None and not self.live:
             raise ValueError("stop_when needs live: true, because the live reconstruction tells when views are enough")
+        if self.stop_when is not None and (self.method == AUTO or not streams(self.method)):
+            raise ValueError(f"stop_when needs a volume that grows while the scan runs; {self.method} has none, r2 has")
         return self
 
 

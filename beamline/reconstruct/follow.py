@@ -35,7 +35,7 @@ class FollowTiming:
     """
 
     poll: float = 0.1
-    slice: float = 0.5
+    slice: float = 0.25
     snapshot: float = 5.0
     patience: float = 120.0
 

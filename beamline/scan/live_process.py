@@ -75,18 +75,10 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
     """The command `beamline recon SCAN --follow` with the options of the configuration."""
-    recon, axis, plan = config.recon, config.recon.axis, plan or LivePlan()
-    if axis == "auto" and config.optics.axis_col is not None:
-        axis = config.optics.axis_col
+    recon, plan = config.recon, plan or LivePlan()
 
     def command(scan: Path, output: Path) -> Sequence[str]:
-        options: dict[str, object] = {
-            "--method": recon.method,
-            "--axis": axis,
-            "--seconds": recon.seconds,
-            "--seed": recon.seed,
-            "-o": output,
-        }
+        options: dict[str, object] = {**_common(config), "--seconds": recon.seconds, "-o": output}
         if (when := recon.stop_when) is not None:
             limits = {"--enough-gain": when.psnr_gain_per_10_views, "--enough-loss": when.psnr_loss}
             options |= {name: limit for name, limit in limits.items() if limit is not None}
@@ -94,10 +86,26 @@ def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
             options["--bin"] = plan.binning
         if plan.every > 1:
             options["--views"] = f"every:{plan.every}"
-        words = [word for name, value in options.items() for word in (name, str(value))]
-        return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), "--follow", "--json", *words]
+        return _words(scan, ["--follow"], options)
 
     return command
+
+
+def finished_command(config: Config) -> LiveCommand:
+    """The command `beamline recon SCAN` for the complete scan, by a method that needs all of it."""
+    return lambda scan, output: _words(scan, [], {**_common(config), "-o": output})
+
+
+def _common(config: Config) -> dict[str, object]:
+    recon, axis = config.recon, config.recon.axis
+    if axis == "auto" and config.optics.axis_col is not None:
+        axis = config.optics.axis_col
+    return {"--method": recon.method, "--axis": axis, "--seed": recon.seed}
+
+
+def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> Sequence[str]:
+    words = [word for name, value in options.items() for word in (name, str(value))]
+    return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), *flags, "--json", *words]
 
 
 class LiveReconstruction:
@@ -108,12 +116,18 @@ class LiveReconstruction:
 
     Args:
         enough: is told why the views so far are enough, in the thread that reads the output.
+        what: its name in messages.
     """
 
     def __init__(
-        self, command: Sequence[str], log: Path, emit: Emit, enough: Callable[[str], None] = lambda reason: None
+        self,
+        command: Sequence[str],
+        log: Path,
+        emit: Emit,
+        enough: Callable[[str], None] = lambda reason: None,
+        what: str = "live reconstruction",
     ) -> None:
-        self._emit, self._log, self._enough = emit, log, enough
+        self._emit, self._log, self._enough, self._what = emit, log, enough, what
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
         self._ready = threading.Event()
@@ -122,7 +136,7 @@ class LiveReconstruction:
             with log.open("x", encoding="utf-8") as stderr:
                 self._process = ChildProcess(command, stderr, self._pass_on, on_end=self._say_if_early, behind=True)
         except OSError as error:
-            message = f"The live reconstruction could not be started ({error}). The scan goes on without it."
+            message = f"The {what} could not be started ({error}). The scan is not affected."
             emit("warning", {"message": message})
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
@@ -160,9 +174,7 @@ class LiveReconstruction:
                 Ending.SILENT: f"it was stopped after {_SILENCE:.0f} s without output",
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
-            message = (
-                f"The live reconstruction gave no volume: {reason}; see {self._log.name}. The scan is not affected."
-            )
+            message = f"The {self._what} gave no volume: {reason}; see {self._log.name}. The scan is not affected."
             self._emit("warning", {"message": message, "source": "recon"})
         return self._done
 
@@ -197,5 +209,5 @@ class LiveReconstruction:
         if event == "done":
             self._done, event = data, "recon_done"
         elif event == "failed":
-            event, data["message"] = "warning", f"Live reconstruction: {data.get('message', 'failed')}"
+            event, data["message"] = "warning", f"{self._what.capitalize()}: {data.get('message', 'failed')}"
         self._emit(event, {**data, "source": "recon"})

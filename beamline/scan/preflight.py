@@ -30,6 +30,8 @@ from beamline.plan.timeline import work_out
 from beamline.scan.live_process import live_plan
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
+from recon.base.choices import AUTO
+from recon.methods import streams
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,8 @@ def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Ti
     """The timeline with what the operator should know of policies that it cannot carry out, and of the live volume."""
     remarks = [*worked.remarks, *_held_late(worked, config)]
     plan = live_plan(shape, worked.views.n, free_memory())
-    if config.recon.live and not plan.whole:
+    method = config.recon.method
+    if config.recon.live and not plan.whole and method != AUTO and streams(method):
         rows, cols = (n // plan.binning for n in shape)
         remarks.append(
             f"the live volume has {cols} columns and {rows} rows (binned {plan.binning} x {plan.binning}) from "

@@ -110,6 +110,7 @@ def run_scan(
     live: LiveCommand | None = None,
     instrument: Instrument | None = None,
     ask: Ask | None = None,
+    afterwards: LiveCommand | None = None,
 ) -> RunResult:
     """Run the scan that `config` describes.
 
@@ -118,6 +119,7 @@ def run_scan(
         sinks: besides events.jsonl and user.log in the run's folder.
         stop: ends the scan from another thread or a signal handler.
         live: gives the command line of a live reconstruction; None: there is none.
+        afterwards: gives that of a reconstruction of the complete scan; a scan that ends early has none.
         instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
         ask: puts a request to the operator, where the shutter or the sample is moved by hand.
 
@@ -149,7 +151,7 @@ def run_scan(
                 ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
             run = _Run(config, instrument, ready, folder, stop, emit, began, ask or ask_operator)
-            return run.go(live, release=connected.close)
+            return run.go(live, afterwards, release=connected.close)
 
 
 def _refuse_stop(stop: StopRequest) -> None:
@@ -172,11 +174,13 @@ class _Run:
     told: set[str] = field(default_factory=set)
     """Groups of references whose faults were told."""
 
-    def go(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
+    def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
         try:
             self._enter(State.PREPARING)
             result = self._scan(live, release)
+            if afterwards is not None:
+                result = self._reconstructed(afterwards, result)
         except BaseException as error:
             self._enter(State.FAILED)
             self.emit("failed", {"message": user_message(error), "exit_code": exit_code(error), "folder": self.folder})
@@ -197,6 +201,17 @@ class _Run:
                 ending.callback(follower.close)
                 follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
             return self._acquire_and_follow(writer, follower, release)
+
+    def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
+        """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
+        began = time.monotonic()
+        log = self.folder / RECON_LOG
+        process = LiveReconstruction(command(result.path, self.folder / RECON), log, self.emit, what="reconstruction")
+        try:
+            recon = process.finish(lambda: self.stop.stopping, lambda: self.stop.aborting)
+        finally:
+            process.close()
+        return replace(result, recon=recon, seconds=result.seconds + time.monotonic() - began)
 
     def _acquire_and_follow(
         self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]

@@ -266,8 +266,11 @@ class ByHand(ManualShutter):
 def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def run_scan(config: object, runs: object, sinks: object, stop: object, *, live: Any, ask: Any) -> Any:
-        asked.append(live and list(live(Path("scan.h5"), Path("recon.h5"))))
+    def run_scan(
+        config: object, runs: object, sinks: object, stop: object, *, ask: Any, live: Any = None, afterwards: Any = None
+    ) -> Any:
+        command = live or afterwards
+        asked.append(command and list(command(Path("scan.h5"), Path("recon.h5"))))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("beamline.cli.scan.run_scan", run_scan)
@@ -276,16 +279,21 @@ def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monk
     assert runner.invoke(main, ["scan", SIMULATED, *overrides]).exit_code == 130
     assert runner.invoke(main, ["scan", SIMULATED, "--no-live"]).exit_code == 130
     assert runner.invoke(main, ["scan", SIMULATED, "--set", "recon.live=false"]).exit_code == 130
-    fbp = runner.invoke(main, ["scan", SIMULATED, "--set", "recon.method=fbp"])
-    assert "needs the complete scan" in fbp.stderr
-    assert asked[1:] == [None, None, None]
+    recon = main.get_command(click.Context(main), "recon")
+    assert recon is not None
+    for method in ("fbp", "auto"):
+        result = runner.invoke(main, ["scan", SIMULATED, "--set", f"recon.method={method}"])
+        assert f"{method} needs the complete scan" in result.stderr
+        command = asked.pop()
+        assert "--follow" not in command
+        parsed = recon.make_context("recon", command[4:]).params
+        assert (parsed["method"], parsed["axis"], parsed["output"]) == (method, None, Path("recon.h5"))
+    assert asked[1:] == [None, None]
     command = asked[0]
     assert command[1:5] == ["-m", "beamline.cli.main", "recon", "scan.h5"]
     assert command[command.index("--seconds") + 1] == "7.0"
     assert command[command.index("--axis") + 1] == "80.5"
     assert {"--follow", "--json"} <= set(command)
-    recon = main.get_command(click.Context(main), "recon")
-    assert recon is not None
     parsed = recon.make_context("recon", command[4:]).params  # and the command understands it
     assert (parsed["seconds"], parsed["axis"], parsed["output"]) == (7.0, 80.5, Path("recon.h5"))
 

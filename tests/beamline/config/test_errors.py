@@ -21,7 +21,8 @@ FAULTS = {
     "missing": (("exposure_s: 0.01", "settle_s: 0"), "my.yaml:2: scan.exposure_s is missing; expected a number > 0"),
     "choice": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {method: r3}"),
-        "my.yaml:2: recon.method is 'r3'; expected r2 | fbp | sirt | sart | cgls | asd-pocs | fista-tv | os-sirt-tv",
+        "my.yaml:2: recon.method is 'r3'; expected auto | r2 | fbp | sirt | sart | cgls | asd-pocs | fista-tv | "
+        "os-sirt-tv",
     ),
     "scheme": (
         ("scheme: fixed", "scheme: goldn"),

@@ -17,7 +17,7 @@ from beamline.core.process import ChildProcess
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import run as module
 from beamline.scan.live_process import LivePlan, LiveReconstruction, follow_command, live_plan
-from beamline.scan.run import run_scan
+from beamline.scan.run import RunResult, run_scan
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
 
@@ -263,11 +263,38 @@ print(json.dumps({"event": "enough", "n_views": 90, "planned": 180, "mean": 0.1,
     for wrong, says in (
         ("{}", "needs psnr_gain_per_10_views or psnr_loss"),
         ("{psnr_loss: 0}", "expected a number > 0"),
+        ("{psnr_loss: 0.5}", "fbp has none, r2 has"),
     ):
         with pytest.raises(ConfigError, match=says):
-            small("recon.live=true", f"recon.stop_when={wrong}")
+            small("recon.live=true", "recon.method=fbp", f"recon.stop_when={wrong}")
     with pytest.raises(ConfigError, match="needs live: true"):
         small("recon.stop_when={psnr_loss: 0.5}")
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_method_that_needs_the_whole_scan_has_its_volume_after_a_complete_one(tmp_path: Path, stopped: bool) -> None:
+    checks = """
+import h5py, json, sys
+with h5py.File(sys.argv[1]) as file:
+    print(json.dumps({"event": "done", "output": sys.argv[2], "frames": len(file["entry/data/data"])}))
+"""
+    stop, events = StopRequest(), list[Event]()
+    instrument = FakeInstrument(on_frame=lambda number: stop.stop() if stopped and number == 10 else None)
+
+    def scan() -> RunResult:
+        return run_scan(
+            small(), tmp_path, [events.append], stop, instrument=instrument.connected(), afterwards=script(checks)
+        )
+
+    if stopped:
+        with pytest.raises(ScanStopped):
+            scan()
+        assert all(event.event != "recon_done" for event in events)
+    else:
+        result = scan()
+        assert result.recon is not None and result.recon["frames"] == 19
+        names = [event.event for event in events]
+        assert names.index("scan_done") < names.index("recon_done") and names[-1] == "done"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
