@@ -24,8 +24,11 @@ def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
 
 
 def odd_views_warning(made: ReconOutcome, prepared: PreparedProjections, selection: Selection) -> str:
-    """The warning that parts of views are not in the volume; empty where there are none, and of direct methods."""
-    if by_name(made.method).traits.direct:
+    """The warning that parts of views are not in the volume; empty where there are none, and of direct methods.
+
+    So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
+    """
+    if by_name(made.method).traits.direct or made.settings.get("ended_early"):
         return ""
     found = odd_views.odd_views(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
     if not found:

@@ -19,7 +19,8 @@ LiveCommand = Callable[[Path, Path], Sequence[str]]
 """(scan file, output file) -> the command line."""
 
 _SILENCE = 300.0  # real s without output, after which the process is ended
-_GRACE = 30.0  # real s in which it may still write the volume that it has
+_GRACE = 120.0  # real s in which it may still write the volume that it has, unless the operator is in a hurry
+_CLOSE = 5.0  # the same where the scan itself has failed
 _POLL = 0.1  # real s between two looks whether it is ready
 
 
@@ -182,7 +183,7 @@ class LiveReconstruction:
         """End it if it still runs."""
         self._wanted = False
         if self._process is not None:
-            self._process.end(_GRACE / 6)
+            self._process.end(_CLOSE)
 
     def _say_if_early(self) -> None:
         """Warn at once where it has ended while the scan runs: the operator watches a volume that grows no more."""

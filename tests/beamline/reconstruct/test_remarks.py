@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,12 @@ def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.ra
 def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> None:
     said = odd_views_warning(*_made(rng, dict.fromkeys(range(0, 40, 6), 0.5), "sirt"), Selection())
     assert said.count("frame ") == 5 and "; and 2 more" in said
+
+
+def test_a_volume_that_was_stopped_is_not_compared(rng: np.random.Generator) -> None:
+    made, prepared = _made(rng, {7: 0.5}, "sirt")
+    assert odd_views_warning(made, prepared, Selection())
+    assert odd_views_warning(replace(made, settings={"ended_early": True}), prepared, Selection()) == ""
 
 
 @pytest.mark.parametrize(("method", "specks"), [("sirt", {}), ("fbp", {7: 0.5})])
