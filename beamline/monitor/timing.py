@@ -22,12 +22,15 @@ class TimingState:
 
 @dataclass(frozen=True)
 class Timing:
-    """Score: periods whose trigger has no frame, else periods by which the frame came late (negative: early)."""
+    """Score: periods by which the frame came late (negative: early).
+
+    Triggers without a frame before it are an INFO: the frame after the gap is as good as any.
+    """
 
     name: ClassVar[str] = "timing"
     bit: ClassVar[int] = 4
     unit: ClassVar[str] = "trigger periods"
-    meaning: ClassVar[str] = "the frame came early or late, or triggers before it gave no frame (fly scans)"
+    meaning: ClassVar[str] = "the frame came early or late (fly scans)"
     policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
@@ -43,7 +46,7 @@ class Timing:
         steps = frame.trigger - state.trigger
         if steps > 1:
             advice = f"{steps - 1} trigger{'s' if steps > 2 else ''} before this one exposed no frame, or it was lost."
-            return Look(after, Flag(self.name, Level.ALARM, frame.index, steps - 1, 0, advice))
+            return Look(after, Flag(self.name, Level.INFO, frame.index, steps - 1, 0, advice))
         if state.trigger < 0 or frame.trigger in context.pass_starts:
             return Look(after)
         score = (frame.time - state.time) / context.period - steps

@@ -165,7 +165,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
         return
     steps = np.diff(stamps)
     new = np.zeros(triggers.size, np.bool_)
-    new[np.unique(triggers, return_index=True)[1]] = True
+    new[np.unique(np.stack([key, triggers]), axis=1, return_index=True)[1]] = True
     armed = new[1:] & ((steps < 0) | (stamps[1:] == 0))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))
@@ -177,6 +177,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
             f"framestamp {stamps[repeated[0] + 1]:g} after {stamps[repeated[0]]:g}).",
         )
     skipped = np.flatnonzero(same_block & (steps > 1))
+    skipped = np.array([i for i in skipped.tolist() if not _taken_again(triggers, key, i, steps[i] - 1)], np.int64)
     if skipped.size:
         lost = int((steps[skipped] - 1).sum())
         yield Finding(
@@ -184,6 +185,12 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
             "framestamps",
             f"The camera counted {lost} frames that are not in the file (first gap before frame {skipped[0] + 1}).",
         )
+
+
+def _taken_again(triggers: NDArray[Any], key: NDArray[Any], at: int, lost: int) -> bool:
+    """As many triggers as frames were lost lie between a frame and the next, and all have a frame elsewhere."""
+    between = np.arange(triggers[at] + 1, triggers[at + 1])
+    return between.size == lost and bool(np.isin(between, triggers[key == key[at]]).all())
 
 
 def frames_differ(places: Places) -> Iterator[Finding]:

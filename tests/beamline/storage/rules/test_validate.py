@@ -251,6 +251,13 @@ def test_each_rule_finds_what_it_is_for(
     assert not {other for other in others if other[0] == "error"} or spoil is float_frames
 
 
+def test_a_frame_that_the_camera_counted_is_missed_unless_it_was_taken_again(write: Write, frames: list[Frame]) -> None:
+    lost = [replace(frame, index=i) for i, frame in enumerate(frames[:6] + frames[7:])]  # darks have trigger 1, too
+    assert ("warning", "framestamps") in found(write(lost))
+    again = replace(frames[6], index=len(lost), framestamp=0, time=lost[-1].time + 1)
+    assert validate(write([*lost, again], "again.h5")) == []  # type: ignore[call-arg]
+
+
 def test_missing_references(write: Write, frames: list[Frame]) -> None:
     projections = [replace(frame, index=i) for i, frame in enumerate(frames[5:])]
     hits = [finding for finding in validate(write(projections)) if finding.rule == "references"]
