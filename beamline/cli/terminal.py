@@ -162,7 +162,7 @@ def fit(data: Mapping[str, Any]) -> str:
     step, steps = data["step"], data["steps"]
     word = data.get("unit") or ("steps" if data["n_gaussians"] else "iterations")
     parts = [f"{step}/{steps} {word}"] if steps else [f"{step} {word}"] if data.get("unit") else []
-    parts += [f"{data['per_s']:.3g} {word}/s"] if data.get("per_s") else []
+    parts += [f"{data['per_s']:.3g} {word.split()[0]}/s"] if data.get("per_s") else []
     parts += [f"{data['n_views']} views"]
     parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []
     if data["residual"] is not None and math.isfinite(data["residual"]):
