@@ -303,9 +303,13 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
     if listen is None:
         return None
 
+    reached = done
+
     def watch(progress: Progress) -> None:
+        nonlocal reached
         share = progress.step / progress.steps if progress.steps else 0.0
         at = done + round((slab.own.stop - slab.own.start) * share)
-        listen(replace(progress, step=at, steps=slices, seconds=control.now() - begin, unit="slices"))
+        reached = max(reached, at)  # a fit's finish counts anew
+        listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
 
     return watch
