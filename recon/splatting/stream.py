@@ -3,12 +3,8 @@
 The first Gaussians come from an FBP of the first well-spread views, and again when these have grown by half where there
 is time for many steps. From then on the model stays: each time the views have grown by half, a new round makes room for
 more Gaussians, which density control clones and splits where the new views ask for it. Between arrivals the model keeps
-fitting: every third step takes one of the newest views, the others replay all of them evenly (the rule of on-the-fly
-mapping: new views must be learnt, old ones not forgotten; Meuleman et al. 2025).
-
-Nobody knows how many steps are to come. So the rates fall as 1 / (1 + t / 60) with the steps t, and the volume is that
-of the mean of the parameters over the last quarter of them: after any number of steps it is about as good as a fit
-whose rates were planned to end there (docs/performance.md, "Streaming").
+fitting, at rates that suit any number of steps to come (`anytime`): every third step takes one of the newest views, the
+others replay all of them evenly (`arrivals`).
 """
 
 from __future__ import annotations
@@ -19,15 +15,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from recon.base.geometry import Geometry
 from recon.base.method import Progress
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import F32
+from recon.splatting import arrivals
 from recon.splatting import optimise as fit
-from recon.splatting.averaging import average, averaged
-from recon.splatting.density_control import DensityPolicy
+from recon.splatting.anytime import HALF, WHILE_VIEWS_COME, average, averaged, fallen
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field, place
 from recon.splatting.problem import FitProblem, extend, with_projections
@@ -35,20 +31,13 @@ from recon.splatting.settings import FitSettings, growth
 
 Clock = Callable[[], float]
 
-_NEWEST = 0.2  # this share of the views counts as the newest
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
-_HALF = 60.0  # steps after which the rates are half of the first ones
 _YOUNG = 16  # a round that begins with fewer views, after so many steps, places all Gaussians anew
-_WINDOW = 0.25  # share of the steps over which the mean is taken
-_EVERY = 4  # steps between two of the mean
 _LAST_GROWTH = 0.5  # density control ends at this share of the last round
 _AXIS_ANEW = 0.3  # px; an axis that moves by so much starts the rates anew, by less in part
 _NEW = 0.2  # weight of the newest of the views that were looked at before they were learnt
 _BLIND = 100.0  # data so many times larger than the density unit implies: the first views showed no sample
 _ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
-
-WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
-"""The rates of a fit to all views, to a lower end; density control at any rate, as far as the rounds make room."""
 
 
 class StreamingFit:
@@ -123,12 +112,7 @@ class StreamingFit:
                 values far too large; nothing is added.
         """
         theta = np.atleast_1d(np.asarray(angles, np.float64))
-        expected = (theta.size, *self._template.detector_shape)
-        if theta.ndim != 1 or np.shape(data) != expected:
-            raise ValueError(f"{theta.size} angles need projections of shape {expected}, got {np.shape(data)}")
-        images = _finite(data)
-        if not np.isfinite(theta).all():
-            raise ValueError("new views hold values or angles that are not finite; nothing was changed")
+        images = arrivals.checked(data, theta, self._template.detector_shape)
         if self._problem is None:
             self._data.extend(images)
         else:
@@ -162,10 +146,9 @@ class StreamingFit:
             ValueError: where the shape is not that of the views, or values are not finite; nothing is changed.
         """
         theta = np.asarray(self._angles if angles is None else angles, np.float64)
-        expected = (theta.size, *self._template.detector_shape)
-        if np.shape(data) != expected or theta.size == 0:
-            raise ValueError(f"the views have shape {expected}, got {np.shape(data)}")
-        images = _finite(data)
+        if theta.size == 0:
+            raise ValueError("there are no views to replace, or none would be left")
+        images = arrivals.checked(data, theta, self._template.detector_shape)
         self._angles = theta.tolist()
         if self._problem is None or self._state is None:
             self._data = list(images)
@@ -177,9 +160,7 @@ class StreamingFit:
     def move_axis(self, axis_col: float) -> None:
         """Move the rotation axis. The model moves to where the views have it about the new axis, and stays.
 
-        An axis that is off by d puts a point x cos θ + y sin θ + d off, and the model follows by the shift (a, b) whose
-        a cos θ + b sin θ is nearest to d in the views so far: (0, 4 d / π) for evenly spread ones. What is left of the
-        error doubles edges, which the model must learn anew: the rates rise again.
+        What is left of the error doubles edges, which the model must learn anew: the rates rise again.
         """
         moved = float(axis_col) - self._template.axis_col
         self._template = replace(self._template, axis_col=float(axis_col))
@@ -187,11 +168,10 @@ class StreamingFit:
             return
         self._problem = replace(self._problem, geometry=replace(self._problem.geometry, axis_col=float(axis_col)))
         theta = self._problem.geometry.angles
-        across = np.stack((np.cos(theta), np.sin(theta)), 1)
-        shift = np.linalg.lstsq(across, np.full(theta.size, moved * self._template.sample_pitch), rcond=None)[0]
+        shift = arrivals.shift_with_axis(theta, moved * self._template.sample_pitch)
         for parameters in (self._state.parameters, self._state.mean):
             if parameters is not None:
-                parameters["means"][:, :2] -= shift.astype(np.float32)
+                parameters["means"][:, :2] -= shift
         kept = 1 - min(1.0, abs(moved) / _AXIS_ANEW)
         self._schedule_step = self._state.step - round(kept * (self._state.step - self._schedule_step))
 
@@ -250,9 +230,9 @@ class StreamingFit:
                 fraction = first + (1 - first) * min(1.0, spent / seconds)
                 if spent >= _LAST_GROWTH * seconds:
                     settings = settled
-            fit.step(self._state, self._problem, settings, fraction, self._choose(finishing))
-            if self._state.step % _EVERY == 0:
-                average(self._state, _EVERY / (_EVERY + _WINDOW * (self._state.step - averaged_from)))
+            view = None if finishing else arrivals.chosen(self.n_views, self._rng)
+            fit.step(self._state, self._problem, settings, fraction, view)
+            average(self._state, averaged_from)
             if on_progress is not None and self._now() - reported > 0.1:
                 reported = self._now()
                 if on_progress(self.progress()):
@@ -262,22 +242,13 @@ class StreamingFit:
         return self.progress()
 
     def _fraction(self) -> float:
-        """How far the rates have come on their logarithmic way to the lowest ones, 0..1."""
         assert self._state is not None
-        steps = self._state.step - self._schedule_step
-        return min(1.0, math.log1p(steps / _HALF) / max(-math.log(self._settings.decay), 1e-9))
-
-    def _choose(self, finishing: bool) -> int | None:
-        n = self.n_views
-        newest = max(1, int(n * _NEWEST))
-        if finishing or newest >= n or self._rng.random() >= 1 / 3:
-            return None
-        return int(self._rng.integers(n - newest, n))
+        return fallen(self._state.step - self._schedule_step, self._settings.decay)
 
     def _begin_round(self, force: bool = False) -> None:
         theta = np.asarray(self._angles)
         if self._state is None:
-            if not force and (theta.size < self._first_views or _span(theta) < self._first_span):
+            if not force and (theta.size < self._first_views or arrivals.span(theta) < self._first_span):
                 return
             try:
                 self._place_first()
@@ -287,7 +258,7 @@ class StreamingFit:
                 self._round_views = self.n_views
                 return
         elif self._problem is not None and (
-            (not force and self.n_views < _YOUNG and self._state.step >= _HALF)
+            (not force and self.n_views < _YOUNG and self._state.step >= HALF)
             or max(float(image.max()) for image in self._problem.images) > _BLIND
         ):
             # So few views place Gaussians badly. Or the sample or the beam came later: the density unit is of noise.
@@ -309,18 +280,3 @@ class StreamingFit:
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data = []  # the problem holds them from now on
-
-
-def _finite(data: F32) -> F32:
-    """A copy as float32, whose values are finite."""
-    with np.errstate(over="ignore"):  # what float32 cannot hold counts as not finite
-        images = np.array(data, np.float32)
-    if not np.isfinite(images).all():
-        raise ValueError("new views hold values or angles that are not finite; nothing was changed")
-    return images
-
-
-def _span(theta: NDArray[np.float64]) -> float:
-    """The angle that views cover, modulo π: π less the widest gap."""
-    ordered = np.sort(np.mod(theta, np.pi))
-    return float(np.pi - np.diff(ordered, append=ordered[0] + np.pi).max())

@@ -14,8 +14,8 @@ from beamline.report.record import history_arrays, history_from, residual_curve
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
 from recon.base.volume import Grid, Volume
+from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.settings import FitSettings
-from recon.splatting.stream import WHILE_VIEWS_COME
 
 GRID = Grid((1, 1, 1))
 
