@@ -139,9 +139,13 @@ class Geometry:
         2π holds for a cone, for an axis that leans along the beam, and for an axis so far off the detector's middle
         that views half a turn apart see different parts (more than a tenth of the field).
         """
+        return 2 * math.pi if self.is_cone or self.tilt.any() or self.is_off_middle else math.pi
+
+    @property
+    def is_off_middle(self) -> bool:
+        """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
         cols = self.detector_shape[1]
-        off = abs(float((self.axis_col + self.shifts[:, 0]).mean()) - (cols - 1) / 2)
-        return 2 * math.pi if self.is_cone or self.tilt.any() or off > _OFF_MIDDLE * cols else math.pi
+        return abs(float((self.axis_col + self.shifts[:, 0]).mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
 
     @property
     def middle_height(self) -> float:

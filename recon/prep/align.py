@@ -1,7 +1,8 @@
 """find_axis: the rotation axis from the data, with the curve of each estimate and whether it is reliable.
 
-Three methods with different weaknesses: the pair needs two views half a turn apart; the double wedge needs views over
-about half a turn; the centre of mass takes any sector, but needs the whole sample in the field and air at zero.
+Four methods with different weaknesses: the pair needs two views half a turn apart, and an axis near the middle;
+opposite views need a full turn; the double wedge needs views over about half a turn; the centre of mass takes any
+sector, but needs the whole sample in the field and air at zero.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.ndimage import uniform_filter1d
 
 Floats = NDArray[np.float64]
 
 _MOST_VIEWS, _MOST_ROWS, _MOST_COLS = 256, 16, 1024  # enough for 0.1 px
 _STEP = 0.25  # px between candidates
 _WIDEST_GAP = np.deg2rad(20)  # in a half turn; with a wider gap the double wedge does not determine the axis
+_FEWEST_PAIRS, _MOST_PAIRS = 8, 64
+_EDGE = 25  # of the columns, one in so many at each edge is too near it for an axis
 _AGREE = 1.0  # px by which independent estimates may differ and still count as equal
 
 
@@ -35,7 +39,7 @@ class AxisEstimate:
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 is none.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
-        method: "pair", "double wedge" or "centre of mass".
+        method: "pair", "opposite views", "double wedge" or "centre of mass".
     """
 
     value: float
@@ -77,6 +81,49 @@ def axis_from_pair(
         halves = [_mirror_mismatch(a[part], b[part], candidates) for part in (rows[::2], rows[1::2])]
         confident = max(abs(_lowest(candidates, half)[0] - value) for half in halves) < _AGREE
     return AxisEstimate(value, *_within(search, candidates, curve), confident, "pair")
+
+
+def axis_from_opposites(
+    projections: NDArray[np.floating], angles: Floats, search: tuple[float, float] | None = None
+) -> AxisEstimate:
+    """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
+
+    As `axis_from_pair`, of the views' slopes along the columns, which have no trend in common where the overlap is
+    narrow, summed over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
+    29, 17849).
+
+    Args:
+        projections: float32 [view, row, col], line integrals.
+        angles: [view], radians.
+        search: (lowest, highest) column; None: all but a 25th at each edge.
+
+    Raises:
+        ValueError: fewer than 8 pairs of opposite views, or values that are not finite.
+        AxisError: where the best match lies at the edge of the search range or outside it.
+    """
+    theta, cols = np.mod(np.asarray(angles, np.float64), 2 * np.pi), projections.shape[2]
+    away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
+    opposite = away.argmax(axis=1)
+    exact = np.pi - away[np.arange(theta.size), opposite] < max(2 / cols, 1e-9)
+    first = np.flatnonzero(exact & (theta < theta[opposite]))
+    if first.size < _FEWEST_PAIRS:
+        raise ValueError(f"{first.size} pairs of views half a turn apart; {_FEWEST_PAIRS} are needed")
+    first = first[np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))]
+    data = _few_rows(projections[np.concatenate((first, opposite[first]))])
+    if not np.isfinite(data).all():
+        raise ValueError("the views hold NaN or infinite values; correct them first")
+    slopes = np.diff(uniform_filter1d(data, 3, axis=2), axis=2)
+    a, b = slopes[: first.size], -slopes[first.size :]
+    candidates = np.arange(2 * cols // _EDGE, 2 * (cols - 1) - 2 * cols // _EDGE) / 2
+    curve = _mirror_mismatch(_rows_of(a), _rows_of(b), candidates - 0.5)
+    value, depth = _optimum(candidates, curve, search)
+    halves = [_mirror_mismatch(_rows_of(a[i::2]), _rows_of(b[i::2]), candidates - 0.5) for i in (0, 1)]
+    apart = max(abs(_lowest(candidates, half)[0] - value) for half in halves)
+    return AxisEstimate(value, *_within(search, candidates, curve), depth > 0.5 and apart < _AGREE, "opposite views")
+
+
+def _rows_of(views: Floats) -> Floats:
+    return views.reshape(-1, views.shape[2])
 
 
 def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
@@ -249,13 +296,17 @@ def find_axis(
 ) -> AxisEstimate:
     """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
+    Where all views do not tell it and they go round the full turn, pairs of opposite views do: the axis of a wide field
+    stands near an edge of the detector.
+
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
         search: (lowest, highest) column; None: the whole detector.
 
     Returns:
-        The estimate from all views, or that of the pair if only that is confident; not confident if they disagree.
+        The estimate from all views, or that of opposite views or of the pair if only that is confident; not confident
+        if they disagree.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
@@ -263,7 +314,14 @@ def find_axis(
     theta = np.asarray(angles, np.float64)
     if projections.ndim != 3:
         raise ValueError(f"projections must be [view, row, col], got shape {projections.shape}")
-    from_all = axis_from_sinogram(projections, theta, search)
+    try:
+        from_all = axis_from_sinogram(projections, theta, search)
+    except AxisError:
+        if (from_opposites := _confident_opposites(projections, theta, search)) is not None:
+            return from_opposites
+        raise
+    if not from_all.confident and (from_opposites := _confident_opposites(projections, theta, search)) is not None:
+        return from_opposites
     pair = _closest_pair(theta, tolerance=2 / projections.shape[2])
     if pair is None:
         return from_all
@@ -276,6 +334,15 @@ def find_axis(
     if abs(from_all.value - from_pair.value) > _AGREE:
         return replace(from_all, confident=False)
     return from_all if from_all.confident else from_pair
+
+
+def _confident_opposites(
+    projections: NDArray[np.floating], theta: Floats, search: tuple[float, float] | None
+) -> AxisEstimate | None:
+    with suppress(ValueError):  # an AxisError is one, too
+        estimate = axis_from_opposites(projections, theta, search)
+        return estimate if estimate.confident else None
+    return None
 
 
 def _closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:

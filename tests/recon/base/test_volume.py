@@ -67,7 +67,7 @@ def _shifted(*shifts: tuple[float, float]) -> Geometry:
 
 
 def test_a_shift_of_all_views_moves_the_matching_volume_as_the_axis_row_does() -> None:
-    explicit = Geometry.parallel(TURN, (10, 32), 0.5, axis_row=11.5)
+    explicit = Geometry.parallel(TURN, (10, 32), 0.5, axis_col=15.5 + 14.0, axis_row=11.5)
     found = Grid.matching(_shifted((14.0, 7.0)))
     assert found == Grid.matching(explicit)
     assert found.centre[0] == pytest.approx(Grid.for_fit(_shifted((0.0, 7.0)), found).centre[0])
