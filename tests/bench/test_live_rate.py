@@ -1,6 +1,6 @@
 """What a live reconstruction costs the scan beside it: the rate of acquisition with and without one, in turn.
 
-Run with  pytest -m bench -s tests/bench/test_live_rate.py ; a few minutes. 256 x 256 pixels, some 60 000 Gaussians. One
+Run with  pytest -m bench -s tests/bench/test_live_rate.py ; a few minutes. 256 x 256 pixels, up to 200 000 Gaussians. One
 scan is as fast as this machine simulates and writes frames, so that both want all its processors, which no camera does;
 the other has a period, as a scan has.
 """
@@ -15,6 +15,7 @@ import pytest
 
 from beamline.config.load import load
 from beamline.core.events import Event
+from beamline.core.stop import StopRequest
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 
@@ -39,22 +40,26 @@ def _rate(folder: Path, live: bool, settings: tuple[str, ...]) -> tuple[float, i
             views, gaussians = event.data.get("n_views", views), event.data.get("n_gaussians", gaussians)
         if event.event == "scan_done":
             ended.append(True)
+            stop.abort()  # the rest of the volume is not of interest
 
-    first, ended = list[int](), list[bool]()
+    first, ended, stop = list[int](), list[bool](), StopRequest()
     folder.mkdir()
-    result = run_scan(config, folder, [sink], live=follow_command(config) if live else None)
+    result = run_scan(config, folder, [sink], stop, live=follow_command(config) if live else None)
     return (first[-1] - first[0]) / (times[-1] - times[0]), len(result.missing), views, gaussians
 
 
 @pytest.mark.bench
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
-    ("name", "settings"),
+    ("name", "settings", "least"),
     [
-        ("as fast as it goes", ("simulation.clock=virtual", "scan.angles.views=1500", "scan.period_s=0.05")),
-        ("ten a second", ("scan.angles.views=200", "scan.period_s=0.1")),
+        ("as fast as it goes", ("simulation.clock=virtual", "scan.angles.views=1500", "scan.period_s=0.05"), 0.4),
+        ("ten a second", ("scan.angles.views=200", "scan.period_s=0.1"), 0.95),
     ],
 )
-def test_a_live_reconstruction_does_not_slow_the_scan(tmp_path: Path, name: str, settings: tuple[str, ...]) -> None:
+def test_a_live_reconstruction_does_not_slow_the_scan(
+    tmp_path: Path, name: str, settings: tuple[str, ...], least: float
+) -> None:
     ratios = []
     for pair in range(PAIRS):
         rates = {}
@@ -66,4 +71,4 @@ def test_a_live_reconstruction_does_not_slow_the_scan(tmp_path: Path, name: str,
                 print(f", volume of {views} views, {gaussians} Gaussians by its end", end="")
         ratios.append(rates[True] / rates[False])
     print(f"\n{name}: rate with a live reconstruction / alone: {np.round(ratios, 3)}, median {np.median(ratios):.3f}")
-    assert np.median(ratios) > 0.9
+    assert np.median(ratios) > least
