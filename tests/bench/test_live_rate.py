@@ -1,8 +1,8 @@
 """What a live reconstruction costs the scan beside it: the rate of acquisition with and without one, in turn.
 
-Run with  pytest -m bench -s tests/bench/test_live_rate.py ; a few minutes. 256 x 256 pixels, up to 200 000 Gaussians. One
-scan is as fast as this machine simulates and writes frames, so that both want all its processors, which no camera does;
-the other has a period, as a scan has.
+Run with  pytest -m bench -s tests/bench/test_live_rate.py ; a few minutes. 256 x 256 pixels, up to 200 000 Gaussians.
+One scan is as fast as this machine simulates and writes frames, so that both want all its processors, which no camera
+does; the other has a period, as a scan has.
 """
 
 from __future__ import annotations
