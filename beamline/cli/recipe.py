@@ -17,11 +17,11 @@ from click.core import ParameterSource
 
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
-    "output", "as_json", "report", "config", "write_config", "log", "verbose", "checkpoint", "resume", "follow",
+    "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume", "follow",
     "unfinished", "truth", "angles", "angle_rows", "darks", "flats",
 )  # fmt: skip
 """Options that are of one scan or one call, not of a recipe."""
-_NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "checkpoint")
+_NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint")
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML takes as they are
 
 

@@ -9,8 +9,9 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -30,10 +31,13 @@ from beamline.core.errors import QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import named_on_failure, refuse_existing, whole_file
 from beamline.core.version import version
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
 from recon.assess.plans import Quality
 from recon.base.choices import AUTO, Filter
 from recon.methods import DEFAULT, names
+
+if TYPE_CHECKING:
+    from beamline.reconstruct.options import ReconOptions
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
@@ -128,6 +132,12 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
 )
 @click.option("--log", type=click.Path(path_type=Path), help="Write everything that happens to this text file.")
 @click.option("-v", "--verbose", is_flag=True, help="Print everything that happens, with its time, to stderr.")
+@click.option(
+    "--dry-run",
+    "dry",
+    is_flag=True,
+    help="Say memory, time and bytes on disk, by seconds of small runs; no more.",
+)
 @json_option
 def recon(
     file: Path,
@@ -148,6 +158,7 @@ def recon(
     enough_gain: float | None,
     unfinished: bool,
     memory: int | None,
+    dry: bool,
     write_config: Path | None,
     log: Path | None,
     verbose: bool,
@@ -179,6 +190,8 @@ def recon(
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")
     if memory is not None and (follow or budget is not None):
         raise click.UsageError("--memory does not go with --follow or --budget, which hold everything in memory.")
+    if dry and (follow or budget is not None):
+        raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
     output = output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared(
@@ -207,6 +220,9 @@ def recon(
         _write_recipe(write_config, options.recipe)
         return
     clock = SystemClock()
+    if dry:
+        _dry_run(options, clock, as_json)
+        return
     last: list[Event] = []
     with (
         terminated_like_interrupted(),
@@ -250,6 +266,18 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 def report_beside(output: Path) -> Path:
     """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
     return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
+
+
+def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
+    """Say what a reconstruction will take."""
+    from beamline.reconstruct.estimate import estimate
+
+    with json_events(as_json) as sinks:
+        found = estimate(options, clock)
+        for sink in sinks:
+            sink(Event("done", clock.now(), asdict(found)))
+    if not as_json:
+        click.echo("\n".join(found.lines()))
 
 
 def _write_recipe(path: Path, text: str) -> None:

@@ -20,6 +20,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
 from drivers.clock import Clock
 from drivers.frame import FrameKind
+from recon.auto import Auto
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, Progress, RunControl
@@ -28,6 +29,7 @@ from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
+from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.odd_views import odd_views_memory
 from recon.voxels.unexplained import unexplained_memory
 
@@ -62,9 +64,11 @@ class Needs:
     weighted: bool
 
     @classmethod
-    def of(cls, method: Method, views: int, shape: tuple[int, int], itemsize: int) -> Needs:
-        """Before any frame is read: of so many views [row, col] of pixels of `itemsize` bytes."""
-        alike = Geometry.parallel(np.linspace(0, math.pi, views, endpoint=False), shape)
+    def of(
+        cls, method: Method, views: int, shape: tuple[int, int], itemsize: int, axis_col: float | None = None
+    ) -> Needs:
+        """Before any frame is read: of so many views [row, col], bytes of a pixel, and the axis where it is known."""
+        alike = Geometry.parallel(np.linspace(0, math.pi, views, endpoint=False), shape, axis_col=axis_col)
         return cls(method, alike, views * math.prod(shape) * itemsize, not method.traits.direct)
 
     @property
@@ -117,8 +121,7 @@ class Needs:
         return _ROWS
 
     def _grid(self, rows: int) -> Grid:
-        cols = self.geometry.detector_shape[1]
-        return Grid((rows, cols, cols), self.geometry.sample_pitch)
+        return Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
 
     def _of_share(self, rows: int) -> Method:
         return of_share(self.method, rows / self.rows)
@@ -144,7 +147,10 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     rows, frames = rows_of(source, selection), np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     views = choose_views(source, frames, selection).size
     shape = (rows.stop - rows.start) // selection.binning, source.shape[1] // selection.binning
-    return Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4)
+    axis = source.axis_col if selection.axis_col is None else selection.axis_col
+    if axis is not None:
+        axis = (axis - (selection.binning - 1) / 2) / selection.binning
+    return Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
 
 
 def spill_of(
@@ -162,10 +168,10 @@ def spill_of(
         needs = needs_of(source, options)
     except ConfigError:
         return None  # what is wrong with the views themselves comes first: reading them says it
-    memory = round(SHARE * free_memory()) if options.memory is None else options.memory
+    memory = memory_of(options)
     if needs.at_once <= memory:
         return None
-    _refuse_whole(source, options, needs, memory)
+    refuse_whole(source, options, needs, memory)
     refuse_smallest(source, replace(needs, weighted=False), memory, options.selection.binning)
     batch = max(1, int(_BATCH * memory / needs.view))
     warn(
@@ -176,7 +182,13 @@ def spill_of(
     return Spill(scratch_array(options.target.output.parent, shape), batch, told)
 
 
-def _refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory: int) -> None:
+def memory_of(options: ReconOptions) -> int:
+    """Bytes that may be used."""
+    return round(SHARE * free_memory()) if options.memory is None else options.memory
+
+
+def refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory: int) -> None:
+    """Raises ConfigError for options that need everything in memory."""
     whole = {
         "--budget": options.budget is not None,
         "--checkpoint and --resume": options.checkpoints.wanted,
@@ -218,7 +230,7 @@ def prepare_within(
     def said(text: str) -> None:
         sink(Event("state", clock.now(), {"state": "memory", "message": text}))
 
-    memory = round(SHARE * free_memory()) if options.memory is None else options.memory
+    memory = memory_of(options)
     spill = spill_of(source, options, told, said)
     prepared = prepare_projections(source, options.selection, warn, spill)
     if spill is None:
@@ -264,7 +276,14 @@ def in_slabs(
         decide = Decisions(options.seed, decided.made)
         watch = _of_all(control, begin, done, slab, grid.shape[0])
         one = replace(control, decide=decide, on_progress=watch)
-        found = _one(run, prepared, options.method, slab, one, volume)
+        try:
+            found = _one(run, prepared, options.method, slab, one, volume)
+        except DataError as error:
+            # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
+            if first is None or not isinstance(options.method, R2 | Auto):
+                raise
+            said(f"Slices {slab.own.start} to {slab.own.stop - 1} by fista-tv: {error}")
+            found = _one(run, prepared, FistaTv(), slab, one, volume)
         done += slab.own.stop - slab.own.start
         if first is None and found is not None:
             first, decided = found, decide

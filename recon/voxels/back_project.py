@@ -303,11 +303,19 @@ def compile_gridding() -> None:
 
 def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]) -> bool:
     """Whether gridding takes less time than going ray by ray, by what both took on two cores (docs/performance.md)."""
+    rays, gridded = nanoseconds(views, cols, voxels, slices, response)
+    return rays > gridded
+
+
+def nanoseconds(
+    views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]
+) -> tuple[float, float]:
+    """What sixteen slices of so many cost there, ray by ray and by gridding."""
     points = views * _frequencies(max(cols, *voxels), response)[0].size
     blocks = -(-slices // SLICES)
-    rays = _NS_A_RAY * views * voxels[0] * voxels[1]
     plane = _cells(voxels[0]) * _cells(voxels[1])
-    return rays > _NS_A_POINT * points + _NS_A_CELL * plane + _NS_OF_PLAN * points / blocks
+    rays = _NS_A_RAY * views * voxels[0] * voxels[1]
+    return rays, _NS_A_POINT * points + _NS_A_CELL * plane + _NS_OF_PLAN * points / blocks
 
 
 def columns_of(views: int, cols: int) -> F32:

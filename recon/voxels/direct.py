@@ -61,7 +61,8 @@ class Fbp:
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         views, (rows, cols) = geometry.n_views, geometry.detector_shape
-        return 4 * (math.prod(grid.shape) + 2 * weighted * views * rows * cols) + fbp_memory(views, cols)
+        beside = fbp_memory(views, max(cols, grid.shape[2]))
+        return 4 * (math.prod(grid.shape) + 2 * weighted * views * rows * cols) + beside
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views / binning**3

@@ -27,6 +27,7 @@ from recon.voxels.back_project import (
     columns_of,
     gridding,
     gridding_pays,
+    nanoseconds,
     ray_by_ray,
 )
 from recon.voxels.view_weights import ray_weights
@@ -143,6 +144,12 @@ def fbp_memory(views: int, cols: int) -> int:
     """Bytes that FBP of slices [cols, cols] takes beside projections and volume, about: of a plan and of one block."""
     samples, cells = round(1.4 * cols), (round(1.25 * cols) + 64) ** 2
     return 64 * views * (cols + 2 * samples) + 16 * views * samples + 64 * cells + 4 * 32 * 16 * 8 * cols
+
+
+def fbp_nanoseconds(views: int, cols: int, slices: int) -> float:
+    """What FBP of so many slices [cols, cols] costs, on the machine of docs/performance.md."""
+    response = partial(_transfer, pixel_pitch=1.0, filter="hann")
+    return min(nanoseconds(views, cols, (cols, cols), slices, response)) * -(-slices // SLICES)
 
 
 def is_gridded(geometry: Geometry, grid: Grid, filter: Filter) -> bool:

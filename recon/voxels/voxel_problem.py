@@ -137,7 +137,8 @@ def iterative_memory(
         filtered: the method makes a filtered back-projection, too.
     """
     n_rays = geometry.n_views * math.prod(geometry.detector_shape)
-    beside = fbp_memory(geometry.n_views, geometry.detector_shape[1]) if filtered else 0
+    wide = max(geometry.detector_shape[1], grid.shape[2])
+    beside = fbp_memory(geometry.n_views, wide) if filtered else 0
     return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -150,3 +151,32 @@ def test_what_is_needed_grows_with_the_scan() -> None:
     assert full.least < 4e9 and full.slab(full.height(8_000_000_000)) < 8e9
     tv = replace(Needs.of(OsSirtTv(), 1800, (2048, 2048), 2), weighted=False)
     assert 64 <= tv.height(32_000_000_000) < 256 and tv.slab(tv.height(32_000_000_000)) < 32e9
+
+
+@pytest.mark.usefixtures("tall")
+def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) -> None:
+    few = ("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--memory", "16M", "--dry-run")
+    said = beamline(*few)
+    assert said.exit_code == 0, said.output
+    assert "200 x 48 x 48 voxels by sirt, from 60 views" in said.stdout and "about" in said.stdout
+    data = json.loads(beamline(*few, "--json").stdout.splitlines()[-1])
+    assert data["slabs"] > 1 and data["memory"] <= 16_000_000 < data["at_once"]
+    assert data["output"] == 4 * 200 * 48**2 and data["scratch"] == 4 * 60 * 200 * 48 + 2 * data["output"]
+    assert data["seconds"] > 0
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "1M", "--dry-run")
+    assert result.exit_code == 5 and "Give --memory 3M" in result.stderr
+    assert left(tmp_path) == {"scan.h5"}
+
+
+def test_a_slab_of_air_is_left_to_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gaussians are placed in matter; the views of a slab without any may even be below zero on average."""
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(96, 32), axis_col=15.7)
+    counts = scan.counts()
+    counts[:, 40:] = 20110
+    write_exchange(Path("scan.h5"), scan, {"data": counts, "data_white": np.full((2, 96, 32), 20100, np.uint16)})
+    options = ("recon", "scan.h5", "-m", "r2", "--steps", "10", "--gaussians", "900", "--air", "none", "--no-report")
+    result = beamline(*options, "--memory", "7M", "-o", "out.h5")
+    assert result.exit_code == 0 and "by fista-tv" in result.stderr, result.output
+    volume = read_reconstruction(Path("out.h5")).volume.data
+    assert np.abs(volume[70:]).max() < 0.02 * volume.max()

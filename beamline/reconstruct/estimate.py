@@ -1,0 +1,96 @@
+"""What a reconstruction will take, before it begins: memory, time, and bytes on disk."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+
+from beamline.core.errors import DataError
+from beamline.core.text import count, size
+from beamline.projections.selection import cone_of
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.slabs import memory_of, needs_of, refuse_smallest, refuse_whole
+from drivers.clock import Clock
+from recon.assess.time_model import duration_text
+from recon.base.slabs import slabs_of
+from recon.base.volume import Grid
+from recon.run_time import Extent, run_seconds
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a reconstruction will take.
+
+    Attributes:
+        method: its name.
+        views: that are used.
+        shape: of the volume [z, y, x].
+        at_once: bytes of memory with everything in it.
+        allowed: bytes of memory that may be used.
+        memory: bytes that will be used.
+        slabs: how many.
+        scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
+        output: bytes of the result.
+        free: bytes on that disk.
+        seconds: without reading and correction.
+    """
+
+    method: str
+    views: int
+    shape: tuple[int, int, int]
+    at_once: int
+    allowed: int
+    memory: int
+    slabs: int
+    scratch: int
+    output: int
+    free: int
+    seconds: float
+
+    def lines(self) -> list[str]:
+        in_slabs = f"in {count(self.slabs, 'slab')}; all at once would take {size(self.at_once)}"
+        how = in_slabs if self.scratch else "all at once"
+        return [
+            f"{'volume':<10}{' x '.join(str(n) for n in self.shape)} voxels by {self.method}, from {self.views} views",
+            f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}, {how}",
+            f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
+            f"{'time':<10}about {duration_text(self.seconds)}, reading and correction not counted",
+        ]
+
+
+def estimate(options: ReconOptions, clock: Clock) -> Estimate:
+    """What a reconstruction of a finished scan of a parallel beam will take.
+
+    Raises:
+        DataError: it does not fit into the memory or on the disk, with the option that would make it fit; for a cone.
+        ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
+    """
+    with options.source.open() as source:
+        if cone_of(source, options.selection) is not None:
+            raise DataError(f"{source.path}: --dry-run is for a parallel beam; this is a cone.")
+        allowed, needs = memory_of(options), needs_of(source, options)
+        rows = needs.rows
+        slabs = slabs_of(rows, rows, 0)
+        fits = needs.at_once <= allowed
+        if not fits:
+            refuse_whole(source, options, needs, allowed)
+            needs = replace(needs, weighted=False)  # as it is unless a part of the detector is dead, or a view flagged
+            refuse_smallest(source, needs, allowed, options.selection.binning)
+            slabs = slabs_of(rows, needs.height(allowed), needs.method.traits.halo)
+    direct = needs.method.traits.direct
+    volumes = 1 if direct or options.target.report is None else 2
+    scratch = 0 if fits else needs.line_integrals + volumes * needs.volume
+    free = shutil.disk_usage(options.target.output.parent).free
+    if scratch + needs.volume > free:
+        raise DataError(
+            f"{options.target.output.parent} has {size(free)}, and {size(scratch + needs.volume)} are needed. Write "
+            f"with -o to another disk, or give --bin {2 * options.selection.binning}."
+        )
+    shape = Grid.matching(needs.geometry).shape
+    heights = [slab.slices.stop - slab.slices.start for slab in slabs]
+    seconds = run_seconds(options.method, Extent(needs.geometry.n_views, shape[2], heights), clock.now)
+    return Estimate(
+        options.method.name, needs.geometry.n_views, shape, needs.at_once, allowed,
+        needs.at_once if fits else max(needs.slab(needs.height(allowed)), needs.least), len(slabs), scratch,
+        needs.volume, free, seconds,
+    )  # fmt: skip

@@ -1,0 +1,152 @@
+"""How long a reconstruction will take, from a second or two of small runs on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.method import Method, RunControl
+from recon.base.volume import Grid
+from recon.methods import has_setting, with_settings
+from recon.reconstruction import reconstruct
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import default_count
+from recon.splatting.r2 import R2
+from recon.voxels.direct import Fbp
+from recon.voxels.fbp import fbp_nanoseconds
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.projector import Projector
+
+Clock = Callable[[], float]
+F32 = NDArray[np.float32]
+Decided = Mapping[str, Sequence[Any]]
+
+_ROWS, _COLS, _VIEWS = 16, 128, (108, 216)  # of small runs; two numbers of views tell what a view costs
+_TRIED, _TALL, _SWEEPS = (
+    (72, 64, 16),
+    96,
+    4,
+)  # views, columns and rows of trials of a weight; most rows; iterations that are timed
+_FBP_COLS, _FBP_VIEWS = 512, 180
+_STEPS = 12  # of a small fit
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much a reconstruction works on.
+
+    Attributes:
+        views, cols: of the scan.
+        heights: slices of each slab, with its halo.
+    """
+
+    views: int
+    cols: int
+    heights: Sequence[int]
+
+    @property
+    def rows(self) -> int:
+        return sum(self.heights)
+
+
+def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
+    """Seconds that the method takes, without reading and correction; of `auto`, where it chooses its first candidate.
+
+    Iterations cost views times voxels and, for what they do to the volume alone, voxels; a weight of total variation is
+    chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover.
+    """
+    if has_setting(type(method), "iterations"):
+        return _of_iterations(method, getattr(method, "iterations"), extent, now)  # noqa: B009
+    if isinstance(method, R2):
+        return _of_fit(method, extent, now)
+    if isinstance(method, Fbp):
+        return _of_fbp(extent, now)
+    candidates: Sequence[Method] = getattr(method, "candidates", ())
+    tried = Extent(extent.views, extent.cols, [32])
+    return sum(run_seconds(one, tried, now) for one in candidates) + (
+        run_seconds(candidates[0], extent, now) if candidates else 0.0
+    )
+
+
+def _of_iterations(method: Method, iterations: int, extent: Extent, now: Clock) -> float:
+    deciding, decided = _took(method, _TRIED, 1 + _SWEEPS, Decisions(), now, twice=True)
+    following, _ = _took(method, _TRIED, 1 + _SWEEPS, Decisions(0, decided), now)
+    height = min(max(extent.heights), _TALL)  # rows are the innermost loop: few of them cost more each
+    few, many = (_of_sweeps(method, (views, _COLS // 2, height), decided, now) for views in _VIEWS)
+    at = (extent.views - _VIEWS[0]) / (_VIEWS[1] - _VIEWS[0])
+    sweep, start = (max(a + at * (b - a), 0.0) for a, b in zip(few, many, strict=True))
+    rays = extent.views * extent.cols**2 / (_TRIED[0] * _TRIED[1] ** 2)
+    once = rays * max(deciding - following, 0.0)  # trials on sixteen rows; how many depends on the data
+    return (2 * extent.cols / _COLS) ** 2 * extent.rows / height * (start + iterations * sweep) + once
+
+
+def _of_sweeps(method: Method, size: tuple[int, int, int], decided: Decided, now: Clock) -> tuple[float, float]:
+    """Seconds of an iteration, and of what goes before the first."""
+    one, last = (_took(method, size, n, Decisions(0, decided), now)[0] for n in (1, 1 + _SWEEPS))
+    sweep = (last - one) / _SWEEPS
+    return sweep, one - sweep
+
+
+def _took(
+    method: Method, size: tuple[int, int, int], iterations: int, decide: Decisions, now: Clock, twice: bool = False
+) -> tuple[float, Decided]:
+    """Seconds of so many iterations, and what was decided; `twice`: a run before compiles."""
+    geometry, data = _sample(*size)
+    one = with_settings(method, {"iterations": iterations})
+    if twice:
+        reconstruct(data, geometry, with_settings(method, {"iterations": 1}))
+    begin = now()
+    reconstruct(data, geometry, one, control=RunControl(decide=decide))
+    return now() - begin, decide.made
+
+
+def _of_fbp(extent: Extent, now: Clock) -> float:
+    cols, views = min(extent.cols, _FBP_COLS), min(extent.views, _FBP_VIEWS)
+    geometry, data = _sample(views, cols)
+    times = []
+    for _ in range(3):
+        begin = now()
+        reconstruct(data, geometry, Fbp())
+        times.append(now() - begin)
+    share = min(times) / fbp_nanoseconds(views, cols, _ROWS)
+    return share * sum(fbp_nanoseconds(extent.views, extent.cols, height) for height in extent.heights)
+
+
+def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
+    geometry, data = _sample(_VIEWS[0], _COLS)
+    count = default_count(Grid.matching(geometry))
+
+    def took(steps: int) -> float:
+        begin = now()
+        reconstruct(data, geometry, R2(steps=steps, finish=0, gaussians=count))
+        return now() - begin
+
+    took(2)
+    step = (took(2 * _STEPS) - took(_STEPS)) / _STEPS
+    voxels = _ROWS * _COLS**2
+    given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
+    fitted = 0.0
+    for height in extent.heights:
+        grid = Grid((height, extent.cols, extent.cols))
+        of_slab = default_count(grid) if given is None else given * height / extent.rows
+        fitted += ((height * extent.cols**2) / voxels) ** (2 / 3) * (of_slab / count) ** (1 / 3)
+    steps = method.seconds if method.seconds is not None else (method.planned_steps or 0) * step * fitted
+    sweeps = 8 if method.finish is None else method.finish
+    finish = _of_iterations(FistaTv(), sweeps, extent, now) if sweeps else 0.0
+    return steps + finish + _of_fbp(extent, now)
+
+
+def _sample(views: int, cols: int, rows: int = _ROWS) -> tuple[Geometry, F32]:
+    """Views of a disc with a hole, with some noise."""
+    geometry = Geometry.parallel(np.arange(views) * np.pi / views, (rows, cols))
+    grid = Grid.matching(geometry)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    disc = (np.hypot(x, y) < 0.4 * cols) & ~(np.hypot(x - 0.1 * cols, y) < 0.1 * cols)
+    data = Projector(geometry, grid).forward((disc / cols).astype(np.float32))
+    return geometry, data + np.random.default_rng(0).normal(0, 0.02, data.shape).astype(np.float32)
