@@ -12,7 +12,7 @@ import click
 
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
-from recon.base.choices import FEW_PHOTONS, Noise
+from recon.base.choices import FEW_PHOTONS, Noise, Rings
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -96,6 +96,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         judge=rest.pop("flags") == "judge",
         accept_references=rest.pop("references") == "accept",
         noise=rest.pop("noise"),
+        rings=rest.pop("rings"),
         gain=rest.pop("gain"),
     )
     if selection.gain is not None and selection.noise == "log":
@@ -180,6 +181,14 @@ _AFTER = (
         help="log: line integrals are logarithms of counts; counts: they carry the likelihood of the photons counted, "
         f"with weights, which few photons need; auto: counts where a pixel of the open beam has fewer than "
         f"{FEW_PHOTONS}.",
+    ),
+    click.option(
+        "--rings",
+        type=click.Choice(get_args(Rings)),
+        default="none",
+        show_default=True,
+        help="Stripes of the sinograms, which make rings. sort: small ones; vo: dead columns, large and small ones; "
+        "wavelet: by their wavelets; auto: sort or vo where there are some, and says so.",
     ),
     click.option(
         "--gain", type=POSITIVE, metavar="COUNTS", help="Counts a photon, for --noise. Default: as the flats vary."

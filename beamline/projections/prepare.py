@@ -39,6 +39,7 @@ from recon.base.masks import RayWeights, areas, masked
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate, find_axis
 from recon.prep.correct import Projections
+from recon.prep.rings import remove_rings
 from recon.voxels.projector import seen_rays
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
@@ -66,6 +67,7 @@ class PreparedProjections:
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
+        rings: what was done about rings; empty where nothing was asked.
         shares_of: `shares` of some rows [view, row, col], where line integrals lie on disk and these are made when
             wanted; None: as `shares` says.
     """
@@ -85,6 +87,7 @@ class PreparedProjections:
     measured: NDArray[np.bool_] | None = None
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
+    rings: str = ""
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
 
     @property
@@ -195,6 +198,7 @@ def prepare_projections(
         projections = correction.at_once(scan_frames[chosen])
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
+    taken, rings = remove_rings(projections.data, source.angles[projections.view_ids], selection.rings)
     regions = usable.regions
     shares_of = None
     if spill is not None:
@@ -208,6 +212,7 @@ def prepare_projections(
     if rest.size:
         others = correction.at_once(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
         unseen = geometry_of(source, selection, axis_col, source.angles[others.view_ids])
+        others.data[...] -= taken
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
     found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
     found = replace(
@@ -215,6 +220,7 @@ def prepare_projections(
         geometry=jumps.corrected(found.geometry, projections.view_ids),
         jumps=jumps.said,
         noise=correction.noise,
+        rings=rings,
         shares_of=shares_of,
     )
     if spill is not None:

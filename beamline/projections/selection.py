@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.storage.readers.base import ScanSource
 from recon.base.choices import Noise as Noise
+from recon.base.choices import Rings
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
@@ -36,6 +37,7 @@ class Selection:
         accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
         noise: "log": line integrals are logarithms of counts; "counts": they and weights carry the likelihood of the
             counts; "auto": that where the open beam has few photons a pixel.
+        rings: how stripes are removed from line integrals, see `recon.prep.rings.remove_rings`.
         gain: counts a photon, of single pixels; None finds it by the flats.
     """
 
@@ -51,6 +53,7 @@ class Selection:
     judge: bool = False
     accept_references: bool = False
     noise: Noise = "auto"
+    rings: Rings = "none"
     gain: float | None = None
 
 

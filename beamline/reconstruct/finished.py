@@ -100,6 +100,8 @@ def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, c
     """Send the event `recon_started`; before it, how photons were counted."""
     if prepared.noise:
         sink(Event("state", clock.now(), {"state": "noise", "message": prepared.noise}))
+    if prepared.rings:
+        sink(Event("state", clock.now(), {"state": "rings", "message": prepared.rings}))
     data = {
         "file": options.source.path,
         "method": options.method.name,

@@ -179,6 +179,8 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "quantity": prepared.quantity,
         **(_flat("correction", asdict(selection.correction)) if corrected else {}),
         **({"noise": prepared.noise or "logarithms of counts"} if corrected else {}),
+        "rings": selection.rings,
+        **({"rings_removed": prepared.rings} if prepared.rings else {}),
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),

@@ -12,6 +12,7 @@ AUTO = "auto"
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 Loss = Literal["l1", "l2", "poisson"]
 Noise = Literal["auto", "log", "counts"]
+Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
 Start = Literal["fbp", "tv"]
 
 KERNEL = Kernel.COMPACT

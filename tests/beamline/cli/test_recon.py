@@ -15,6 +15,7 @@ from beamline.monitor.check import Level
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr
+from recon.prep.rings import ring_score
 from recon.splatting.schedule import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import frames_of, write_flagged
@@ -183,3 +184,24 @@ def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None
     truth = SCAN.truth(used.volume.grid)
     assert psnr(truth, used.volume.data) > psnr(truth, ignored.volume.data) + 10
     assert (used.parameters["flags"], used.parameters["views_left_out"], used.parameters["n_views"]) == ("use", 10, 20)
+
+
+def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) -> None:
+    scan, options = str(shared_data / "diamond_24737_parallel_91x135x160.h5"), ("--axis", "85.75", "--rows", "60:64")
+    scores, middle = {}, 79.5
+    for rings in ("none", "auto"):
+        result = beamline("recon", scan, "-m", "fbp", "--rings", rings, *options, "--no-report", "-o", f"{rings}.h5")
+        assert result.exit_code == 0, result.output
+        record = read_reconstruction(folder / f"{rings}.h5")
+        scores[rings] = ring_score(record.volume.data[0], (middle, middle))
+        assert record.parameters["rings"] == rings
+    assert "Rings: removed by vo; stripes of" in result.stderr
+    assert str(record.parameters["rings_removed"]) in result.stderr
+    assert scores["auto"] < 0.5 * scores["none"], scores
+
+
+def test_rings_need_a_finished_scan_and_columns(folder: Path) -> None:
+    result = beamline("recon", "scan.h5", "--rings", "auto", "--follow")
+    assert result.exit_code == 2 and "--rings is for a finished scan" in result.stderr
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--rings", "sort", "--no-report")
+    assert result.exit_code == 0 and "30 views of 40 columns are too few" in result.stderr

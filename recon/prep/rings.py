@@ -1,0 +1,239 @@
+"""Rings: pixels that answer unequally to the beam make stripes in a sinogram, rings in a slice; here they are removed.
+
+A sinogram is float32 [view, col] of one detector row, line integrals in the order of their angles, where a stripe is a
+column. Stripes of views that cover little angle cannot be told from the sample's own edges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from recon.base.choices import Rings
+
+F32 = NDArray[np.float32]
+
+_ROBUST = 1.4826  # median deviation to standard deviation, for normal values
+_FAR = 3.0  # standard deviations from which on a column is another than its neighbours (Vo 2018: snr 3)
+_FEWEST_VIEWS, _NARROWEST = 8, 64  # in 40 columns what was put in was more than what was taken out
+_MOST = 0.1  # of the columns
+_SEEN = 4.5  # `stripe_score` from which on there are stripes: 1.4 to 3.6 without, 5 to 10 in two real scans
+_LEVELS, _DAMPING = 2, 1.0  # of the wavelets; more levels take wider stripes, and more of the sample
+
+# Scaling filter of Daubechies' wavelet with five vanishing moments (Daubechies 1992, table 6.1).
+_DB5 = np.array(
+    [0.160102397974125, 0.603829269797473, 0.724308528438574, 0.138428145901103, -0.242294887066190,
+     -0.032244869585030, 0.077571493840065, -0.006241490213012, -0.012580751999016, 0.003335725285002]
+)  # fmt: skip
+
+
+def width_for(cols: int) -> int:
+    """Odd number of columns, of a median along them, that is wider than small stripes and narrower than the sample: 31
+    for 2048, 7 for 160, 3 for 40."""
+    return 2 * round(max(cols * 0.015, min(6.0, cols / 24)) / 2) + 1
+
+
+def by_sorting(sinogram: F32, width: int | None = None) -> F32:
+    """Small and medium stripes out: a median along the columns of values sorted in each column.
+
+    A stripe shifts all values of its column; sorted, neighbouring columns look alike, so that what differs is the
+    stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3).
+    """
+    order = np.argsort(sinogram, axis=0, kind="stable")
+    ranked = np.take_along_axis(sinogram, order, axis=0)
+    smooth = median_filter(ranked, (1, width or width_for(sinogram.shape[1])), mode="nearest")
+    out = np.empty_like(sinogram)
+    np.put_along_axis(out, order, smooth, axis=0)
+    return out
+
+
+def without_dead_columns(sinogram: F32) -> F32:
+    """Columns that hardly answer, or flicker, filled from their neighbours (Vo et al. 2018, algorithm 6).
+
+    They are told by how much they vary from view to view, against a median of the columns around.
+    """
+    rough = np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")).mean(axis=0)
+    bad = _outliers(np.log(np.maximum(rough, 1e-12) / np.maximum(_around(rough, 4), 1e-12)), 2 * _FAR)
+    return _filled(sinogram, bad)
+
+
+def without_large_stripes(sinogram: F32) -> F32:
+    """Wide or strong stripes shifted onto their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
+
+    Only columns whose sorted values lie off those around by three times the noise of a pixel, over the middle four
+    fifths of them, are changed, and none where a tenth of all are.
+    """
+    ranked = np.sort(sinogram, axis=0)
+    smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
+    drop = len(ranked) // 10
+    shift = (ranked - smooth)[drop : len(ranked) - drop].mean(axis=0)
+    far = np.abs(shift) > _FAR * max(_noise(sinogram), _ROBUST * float(np.median(np.abs(shift))))
+    if far.mean() > _MOST:
+        return sinogram  # so many are the sample's own
+    return sinogram - np.where(far, shift, 0).astype(np.float32)
+
+
+def by_vo(sinogram: F32) -> F32:
+    """Dead columns, large stripes, then small ones, one after another (Vo et al. 2018, section 3.7)."""
+    return by_sorting(without_large_stripes(without_dead_columns(sinogram)))
+
+
+def by_wavelets(sinogram: F32, levels: int = _LEVELS, damping: float = _DAMPING) -> F32:
+    """Stripes out of the wavelet coefficients that hold them (Münch, Trtik, Marone & Stampanoni 2009, Opt. Express 17,
+    8567).
+
+    Coefficients that are smooth along the views and rough along the columns hold the stripes; there, frequencies k
+    along the views are damped by 1 - exp(-k² / (2 damping²)).
+    """
+    views, cols = sinogram.shape
+    step = 2**levels
+    pad = [(step * 2, step * 2 + -n % step) for n in (views, cols)]
+    smooth = np.pad(sinogram.astype(np.float64), pad, mode="symmetric")
+    details = []
+    for _ in range(levels):
+        low, high = _analysed(smooth, 1)
+        smooth, along = _analysed(low, 0)
+        stripes, corner = _analysed(high, 0)
+        spectrum = np.fft.rfft(stripes, axis=0)
+        k = np.arange(len(spectrum))[:, None]
+        stripes = np.fft.irfft(spectrum * (1 - np.exp(-(k**2) / (2 * damping**2))), len(stripes), axis=0)
+        details.append((along, stripes, corner))
+    for along, stripes, corner in reversed(details):
+        smooth = _synthesised(_synthesised(smooth, along, 0), _synthesised(stripes, corner, 0), 1)
+    return smooth[pad[0][0] : pad[0][0] + views, pad[1][0] : pad[1][0] + cols].astype(np.float32)
+
+
+REMOVERS: Mapping[str, Callable[[F32], F32]] = MappingProxyType(
+    {"sort": by_sorting, "vo": by_vo, "wavelet": by_wavelets}
+)
+"""Ways to remove stripes, by name."""
+
+
+def stripe_score(sinogram: F32) -> float:
+    """How far columns lie off the four beside them in most views, in the noise of that figure; about 1 without stripes.
+
+    The median over views leaves out edges of the sample, which cross a column in a few views. A body that stands on the
+    axis stays, and counts as a stripe.
+    """
+    x = sinogram
+    off = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
+    noise = _noise(off)
+    of_columns = np.median(off, axis=0)
+    rough = np.diff(of_columns, 2) / math.sqrt(6)  # a large body bends slowly from column to column
+    spread = _ROBUST * np.median(np.abs(rough))
+    return float(spread / max(noise * math.sqrt(math.pi / 2 / len(x)), 1e-12))
+
+
+def remove_rings(views: F32, angles: NDArray[np.float64], rings: Rings) -> tuple[F32, str]:
+    """Stripes out of all rows of line integrals [view, row, col], in place.
+
+    Args:
+        views: in any order; fewer than 8, or of fewer than 64 columns, are not changed.
+        angles: [view], radians.
+        rings: the way; "auto": by `stripe_score` of some rows, `sort` where stripes are seen and `vo` where columns
+            are dead or far off, or nothing.
+
+    Returns:
+        float32 [row, col], what was taken from a view on average, and a sentence about it; "" where nothing was asked.
+    """
+    taken = np.zeros(views.shape[1:], np.float32)
+    if rings == "none":
+        return taken, ""
+    if len(views) < _FEWEST_VIEWS or views.shape[2] < _NARROWEST:
+        return taken, (
+            f"Rings: {len(views)} views of {views.shape[2]} columns are too few to tell stripes from the sample (at "
+            f"least {_FEWEST_VIEWS} of {_NARROWEST}); none removed."
+        )
+    order = np.argsort(angles, kind="stable")
+    rows = np.unique(np.linspace(0, views.shape[1] - 1, min(views.shape[1], 8)).astype(int))
+    before = float(np.median([stripe_score(views[order, row]) for row in rows]))
+    way: str = rings
+    if rings == "auto":
+        odd = sum(_odd_columns(views[order, row]) for row in rows)
+        way = "vo" if odd else "sort" if before > _SEEN else "none"
+        if way == "none":
+            return taken, f"Rings: none seen (stripes of {before:.1f}, seen from {_SEEN:g} on); none removed."
+    remover = REMOVERS[way]
+    for row in range(views.shape[1]):
+        stripes = views[order, row]
+        clean = remover(stripes)
+        taken[row] = (stripes - clean).mean(axis=0)
+        views[order, row] = clean
+    after = float(np.median([stripe_score(views[order, row]) for row in rows]))
+    return taken, f"Rings: removed by {way}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+
+
+def ring_score(image: NDArray[np.floating], axis: tuple[float, float], width: int = 9) -> float:
+    """Rings of a slice: standard deviation of means along circles about the axis, less their median over `width` radii.
+
+    Args:
+        image: [y, x].
+        axis: (y, x) in voxels, on which the rings are centred.
+    """
+    y, x = np.indices(image.shape)
+    radius = np.rint(np.hypot(y - axis[0], x - axis[1])).astype(int)
+    reach = min(image.shape) // 2 - 2
+    inside = (radius < reach) & np.isfinite(image)
+    count = np.bincount(radius[inside], minlength=reach)
+    means = np.bincount(radius[inside], image[inside], minlength=reach) / np.maximum(count, 1)
+    off = (means - _around(means, width))[width:]  # short circles about the axis are structure
+    return float(off.std())
+
+
+def _noise(values: NDArray[np.floating]) -> float:
+    """Standard deviation from view to view, robustly by second differences."""
+    return float(_ROBUST * np.median(np.abs(np.diff(values, 2, axis=0))) / math.sqrt(6))
+
+
+def _odd_columns(sinogram: F32) -> int:
+    """How many columns are dead or far off, at most a fifth."""
+    cleaned = without_large_stripes(without_dead_columns(sinogram))
+    changed = (cleaned != sinogram).any(axis=0).sum()
+    strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
+    return int(strong.sum()) if changed <= sinogram.shape[1] / 5 else 0
+
+
+def _around(values: NDArray[np.floating], width: int) -> NDArray[np.floating]:
+    return np.asarray(median_filter(values, 2 * (width // 2) + 1, mode="nearest"))
+
+
+def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
+    off = np.abs(values - np.median(values))
+    return np.asarray(off > limit * _ROBUST * max(float(np.median(off)), 1e-12))
+
+
+def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
+    """Bad columns by the line between the good ones beside them; nothing where more than half are bad."""
+    if not bad.any() or bad.mean() > 0.5:
+        return sinogram
+    good, wanted = np.flatnonzero(~bad), np.flatnonzero(bad)
+    after = np.clip(np.searchsorted(good, wanted), 0, good.size - 1)
+    left, right = good[np.clip(after - 1, 0, None)], good[after]
+    share = np.clip((wanted - left) / np.maximum(right - left, 1), 0, 1).astype(np.float32)
+    out = sinogram.copy()
+    out[:, wanted] = (1 - share) * sinogram[:, left] + share * sinogram[:, right]
+    return out
+
+
+def _analysed(values: NDArray[np.float64], axis: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Smooth and detail coefficients of a periodic signal along an axis, each half as long."""
+    values = np.moveaxis(values, axis, 0)
+    low = sum(h * np.roll(values, -n, axis=0)[::2] for n, h in enumerate(_DB5))
+    high = sum((-1) ** n * h * np.roll(values, -n, axis=0)[::2] for n, h in enumerate(_DB5[::-1]))
+    return np.moveaxis(np.asarray(low), 0, axis), np.moveaxis(np.asarray(high), 0, axis)
+
+
+def _synthesised(low: NDArray[np.float64], high: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """The signal of these coefficients: the transpose of `_analysed`, which is orthogonal."""
+    low, high = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
+    out = np.zeros((2 * len(low), *low.shape[1:]))
+    for n, (h, g) in enumerate(zip(_DB5, _DB5[::-1], strict=True)):
+        spread = np.zeros_like(out)
+        spread[::2] = h * low + (-1) ** n * g * high
+        out += np.roll(spread, n, axis=0)
+    return np.moveaxis(out, 0, axis)
