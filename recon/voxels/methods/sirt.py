@@ -53,7 +53,7 @@ class Sirt:
         return iteration_trials({"quick": (20, 60), "full": (10, 30, 100, 300)}[depth])
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 4.1, 3.1, 3.1 * weighted)
+        return iterative_memory(geometry, grid, 4.5, 3.2, 3.1 * weighted)
 
     def work(self, n_views: int, binning: int) -> float:
         return n_views * self.iterations / binning**3
