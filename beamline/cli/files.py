@@ -76,10 +76,9 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
     Exit code: 0 no error (warnings may be), 5 errors.
     """
     clock = SystemClock()
-    now = clock.now()
     with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
         progress = counting("validate", fan_out(*(sinks or [terminal])), clock)
-        findings = findings_of(SourceOptions(file, **said), progress if deep else None)
+        findings, now = findings_of(SourceOptions(file, **said), progress if deep else None), clock.now()
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for sink in sinks:
             for finding in findings:

@@ -77,8 +77,9 @@ def repeating(ctx: click.Context, argument: Path, output: Path) -> str:
             on = str(value).lower() in ("true", "1", "yes", "on", "y", "t")
             words += [max(option.opts if on else option.secondary_opts, key=len)] if on or option.secondary_opts else []
             continue
-        for each in value if isinstance(value, list | tuple) else [value]:
-            words += [max(option.opts, key=len), _from_anywhere(str(each), option.type)]
+        name, several = max(option.opts, key=len), value if isinstance(value, list | tuple) else [value]
+        values = [_from_anywhere(str(each), option.type) for each in several]
+        words += [name, *values] if option.nargs > 1 else [word for each in values for word in (name, each)]
     words += ["--output", again]
     return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
 

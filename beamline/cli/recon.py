@@ -297,7 +297,9 @@ def _logged(path: Path | None) -> Iterator[list[Sink]]:
         yield []
         return
     refuse_existing(path)
-    with named_on_failure(path), path.open("x", encoding="utf-8") as file:
+    with named_on_failure(path):
+        file = path.open("x", encoding="utf-8")
+    with file:
         lines = LogLines(file)
         lines(Event("state", SystemClock().now(), {"message": f"splatline {version()}: {shlex.join(sys.argv)}"}))
         try:

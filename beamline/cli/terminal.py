@@ -134,7 +134,7 @@ class LogLines:
             said = ", ".join(f"{name} {value}" for name, value in event.data.items())
         at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
         with self._lock, _closed_terminal_ignored():
-            self._stream.write(f"{at}  {event.event}: {' '.join(said.split())}\n")
+            self._stream.write(f"{at}  {event.event}: {printable(' '.join(said.split()))}\n")
             self._stream.flush()
 
 

@@ -76,7 +76,8 @@ def exit_code(error: BaseException) -> int:
 
 def damaged(error: BaseException) -> bool:
     """HDF5 could not read or follow what a file holds; h5py has no class of its own for that."""
-    return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in str(error)
+    said = str(error)
+    return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in said and "exist" not in said
 
 
 def user_message(error: BaseException) -> str:

@@ -80,6 +80,7 @@ def digest(
         raise ValueError(f"The preview bin is {preview_bin}; it must be at least 1.")
     image = np.ascontiguousarray(image).view()
     image.flags.writeable = False  # one compiled kernel for all: numba tells writable arrays from others
+    checksum = checksum_of(image)  # of the pixels as they are written
     preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
     peaks = np.empty_like(preview)
     if image.dtype == np.uint16 and no_data is None:
@@ -89,7 +90,7 @@ def digest(
             image = image.astype(np.float64)
             image.flags.writeable = False
         numbers = _from_reals(image, saturation, preview_bin, no_data, preview, peaks)
-    return FrameDigest(*numbers, checksum_of(image), preview, peaks)
+    return FrameDigest(*numbers, checksum, preview, peaks)
 
 
 def checksum_of(image: NDArray[Any]) -> int:

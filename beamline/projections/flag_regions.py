@@ -35,12 +35,19 @@ class Regions:
     shares: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     local: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
+    def mark(self, view_ids: I64) -> bool:
+        """Whether a ray of these views weighs less."""
+        return bool(self._of(view_ids).any())
+
+    def _of(self, view_ids: I64) -> NDArray[np.bool_]:
+        return np.isin(self.frames, view_ids[self.local[view_ids]]) if self.local.size else np.zeros(0, np.bool_)
+
     def weights(self, view_ids: I64, rows: slice, binning: int, shape: tuple[int, int]) -> NDArray[np.float32] | None:
         """[view, row, col] weights of the rays of some views, in binned pixels `shape` of these detector rows.
 
         None where all are 1.
         """
-        chosen = np.isin(self.frames, view_ids[self.local[view_ids]]) if self.local.size else np.zeros(0, np.bool_)
+        chosen = self._of(view_ids)
         if not chosen.any():
             return None
         height, width = shape

@@ -202,10 +202,9 @@ def prepare_projections(
     regions = usable.regions
     shares_of = None
     if spill is not None:
-        rows = rows_of(source, selection)
-        shares_of = partial(
-            _shares_of, regions, projections.view_ids, rows, selection.binning, projections.data.shape[2]
-        )
+        rows, ids = rows_of(source, selection), projections.view_ids
+        if regions.mark(ids):
+            shares_of = partial(_shares_of, regions, ids, rows, selection.binning, projections.data.shape[2])
         usable = replace(usable, regions=Regions())
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     held_out = None
@@ -370,7 +369,7 @@ def locate_axis(
     """
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
-    frames = frames[_spread(np.arange(frames.size), _AXIS_VIEWS)]
+    frames = frames[_axis_views(source.angles[frames], _AXIS_VIEWS)]
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)))
     try:
         estimate = find_axis(band.data, source.angles[band.view_ids])
@@ -412,6 +411,16 @@ def report_defects(projections: Projections, warn: Warn) -> None:
 def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
     """The values of views, and ones for others after them."""
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
+
+
+def _axis_views(angles: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    """At most `n` views, evenly spread; of a full turn half as many, and with each the one opposite to it."""
+    every = np.arange(angles.size)
+    if angles.size <= n or np.ptp(angles) < 1.5 * np.pi:
+        return _spread(every, n)
+    some = _spread(every, n // 2)
+    away = np.abs(np.mod(angles[some][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
+    return np.union1d(some, away.argmax(axis=1))
 
 
 def _spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:

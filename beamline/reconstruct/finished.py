@@ -73,7 +73,9 @@ def reconstruct_file(
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
-    options.target.require_room(4 * math.prod(Grid.matching(prepared.geometry).shape))
+    volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
+    compared = options.target.report is not None and not options.method.traits.direct
+    options.target.require_room(volume, (1 + compared) * volume if slabs else 0)
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
@@ -215,7 +217,7 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
     def said(text: str) -> None:
         job.sink(Event("state", job.clock.now(), {"state": "slab", "message": text}))
 
-    result = in_slabs(job.run_on, job.prepared, options, slabs, control, said)
+    result = in_slabs(job.run_on, job.prepared, options, slabs, control, said, job.warn)
     return job.outcome(result, job.stop_latch.stopped, _chosen(result))
 
 

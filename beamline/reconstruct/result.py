@@ -55,13 +55,15 @@ class OutputPaths:
                 "-o. Nothing was read."
             ) from error
 
-    def require_room(self, n_bytes: int) -> None:
-        """Raise DataError before the work where the disk has no room for a volume of so many bytes."""
+    def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
+        """Raise DataError before the work where the disk has no room for a volume of so many bytes, and for what lies
+        there `meanwhile`."""
         free = shutil.disk_usage(self.output.parent).free
-        if n_bytes > free:
+        if n_bytes + meanwhile > free:
+            work = f" and {size(meanwhile)} while it is made" if meanwhile else ""
             raise DataError(
-                f"The volume takes {size(n_bytes)}, the disk of {self.output} has {size(free)} free. Free some space, "
-                "name an output elsewhere with -o, or give --bin. Nothing was written."
+                f"The volume takes {size(n_bytes)}{work}, the disk of {self.output} has {size(free)} free. Free some "
+                "space, name an output elsewhere with -o, or give --bin. Nothing was written."
             )
 
 

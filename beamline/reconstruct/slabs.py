@@ -98,7 +98,7 @@ class Needs:
         seen = min(height + 2 * self.method.traits.halo, self.rows)
         part = self.geometry.rows(0, seen)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        return rays + self._of_share(seen).memory(part, self._grid(seen), self.weighted)
+        return rays + self._for_part(seen).memory(part, self._grid(seen), self.weighted)
 
     @property
     def figures(self) -> int:
@@ -123,18 +123,21 @@ class Needs:
     def _grid(self, rows: int) -> Grid:
         return Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
 
-    def _of_share(self, rows: int) -> Method:
-        return of_share(self.method, rows / self.rows)
+    def _for_part(self, rows: int) -> Method:
+        return for_part(self.method, rows, self.rows, self.rows)
 
 
-def of_share(method: Method, share: float) -> Method:
-    """The method for a part of the volume: as many Gaussians and seconds as belong to it."""
+def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
+    """The method for so many slices: as many Gaussians as belong to them `of` a volume, and their part of the seconds
+    for all slabs, which with what they share have so many `in_all`."""
     if not isinstance(method, R2):
         return method
     count = method.gaussians
     if isinstance(count, int):
-        count = max(1, round(share * count))
-    return replace(method, gaussians=count, seconds=None if method.seconds is None else share * method.seconds)
+        count = max(1, round(slices / of * count))
+    return replace(
+        method, gaussians=count, seconds=None if method.seconds is None else slices / in_all * method.seconds
+    )
 
 
 def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
@@ -233,15 +236,27 @@ def prepare_within(
     memory = memory_of(options)
     spill = spill_of(source, options, told, said)
     prepared = prepare_projections(source, options.selection, warn, spill)
-    if spill is None:
-        return prepared, []
     geometry, method = prepared.geometry, options.method
+    if spill is None:
+        _refuse_wider(source, prepared, Needs(method, geometry, 0, not method.traits.direct), memory)
+        return prepared, []
     if not geometry.is_straight:
         raise DataError(f"{source.path}: its views are rolled or tilted, which needs the whole scan in memory.")
-    weighted = not method.traits.direct and prepared.ray_factors() is not None
+    weighted = not method.traits.direct and (prepared.ray_factors() is not None or prepared.shares_of is not None)
     needs = Needs(method, geometry, 0, weighted)
     refuse_smallest(source, needs, memory, options.selection.binning)
     return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)
+
+
+def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: Needs, memory: int) -> None:
+    """Raises DataError where a volume that was thought to fit does not: its axis, found since, is near an edge."""
+    if needs.geometry.is_cone or prepared.axis is None or needs.at_once <= memory:
+        return
+    raise DataError(
+        f"{source.path}: the rotation axis was found at column {prepared.axis_col:.2f}, off the middle, and the volume "
+        f"that a full turn sees takes {size(needs.at_once)} of memory, {size(memory)} may be used. Give "
+        f"--axis {prepared.axis_col:.2f}, so that it is made in slabs. Nothing was written."
+    )
 
 
 def in_slabs(
@@ -251,6 +266,7 @@ def in_slabs(
     slabs: Sequence[Slab],
     control: RunControl,
     said: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> Reconstruction:
     """A method's volume on disk, slab by slab.
 
@@ -261,34 +277,41 @@ def in_slabs(
         run: reconstructs a slab.
         control: of all slabs together.
         said: is told of each slab.
+        warn: is told of slices that are not there, or not by the method.
 
     Raises:
-        DataError: there is no slab to show.
+        DataError: the views are zero everywhere.
     """
     grid, begin = Grid.matching(prepared.geometry), control.now()
     volume = Volume(scratch_array(options.target.output.parent, grid.shape), grid)
     first: Reconstruction | None = None
-    decided, done = Decisions(options.seed), 0
+    decided, done, in_all = Decisions(options.seed), 0, sum(slab.slices.stop - slab.slices.start for slab in slabs)
     for n, slab in enumerate(busiest_first(prepared, grid, slabs)):
-        if control.should_stop is not None and control.should_stop():
+        if first is not None and control.should_stop is not None and control.should_stop():
+            warn(
+                f"Stopped after {n} of {len(slabs)} slabs: {done} of {grid.shape[0]} slices are there, the others are "
+                "empty."
+            )
             break
         said(f"Slab {n + 1} of {len(slabs)}: slices {slab.own.start} to {slab.own.stop - 1}.")
         decide = Decisions(options.seed, decided.made)
         watch = _of_all(control, begin, done, slab, grid.shape[0])
         one = replace(control, decide=decide, on_progress=watch)
         try:
-            found = _one(run, prepared, options.method, slab, one, volume)
+            slices = slab.slices.stop - slab.slices.start
+            method = for_part(options.method, slices, grid.shape[0], in_all)
+            found = _one(run, prepared, method, slab, one, volume)
         except DataError as error:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
             if first is None or not isinstance(options.method, R2 | Auto):
                 raise
-            said(f"Slices {slab.own.start} to {slab.own.stop - 1} by fista-tv: {error}")
+            warn(f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}")
             found = _one(run, prepared, FistaTv(), slab, one, volume)
         done += slab.own.stop - slab.own.start
         if first is None and found is not None:
             first, decided = found, decide
     if first is None:
-        raise DataError("The views are zero everywhere, or the reconstruction was stopped before there was a slab.")
+        raise DataError("The views are zero everywhere: there is nothing in the beam.")
     settings = {**first.settings, "slabs": len(slabs), "slab_halo": options.method.traits.halo}
     return replace(first, seconds=control.now() - begin, settings=settings)
 
@@ -301,7 +324,7 @@ def _one(
     part = prepared.of_rows(rows, geometry)
     if not part.projections.data.any():
         return None
-    found = run(of_share(method, box.shape[0] / volume.grid.shape[0]), part, box, control)
+    found = run(method, part, box, control)
     for k, share in enumerate(slab.share):
         volume.data[slab.slices.start + k] += share * found.volume.data[k]
     return replace(found, volume=volume, gaussians=None, checkpoint=None)

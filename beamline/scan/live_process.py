@@ -118,6 +118,8 @@ class LiveReconstruction:
     Args:
         enough: is told why the views so far are enough, in the thread that reads the output.
         what: its name in messages.
+        silence: s without output after which `finish` stops it.
+        low_priority: it gives way to a scan that runs beside it.
     """
 
     def __init__(
@@ -127,15 +129,20 @@ class LiveReconstruction:
         emit: Emit,
         enough: Callable[[str], None] = lambda reason: None,
         what: str = "live reconstruction",
+        silence: float = _SILENCE,
+        low_priority: bool = True,
     ) -> None:
         self._emit, self._log, self._enough, self._what = emit, log, enough, what
+        self._silence = silence
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
         self._ready = threading.Event()
         self._process: ChildProcess | None = None
         try:
             with log.open("x", encoding="utf-8") as stderr:
-                self._process = ChildProcess(command, stderr, self._pass_on, on_end=self._say_if_early, behind=True)
+                self._process = ChildProcess(
+                    command, stderr, self._pass_on, on_end=self._say_if_early, behind=low_priority
+                )
         except OSError as error:
             message = f"The {what} could not be started ({error}). The scan is not affected."
             emit("warning", {"message": message})
@@ -168,11 +175,11 @@ class LiveReconstruction:
         if process is None:
             return None
         self._wanted = False
-        ending = process.wait(stop=stop, hurry=hurry, silence=_SILENCE, grace=_GRACE)
+        ending = process.wait(stop=stop, hurry=hurry, silence=self._silence, grace=_GRACE)
         if self._done is None:
             reasons = {
                 Ending.STOPPED: "it was stopped",
-                Ending.SILENT: f"it was stopped after {_SILENCE:.0f} s without output",
+                Ending.SILENT: f"it was stopped after {self._silence:.0f} s without output",
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
             message = f"The {self._what} gave no volume: {reason}; see {self._log.name}. The scan is not affected."
@@ -188,9 +195,10 @@ class LiveReconstruction:
     def _say_if_early(self) -> None:
         """Warn at once where it has ended while the scan runs: the operator watches a volume that grows no more."""
         if self._wanted and self._done is None:
+            when = "in the middle of the scan" if self._ready.is_set() else "before it was ready"
             message = (
-                f"The live reconstruction has ended in the middle of the scan; see {self._log.name}. The scan goes on "
-                "without it. To start another: beamline recon FILE --follow -o OUT.h5"
+                f"The live reconstruction has ended {when}; see {self._log.name}. The scan goes on without it. To "
+                "start another: beamline recon FILE --follow -o OUT.h5"
             )
             self._emit("warning", {"message": message, "source": "recon"})
 

@@ -206,7 +206,8 @@ class _Run:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
         began = time.monotonic()
         log = self.folder / RECON_LOG
-        process = LiveReconstruction(command(result.path, self.folder / RECON), log, self.emit, what="reconstruction")
+        words = command(result.path, self.folder / RECON)
+        process = LiveReconstruction(words, log, self.emit, what="reconstruction", silence=math.inf, low_priority=False)
         try:
             recon = process.finish(lambda: self.stop.stopping, lambda: self.stop.aborting)
         finally:

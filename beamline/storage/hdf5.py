@@ -105,6 +105,8 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except ALTERED as error:
+        if isinstance(error, MemoryError | PermissionError | FileNotFoundError):
+            raise
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
             f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was changed."
@@ -211,7 +213,7 @@ def missing_links(item: h5py.Dataset) -> list[str]:
     for source in item.virtual_sources():
         if source.file_name == ".":
             drawn = dataset(item.file, source.dset_name)
-            if drawn is None or drawn.shape[1:] != item.shape[1:]:
+            if drawn is None or drawn.shape[1:] != source.src_space.shape[1:]:
                 lost.add(source.dset_name)
         elif not (folder / source.file_name).is_file():
             lost.add(str(folder / source.file_name))

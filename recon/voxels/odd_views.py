@@ -175,4 +175,4 @@ def _cells(images: F32, side: int) -> F32:
     """Means of squares of pixels; rows and columns left over at the ends count for nothing."""
     rows, cols = (n // side for n in images.shape[1:])
     whole = images[:, : rows * side, : cols * side]
-    return np.asarray(whole.reshape(-1, rows, side, cols, side).mean(axis=(2, 4)), np.float32)
+    return np.asarray(whole.reshape(len(images), rows, side, cols, side).mean(axis=(2, 4)), np.float32)

@@ -28,7 +28,7 @@ def _found(rule: Rule, places: Places) -> list[Finding]:
     try:
         return list(rule(places))
     except hdf5.ALTERED as error:
-        return [Finding("error", "layout", f"{rule.__name__}: not laid out as it should be ({error}).")]
+        return [Finding("error", "layout", f"{rule.__name__}: damaged, or not laid out as it should be ({error}).")]
 
 
 def definition_said(places: Places) -> Iterator[Finding]:

@@ -30,5 +30,5 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         yield Finding("warning", "ended-early", "The reconstruction was stopped early; this is what it had reached.")
     if record.length_unit != "mm":
         yield Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")
-    if record.parameters and not Path(record.raw_file).is_file():
+    if record.parameters and not Path(record.raw_file).exists():
         yield Finding("info", "raw-file", f"The scan that it was made from, {record.raw_file}, is not there.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.errors import DataError
 from beamline.core.version import version
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
@@ -49,7 +51,11 @@ class Slices:
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         for z in range(self.shape[0]):
-            yield self._stored(np.asarray(self._data[z : z + 1][0], np.float32))
+            try:
+                values = np.asarray(self._data[z : z + 1][0], np.float32)
+            except OSError as error:
+                raise DataError(f"Slice {z} of the volume cannot be read ({error}).") from error
+            yield self._stored(values)
 
     def _stored(self, values: NDArray[np.float32]) -> NDArray[Any]:
         dtype, window = self.pixels.dtype, self.pixels.window
@@ -147,7 +153,9 @@ def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
 
 def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:
     """The record of a volume of which nothing else is known; `spacing` (z, y, x) in mm."""
-    dz, _, dx = spacing or (1.0, 1.0, 1.0)
+    dz, dy, dx = spacing or (1.0, 1.0, 1.0)
+    if not math.isclose(dy, dx, rel_tol=1e-3):
+        raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be kept.")
     return ReconRecord(
         volume=Volume(values, Grid(values.shape, dx, slice_pitch=dz)),
         length_unit="px" if spacing is None else "mm",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -144,10 +145,12 @@ def opened_reconstruction(path: Path) -> Iterator[ReconRecord]:
 def _read_entry(entry: h5py.Group) -> ReconRecord:
     data, process = entry["data"], entry["reconstruction"]
     z, y, x = (np.asarray(data[name][:]) for name in ("z", "y", "x"))
-    # A one-voxel axis says nothing about the voxel size, the longest one says it best.
-    longest = max((z, y, x), key=len)
-    size = float(longest[-1] - longest[0]) / (len(longest) - 1) if len(longest) > 1 else 1.0
-    grid = Grid(data["data"].shape, size, tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x)))  # type: ignore[arg-type]
+    # An axis of one voxel says nothing about the voxel size, the longer one says it best; slices may be higher.
+    height = _pitch(z)
+    size = _pitch(max(y, x, key=len)) or height or 1.0
+    pitch = None if height is None or math.isclose(height, size, rel_tol=1e-3) else height
+    centre = tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x))
+    grid = Grid(data["data"].shape, size, centre, pitch)  # type: ignore[arg-type]
     parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(
         volume=Volume(data["data"], grid),
@@ -160,6 +163,11 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         metrics={name: float(node[()]) for name, node in process["metrics"].items()},
         history={name: np.asarray(node[()]) for name, node in process["history"].items()},
     )
+
+
+def _pitch(axis: NDArray[np.floating]) -> float | None:
+    """From voxel to voxel; None of one voxel."""
+    return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
 
 
 def value_of(node: h5py.Dataset) -> Value:

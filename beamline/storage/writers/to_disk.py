@@ -9,6 +9,8 @@ import time
 
 SECONDS = 1.0  # between two calls, at least
 
+_PATIENCE = 60.0  # s that the last calls may take
+
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
 
 
@@ -52,13 +54,18 @@ class ToDisk:
         """Wait until everything is on the disk.
 
         Raises:
-            OSError: it did not take it.
+            OSError: it did not take it, or not within a minute a call.
         """
-        if self._thread is not None:
-            self._thread.join()
-        if self._error is not None:
-            raise self._error
-        to_disk(self._handle)
+        for last in (self._thread, threading.Thread(target=self._run, name="to disk", daemon=True)):
+            if last is None:
+                continue
+            if not last.ident:
+                last.start()
+            last.join(_PATIENCE)
+            if last.is_alive():
+                raise OSError(errno.ETIMEDOUT, f"the disk has not taken the file for {_PATIENCE:.0f} s")
+            if self._error is not None:
+                raise self._error
 
     def _run(self) -> None:
         try:

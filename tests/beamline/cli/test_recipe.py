@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.cli.recipe import repeating
+from beamline.cli.segment import segment
 from beamline.cli.study import study
 from beamline.cli.tradeoff import tradeoff
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
@@ -123,3 +124,9 @@ def test_lines_of_commands_with_arguments_and_flags(folder: Path) -> None:
     context = tradeoff.make_context("tradeoff", ["scan.h5", "--full", "--darks", "d.tif"])
     line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
     assert line == ["beamline", "tradeoff", scan, "--darks", str(folder / "d.tif"), "--full", "--output", "t_again"]
+
+
+def test_an_option_of_two_values_stands_once(folder: Path) -> None:
+    context = segment.make_context("segment", ["scan.h5", "--percentiles", "1", "99"])
+    line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
+    assert " ".join(line).count("--percentiles 1 99") == 1

@@ -174,3 +174,12 @@ def test_a_frame_takes_a_few_milliseconds(shape: tuple[int, int], limit: float, 
     seconds = time.perf_counter() - start
     print(f"{shape}: {seconds * 1e3:.2f} ms")
     assert seconds < limit
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint16, np.float32, np.float64])
+@pytest.mark.parametrize("no_data", [None, 0.0])
+def test_the_checksum_is_of_the_pixels_as_they_are_written(
+    dtype: type, no_data: float | None, rng: np.random.Generator
+) -> None:
+    image = rng.integers(0, 200, (9, 7)).astype(dtype)
+    assert digest(image, no_data=no_data).checksum == zlib.crc32(image.tobytes())

@@ -88,3 +88,11 @@ def test_few_views_say_nothing() -> None:
     volume, clean = _sample(geometry)
     clean[10] += _speck(15, 40, 1.0)
     assert odd_views(volume, clean, geometry) == ()
+
+
+def test_rows_that_fill_no_cell_count_for_nothing(rng: np.random.Generator) -> None:
+    geometry = Geometry.parallel(TURN, (17, 256))  # cells of 2 x 2, bands of 16 rows: one row is left over
+    volume = Volume(np.full((17, 256, 256), 1e-4, np.float32), Grid.matching(geometry))
+    views = Projector(geometry, volume.grid).forward(volume.data)
+    views += rng.normal(0, SIGMA, views.shape).astype(np.float32)
+    assert odd_views(volume, views, geometry) == ()

@@ -147,3 +147,10 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     for name in ("text.h5", "other.h5", "missing.h5"):
         with pytest.raises(DataError, match="cannot be read as a reconstruction"):
             read_reconstruction(tmp_path / name)
+
+
+def test_slices_that_are_higher_than_pixels_are_wide_stay_so(tmp_path: Path) -> None:
+    record = _record((3, 4, 4), 0.02)
+    grid = Grid((3, 4, 4), 0.02, slice_pitch=0.05)
+    write_reconstruction(tmp_path / "v.h5", replace(record, volume=Volume(record.volume.data, grid)))
+    assert read_reconstruction(tmp_path / "v.h5").volume.grid.spacing == pytest.approx((0.05, 0.02, 0.02))
