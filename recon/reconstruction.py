@@ -69,6 +69,7 @@ class Reconstruction:
         try:
             np.savez(
                 partial, volume=self.volume.data, voxel_mm=self.volume.grid.voxel_size,
+                slice_mm=self.volume.grid.spacing[0],
                 centre_zyx_mm=self.volume.grid.centre, method=self.method, seconds=self.seconds,
                 settings=json.dumps(settings, default=str),
             )  # fmt: skip

@@ -13,13 +13,14 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
 from recon.base.volume import Grid
-from recon.methods import has_setting, with_settings
+from recon.methods import with_settings
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
 from recon.voxels.fbp import fbp_nanoseconds
+from recon.voxels.iterative import IterativeMethod
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
@@ -28,11 +29,8 @@ F32 = NDArray[np.float32]
 Decided = Mapping[str, Sequence[Any]]
 
 _ROWS, _COLS, _VIEWS = 16, 128, (108, 216)  # of small runs; two numbers of views tell what a view costs
-_TRIED, _TALL, _SWEEPS = (
-    (72, 64, 16),
-    96,
-    4,
-)  # views, columns and rows of trials of a weight; most rows; iterations that are timed
+_TRIED = 72, 64, 16  # views, columns and rows of trials of a weight
+_TALL, _SWEEPS = 96, 4  # most rows; iterations that are timed
 _FBP_COLS, _FBP_VIEWS = 512, 180
 _STEPS = 12  # of a small fit
 
@@ -61,8 +59,8 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
     Iterations cost views times voxels and, for what they do to the volume alone, voxels; a weight of total variation is
     chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover.
     """
-    if has_setting(type(method), "iterations"):
-        return _of_iterations(method, getattr(method, "iterations"), extent, now)  # noqa: B009
+    if isinstance(method, IterativeMethod):
+        return _of_iterations(method, method.iterations, extent, now)
     if isinstance(method, R2):
         return _of_fit(method, extent, now)
     if isinstance(method, Fbp):

@@ -136,7 +136,7 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     "--dry-run",
     "dry",
     is_flag=True,
-    help="Say memory, time and bytes on disk, by seconds of small runs; no more.",
+    help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
 )
 @json_option
 def recon(
@@ -186,7 +186,7 @@ def recon(
     if follow and values["flags"] == "judge":
         raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")
     if follow and values["rings"] != "none":
-        raise click.UsageError("--rings is for a finished scan: a stripe is told by all views.")
+        raise click.UsageError("--rings is for a finished scan: it needs all views.")
     enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
     if enough is not None and not follow:
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")

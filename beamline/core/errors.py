@@ -88,8 +88,8 @@ def user_message(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return (
             f"Out of memory ({str(error) or 'no details'}). No half result was kept. Take fewer --rows or --views, a "
-            "coarser --bin, or recon -m fbp, which keeps within --memory."
+            "coarser --bin, or a smaller --memory, which works in slabs."
         )
     if damaged(error):
         return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
-    return "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or repr(error)
+    return str(error) or ("interrupted" if isinstance(error, KeyboardInterrupt) else repr(error))

@@ -88,7 +88,7 @@ class ScanCorrection:
         if self.photons is not None:
             raise DataError(
                 f"{self._source.path}: photons are counted, which needs all views in "
-                "memory. Give --noise log, or --bin 2."
+                f"memory. Give --noise log, or --bin {2 * self.binning}."
             )
         parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._references is None else 2
         stream, columns, alive = None, (0, 0), []

@@ -146,7 +146,7 @@ class PreparedProjections:
 
 @dataclass(frozen=True, eq=False)
 class Spill:
-    """Line integrals on disk instead of in memory, for a direct method.
+    """Line integrals on disk instead of in memory, for work in slabs.
 
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.

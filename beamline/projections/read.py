@@ -71,7 +71,8 @@ def read_references(
     for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group], use_damaged)
         if dark is not None and mean is not None:
-            flats.append((float(group.mean()), (mean + (1 - scale[group].mean()) * dark).astype(np.float32)))
+            used = group if use_damaged else np.setdiff1d(group, list(source.damaged))
+            flats.append((float(used.mean()), (mean + (1 - scale[used].mean()) * dark).astype(np.float32)))
     if dark is None or not flats:
         raise DataError(
             f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: their pixels are not those that "

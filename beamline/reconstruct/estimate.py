@@ -88,7 +88,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
         )
     shape = Grid.matching(needs.geometry).shape
     heights = [slab.slices.stop - slab.slices.start for slab in slabs]
-    seconds = run_seconds(options.method, Extent(needs.geometry.n_views, shape[2], heights), clock.now)
+    seconds = run_seconds(needs.method, Extent(needs.geometry.n_views, shape[2], heights), clock.now)
     return Estimate(
         options.method.name, needs.geometry.n_views, shape, needs.at_once, allowed,
         needs.at_once if fits else max(needs.slab(needs.height(allowed)), needs.least), len(slabs), scratch,

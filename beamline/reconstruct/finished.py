@@ -31,7 +31,6 @@ from recon.base.volume import Grid
 from recon.methods import with_trait
 from recon.reconstruction import Reconstruction
 from recon.splatting.backend import backend_for
-from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
@@ -202,16 +201,13 @@ class _Job:
 
 def _at_once(job: _Job) -> ReconOutcome:
     """Run a method on the whole volume."""
-    method = job.options.method
+    method = job.options.method_for(job.prepared.geometry)
     return _by_fit(job, method) if isinstance(method, R2) else _by_method(job, method)
 
 
 def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
     """Run a method slab by slab."""
-    options = job.options
-    if isinstance(options.method, R2) and options.quality is not None:
-        count = default_count(Grid.of_field(job.prepared.geometry, job.grid.voxel_size))
-        options = replace(options, method=options.method.with_quality(options.quality, count))
+    options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
 
     def said(text: str) -> None:
@@ -237,11 +233,7 @@ def _by_method(job: _Job, method: Method) -> ReconOutcome:
 def _by_fit(job: _Job, method: R2) -> ReconOutcome:
     """Fit Gaussians; save checkpoints and continue from one if asked to."""
     options, prepared = job.options, job.prepared
-    asked, chosen = method.gaussians, ""
-    if options.quality is not None:
-        method = method.with_quality(
-            options.quality, default_count(Grid.of_field(prepared.geometry, job.grid.voxel_size))
-        )
+    asked, chosen = method.gaussians if options.quality is None else None, ""
     steps, checkpoints = method.planned_steps or 0, options.checkpoints
     origin, resume = {}, None
     if checkpoints.wanted:

@@ -139,7 +139,7 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: C
             return True
         if stopped() and not growing.source.finished:
             if not growing.has_volume:
-                raise KeyboardInterrupt
+                raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False
         if clock.now() - last_frame > rhythm.patience:
             if held(growing.source.path):  # it waits: for the operator, the beam, or a long exposure

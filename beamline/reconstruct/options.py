@@ -10,8 +10,11 @@ from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.open import SourceOptions
 from recon.assess.plans import Quality
+from recon.base.geometry import Geometry
 from recon.base.method import Method
+from recon.base.volume import Grid
 from recon.methods import names, streams
+from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.splatting.streaming_method import StreamingMethod
 from recon.voxels.enough_views import Goal
@@ -36,7 +39,7 @@ class ReconOptions:
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the frames that there are, where the scan still runs or died.
         enough: of a followed scan: when its views are enough; None: nobody asks.
-        memory: bytes that FBP may use; None: 70 % of what is free.
+        memory: bytes that the reconstruction may use; None: 70 % of what is free.
         command: that repeats this, for the record.
         recipe: its options that hold for any scan, as YAML, for the record.
     """
@@ -57,6 +60,12 @@ class ReconOptions:
     memory: int | None = None
     command: str = ""
     recipe: str = ""
+
+    def method_for(self, geometry: Geometry) -> Method:
+        """The method for these views, with the steps and Gaussians of the preset, if there is one."""
+        if self.quality is None or not isinstance(self.method, R2):
+            return self.method
+        return self.method.with_quality(self.quality, default_count(Grid.of_field(geometry, geometry.sample_pitch)))
 
     @property
     def streaming(self) -> StreamingMethod:

@@ -153,7 +153,8 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     axis = source.axis_col if selection.axis_col is None else selection.axis_col
     if axis is not None:
         axis = (axis - (selection.binning - 1) / 2) / selection.binning
-    return Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
+    needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
+    return replace(needs, method=options.method_for(needs.geometry))
 
 
 def spill_of(
@@ -236,7 +237,7 @@ def prepare_within(
     memory = memory_of(options)
     spill = spill_of(source, options, told, said)
     prepared = prepare_projections(source, options.selection, warn, spill)
-    geometry, method = prepared.geometry, options.method
+    geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if spill is None:
         _refuse_wider(source, prepared, Needs(method, geometry, 0, not method.traits.direct), memory)
         return prepared, []

@@ -153,7 +153,8 @@ def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tupl
     spacing = arrays.get("voxel_mm")
     if spacing is None or spacing.ndim != 0 or not (np.issubdtype(spacing.dtype, np.floating) and spacing > 0):
         return arrays[name], None
-    return arrays[name], (float(spacing),) * 3
+    slices = arrays.get("slice_mm", spacing)
+    return arrays[name], (float(slices), float(spacing), float(spacing))
 
 
 def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.generic]:

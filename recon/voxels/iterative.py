@@ -13,7 +13,7 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from recon.voxels.voxel_problem import VoxelProblem
 F32 = NDArray[np.float32]
 
 
+@runtime_checkable
 class IterativeMethod(Protocol):
     """An iterative method on voxels, such as `recon.voxels.methods.sirt.Sirt`."""
 

@@ -72,14 +72,14 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCo
         now: s, of a clock for short times.
     """
     # What changes the rays of a frame is no step of its own: it costs what a frame takes longer with it.
-    aims = [effect for effect in scene.chain.effects if not isinstance(effect, ImageEffect)]
+    ray_effects = [effect for effect in scene.chain.effects if not isinstance(effect, ImageEffect)]
     rest = [effect for effect in scene.chain.effects if isinstance(effect, ImageEffect)]
-    variants = [replace(scene, chain=Chain.of([*aims[:n], *rest])) for n in range(len(aims) + 1)]
+    variants = [replace(scene, chain=Chain.of([*ray_effects[:n], *rest])) for n in range(len(ray_effects) + 1)]
     rounds = [_round(variants, shot, now) for _ in range(repeats + 1)][1:]
     seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
     sizes, peaks = _sizes(variants[0], shot), [_peak(each, shot) for each in variants]
     costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
-    for n, effect in enumerate(aims):
+    for n, effect in enumerate(ray_effects):
         more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
         costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))
     order = [effect.name for effect in rest]
