@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,9 +28,10 @@ from beamline.cli.recipe import Repeatable, config_option, recipe_text, repeatin
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import LogLines, Terminal, results
 from beamline.core.errors import QualityError, ScanStopped, user_message
-from beamline.core.events import Event, Sink, fan_out
+from beamline.core.events import Event, Sink, fan_out, while_it_works
 from beamline.core.files import named_on_failure, refuse_existing, whole_file
 from beamline.core.version import version
+from beamline.scan.run_folder import new_log
 from drivers.clock import Clock, SystemClock
 from recon.assess.plans import Quality
 from recon.base.choices import AUTO, Filter
@@ -230,11 +231,11 @@ def recon(
         terminated_like_interrupted(),
         json_events(as_json) as json_sinks,
         Terminal(sys.stderr) as terminal,
-        _logged(log) as logged,
     ):
-        shown = [LogLines(sys.stderr)] if verbose else [terminal]
-        sink = fan_out(last.append, *logged, *(json_sinks or shown))
-        metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
+        shown = fan_out(*(json_sinks or [LogLines(sys.stderr) if verbose else terminal]))
+        with _logged(log, shown) as logged:
+            sink = fan_out(last.append, *logged, shown)
+            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
     if not as_json:
         click.echo(results(last[-1].data))
     if last[-1].data.get("ended_early"):
@@ -291,16 +292,19 @@ def _write_recipe(path: Path, text: str) -> None:
 
 
 @contextmanager
-def _logged(path: Path | None) -> Iterator[list[Sink]]:
-    """The sink that writes a log; none where none is wanted. An error in the block is its last line."""
+def _logged(path: Path | None, tell: Sink) -> Iterator[list[Sink]]:
+    """The sink that writes a log; none where none is wanted. An error in the block is its last line.
+
+    Where its disk takes no more, `tell` gets a warning, and the work goes on.
+    """
     if path is None:
         yield []
         return
     refuse_existing(path)
-    with named_on_failure(path):
-        file = path.open("x", encoding="utf-8")
-    with file:
-        lines = LogLines(file)
+    with ExitStack() as closing:
+        with named_on_failure(path):
+            file = closing.enter_context(new_log(path))
+        lines = while_it_works(LogLines(file), tell)
         lines(Event("state", SystemClock().now(), {"message": f"splatline {version()}: {shlex.join(sys.argv)}"}))
         try:
             yield [lines]

@@ -80,6 +80,24 @@ def fan_out(*sinks: Sink) -> Sink:
     return send
 
 
+def while_it_works(sink: Sink, tell: Sink) -> Sink:
+    """A sink that gets events until it raises (a full disk, a closed pipe); `tell` then gets a warning, once."""
+    works = True
+
+    def send(event: Event) -> None:
+        nonlocal works
+        if not works:
+            return
+        try:
+            sink(event)
+        except Exception as error:
+            works = False
+            message = f"An output of events failed and gets no further events: {error}"
+            tell(Event("warning", event.time, {"message": message}))
+
+    return send
+
+
 Emit = Callable[[str, Mapping[str, Any]], None]
 """(kind of event, data): the event happened now."""
 
@@ -109,7 +127,7 @@ class Announcer:
     """
 
     def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:
-        self._sinks, self._clock = list(sinks), clock
+        self._sinks, self._clock = [while_it_works(sink, self._send) for sink in sinks], clock
         self._queue: SimpleQueue[Event | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._deliver, name="announcer", daemon=True)
 
@@ -132,12 +150,5 @@ class Announcer:
             self._send(event)
 
     def _send(self, event: Event) -> None:
-        for sink in list(self._sinks):
-            if sink not in self._sinks:  # removed while an earlier event was passed on
-                continue
-            try:
-                sink(event)
-            except Exception as error:
-                self._sinks.remove(sink)
-                message = f"An output of events failed and gets no further events: {error}"
-                self._send(Event("warning", event.time, {"message": message}))
+        for sink in self._sinks:
+            sink(event)

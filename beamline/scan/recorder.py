@@ -37,7 +37,7 @@ class Writer(Protocol):
     @property
     def path(self) -> Path: ...
     @property
-    def committed(self) -> int: ...
+    def safe(self) -> int: ...
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None: ...
 
 
@@ -177,7 +177,7 @@ class Recorder:
             ) from cause
 
     def _safe(self) -> str:
-        return f"The first {self._writer.committed} frames are safe in {self._writer.path}."
+        return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _run(self) -> None:
         while (frame := self._waiting.get()) is not None:

@@ -142,13 +142,19 @@ class NXtomoWriter:
         """Frames that are complete in the file, seen by readers and safe from a crash of this process."""
         return self._committed
 
+    @property
+    def safe(self) -> int:
+        """Of these, what the disk has, as far as is known: after a failed fsync it may have lost what came since the
+        last one that succeeded."""
+        return self._to_disk.rows if self._to_disk.failed else self._committed
+
     def flush(self) -> None:
         """Commit the rows appended so far, whatever `flush_every` says."""
         self._file.flush()
         self._progress[()] = self._rows
         self._progress.flush()
         self._committed = self._rows
-        self._to_disk()
+        self._to_disk(self._committed)
 
     def close(self, status: str = "complete", missing: Sequence[int] = (), beam: Sequence[BeamReading] = ()) -> None:
         """Finish: missing triggers, end time and status, then `finished`, then the /exchange view. Twice is once.
@@ -202,7 +208,7 @@ class NXtomoWriter:
         self._file.flush()
         self._file[layout.FINISHED][()] = 1
         self._file.flush()
-        self._to_disk.finish()
+        self._to_disk.finish(self._committed)
         self._file.close()
 
     def _let_go(self) -> None:
@@ -233,7 +239,7 @@ class NXtomoWriter:
         free = shutil.disk_usage(self.path.parent).free
         return DataError(
             f"{self.path} could not {what} ({hdf5.reason(error)}); {size(free)} are free on its disk. "
-            f"The first {self._committed} frames are safe in it and can be read."
+            f"The first {self.safe} frames are safe in it and can be read."
         )
 
     def _add_exchange_view(self) -> None:

@@ -121,7 +121,7 @@ def read_reconstruction(path: Path) -> ReconRecord:
     Raises:
         DataError: if the file is missing or is not such a file.
     """
-    with opened_reconstruction(path) as record:
+    with opened_reconstruction(path) as record, hdf5.readable(path):
         values = np.asarray(record.volume.data[:], dtype=np.float32)
         return replace(record, volume=Volume(values, record.volume.grid))
 
@@ -137,7 +137,7 @@ def opened_reconstruction(path: Path) -> Iterator[ReconRecord]:
         try:
             file = stack.enter_context(h5py.File(path, "r"))
             record = _read_entry(file["entry"])
-        except (OSError, KeyError, ValueError, AttributeError) as error:
+        except hdf5.ALTERED as error:
             raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error
         yield record
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 import threading
 import time
 
@@ -14,10 +15,23 @@ _PATIENCE = 60.0  # s that the last calls may take
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
 
 
+if sys.platform == "darwin":
+    import fcntl
+
+    def _fsync(handle: int) -> None:
+        os.fsync(handle)  # which does not wait for the cache in the disk
+        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
+
+else:
+
+    def _fsync(handle: int) -> None:
+        os.fsync(handle)
+
+
 def to_disk(handle: int) -> None:
     """Wait until what was written to an open file is on the disk. OSError where the disk did not take it."""
     try:
-        os.fsync(handle)
+        _fsync(handle)
     except OSError as error:
         if error.errno not in _NO_SUCH_CALL:
             raise
@@ -27,15 +41,24 @@ class ToDisk:
     """Calls `to_disk` in a thread, one call at a time: a writer that waited for it would be as slow as both together.
 
     The thread is a daemon: a disk that hangs does not keep the program from ending.
+
+    Attributes:
+        failed: the disk did not take what a call was for.
+        rows: written to the file before the last call that succeeded.
     """
 
     def __init__(self, handle: int) -> None:
         self._handle = handle
         self._thread: threading.Thread | None = None
         self._error: OSError | None = None
+        self.rows = 0
         self._begun = time.monotonic()
 
-    def __call__(self) -> None:
+    @property
+    def failed(self) -> bool:
+        return self._error is not None
+
+    def __call__(self, rows: int) -> None:
         """Begin a call, unless one is under way or began less than SECONDS ago.
 
         Raises:
@@ -47,28 +70,33 @@ class ToDisk:
         if under_way or time.monotonic() - self._begun < SECONDS:
             return
         self._begun = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name="to disk", daemon=True)
+        self._thread = self._call(rows)
         self._thread.start()
 
-    def finish(self) -> None:
+    def finish(self, rows: int) -> None:
         """Wait until everything is on the disk.
 
         Raises:
             OSError: it did not take it, or not within a minute a call.
         """
-        for last in (self._thread, threading.Thread(target=self._run, name="to disk", daemon=True)):
+        for last in (self._thread, self._call(rows)):
             if last is None:
                 continue
             if not last.ident:
                 last.start()
             last.join(_PATIENCE)
             if last.is_alive():
-                raise OSError(errno.ETIMEDOUT, f"the disk has not taken the file for {_PATIENCE:.0f} s")
+                self._error = OSError(errno.ETIMEDOUT, f"the disk has not taken the file for {_PATIENCE:.0f} s")
             if self._error is not None:
                 raise self._error
 
-    def _run(self) -> None:
-        try:
-            to_disk(self._handle)
-        except OSError as error:
-            self._error = error
+    def _call(self, rows: int) -> threading.Thread:
+        def run() -> None:
+            try:
+                to_disk(self._handle)
+            except OSError as error:
+                self._error = error
+            else:
+                self.rows = rows
+
+        return threading.Thread(target=run, name="to disk", daemon=True)

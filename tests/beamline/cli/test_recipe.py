@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamline.cli import recon
 from beamline.cli.recipe import repeating
 from beamline.cli.segment import segment
 from beamline.cli.study import study
+from beamline.cli.terminal import LogLines
 from beamline.cli.tradeoff import tradeoff
+from beamline.core.events import Event
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange
@@ -113,6 +116,20 @@ def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
     assert "none.h5 is not there" in (folder / "bad.txt").read_text().splitlines()[-1]
     said = beamline("recon", "scan.h5", "-m", "fbp", "-v", "-o", "y.h5", "--no-report").stderr
     assert [line.split()[1] for line in said.splitlines()] == kinds[1:]
+
+
+def test_a_log_whose_disk_is_full_does_not_end_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(LogLines):
+        def __call__(self, event: Event) -> None:
+            if event.event != "state":
+                raise OSError(28, "No space left on device")
+            super().__call__(event)
+
+    monkeypatch.setattr(recon, "LogLines", Full)
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5", "--no-report")
+    assert result.exit_code == 0
+    assert result.stderr.count("No space left on device") == 1
+    assert {"log.txt", "x.h5"} <= left(folder)
 
 
 def test_lines_of_commands_with_arguments_and_flags(folder: Path) -> None:

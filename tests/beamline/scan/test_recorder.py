@@ -32,7 +32,7 @@ class Writer:
         self._before = before
 
     @property
-    def committed(self) -> int:
+    def safe(self) -> int:
         return len(self.rows)
 
     def append(self, frame: Frame, digest: FrameDigest, flags: object = ()) -> None:

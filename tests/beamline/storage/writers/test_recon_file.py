@@ -149,6 +149,20 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
             read_reconstruction(tmp_path / name)
 
 
+def test_damaged_voxels_are_said_to_be(tmp_path: Path) -> None:
+    path, values = tmp_path / "v.h5", _record().volume.data
+    write_reconstruction(path, _record())
+    with h5py.File(path, "a") as file:
+        del file["entry/data/data"]
+        stored = file["entry/data"].create_dataset("data", data=values, chunks=(1, 4, 5), fletcher32=True)
+        at = stored.id.get_chunk_info(1).byte_offset
+    raw = bytearray(path.read_bytes())
+    raw[at + 7] ^= 1
+    path.write_bytes(raw)
+    with pytest.raises(DataError, match="is damaged"):
+        read_reconstruction(path)
+
+
 def test_slices_that_are_higher_than_pixels_are_wide_stay_so(tmp_path: Path) -> None:
     record = _record((3, 4, 4), 0.02)
     grid = Grid((3, 4, 4), 0.02, slice_pitch=0.05)
