@@ -103,11 +103,19 @@ def segment(
 def summary(found: Segmented, options: SegmentOptions) -> str:
     """The result for people."""
     figures, unit = found.particles.statistics(), found.unit
+    _, rows, cols = found.box
+    crop = "none, the whole volume"
+    if options.margin is not None:
+        crop = (
+            f"rows {rows.start}-{rows.stop - 1}, columns {cols.start}-{cols.stop - 1} of each slice: the square inside "
+            f"the circle of the sample, less {options.margin:.3g} of its side at each end (--crop none, --margin)"
+        )
     lines = [
         f"{'labels':<12}{options.output}",
         f"{'table':<12}{options.table}",
         f"{'picture':<12}{options.picture}",
         f"{'box':<12}{' x '.join(map(str, found.labels.shape))} voxels of {found.volume.grid.voxel_size:g} {unit}",
+        f"{'crop':<12}{crop}",
         f"{'clusters':<12}{found.clusters.centres.size}, threshold {found.clusters.threshold:.3f} of the range",
         f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
     ]

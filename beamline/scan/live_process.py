@@ -14,6 +14,7 @@ from typing import Any
 from beamline.config.load import Config
 from beamline.core.events import Emit
 from beamline.core.process import ChildProcess, Ending, json_object
+from beamline.core.text import count, size
 
 LiveCommand = Callable[[Path, Path], Sequence[str]]
 """(scan file, output file) -> the command line."""
@@ -63,15 +64,37 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
     while shape[1] > _WIDEST * binning:
         binning *= 2
     while True:
-        rows, cols = (max(1, n // binning) for n in shape)
-        volume = _A_VOXEL * rows * cols * cols
-        view, room = _A_RAY * rows * cols, _SHARE * free - volume
+        volume = live_bytes(shape, 0, binning)
+        view, room = live_bytes(shape, 1, binning) - volume, _SHARE * free - volume
         most = max(1, int(room // view)) if room > 0 else 1
         every = math.ceil(n_views / most)
         used = math.ceil(n_views / every)
-        if used >= min(n_views, _FEWEST) or cols < 32:
+        if used >= min(n_views, _FEWEST) or shape[1] // binning < 32:
             return LivePlan(binning, every, volume + used * view)
         binning *= 2
+
+
+def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
+    """About how much memory a live volume of so many views of rows and columns takes."""
+    rows, cols = (max(1, n // binning) for n in shape)
+    return rows * cols * (_A_VOXEL * cols + _A_RAY * n_views)
+
+
+def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
+    """What the live volume is made of, the memory that it takes, and why it is of no more."""
+    plan = live_plan(shape, n_views, free)
+    rows, cols = (max(1, n // plan.binning) for n in shape)
+    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} that are free"
+    found = (
+        f"the live volume is of {count(views, 'view')} of {rows} x {cols} pixels, in about {size(plan.bytes)} of memory"
+    )
+    if plan.whole:
+        return f"{found}; it may take {most}"
+    how = [f"one view of {plan.every}"] if plan.every > 1 else []
+    how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
+    whole = f"all {n_views} of {shape[0]} x {shape[1]} would take {size(live_bytes(shape, n_views))}"
+    wide = f"at most {_WIDEST} columns, and " if shape[1] > _WIDEST else ""
+    return f"{found}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"
 
 
 def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:

@@ -17,7 +17,6 @@ from beamline.config.load import Config, plan_of, resolved_yaml
 from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
 from beamline.core.machine import free_memory
-from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import Instrument, camera_settings
 from beamline.monitor.check import Policy, ScanContext
@@ -27,7 +26,7 @@ from beamline.monitor.watch import start as start_monitor
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import work_out
-from beamline.scan.live_process import live_plan
+from beamline.scan.live_process import live_need
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 from recon.base.choices import AUTO
@@ -96,14 +95,9 @@ def dry_run(settings: Config) -> DryRun:
 def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Timeline:
     """The timeline with what the operator should know of policies that it cannot carry out, and of the live volume."""
     remarks = [*worked.remarks, *_held_late(worked, config)]
-    plan = live_plan(shape, worked.views.n, free_memory())
     method = config.recon.method
-    if config.recon.live and not plan.whole and method != AUTO and streams(method):
-        rows, cols = (n // plan.binning for n in shape)
-        remarks.append(
-            f"the live volume has {cols} columns and {rows} rows (binned {plan.binning} x {plan.binning}) from "
-            f"one view of {plan.every}, in about {size(plan.bytes)} of memory; `beamline recon` makes the full one"
-        )
+    if config.recon.live and method != AUTO and streams(method):
+        remarks.append(live_need(shape, worked.views.n, free_memory()))
     return replace(worked, remarks=tuple(remarks))
 
 

@@ -22,7 +22,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import read_volume
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
-from recon.post.enhance import enhanced, inscribed_box, sample_circle
+from recon.post.enhance import Box, enhanced, inscribed_box, sample_circle
 from recon.post.particles import NECK, Particles, cleaned, measured, parted
 
 _SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
@@ -74,13 +74,15 @@ class Segmented:
     """What was found.
 
     Attributes:
-        volume: the part that was segmented, as it is in the file, on its grid.
+        box: the part of the volume in the file that was segmented.
+        volume: this part, as it is in the file, on its grid.
         unit: "mm", or "px" where nobody knows the size of a voxel.
         labels: int32 [z, y, x] of the same shape; 0: no particle.
         clusters: of the enhanced grey values.
         particles: of the labels.
     """
 
+    box: Box
     volume: Volume
     unit: str
     labels: NDArray[np.int32]
@@ -124,6 +126,8 @@ def segment(options: SegmentOptions) -> Segmented:
 
 
 def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
+    nz, ny, nx = volume.grid.shape
+    box: Box = slice(0, nz), slice(0, ny), slice(0, nx)
     if options.margin is not None:
         box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
         volume = _cut(volume, box)
@@ -132,10 +136,10 @@ def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
     labels = parted(cleaned(grey > found.threshold, options.radius, options.smallest), options.neck)
     first = tuple(float(axis[0]) for axis in volume.grid.coordinates())
     particles = measured(labels, volume.grid.spacing, first)  # type: ignore[arg-type]
-    return Segmented(volume, unit, labels, found, particles)
+    return Segmented(box, volume, unit, labels, found, particles)
 
 
-def _cut(volume: Volume, box: tuple[slice, slice, slice]) -> Volume:
+def _cut(volume: Volume, box: Box) -> Volume:
     axes = [axis[part] for axis, part in zip(volume.grid.coordinates(), box, strict=True)]
     z, y, x = ((float(axis[0]) + float(axis[-1])) / 2 for axis in axes)
     shape = len(axes[0]), len(axes[1]), len(axes[2])

@@ -65,6 +65,11 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
         assert row["volume_mm3"] == pytest.approx(np.pi / 6 * row["equivalent_diameter_mm"] ** 3, rel=1e-4)
     with h5py.File(here / "recon_particles.h5") as file:
         labels = file["entry/data/labels"]
+        (y0, y1), (x0, x1) = (
+            (np.searchsorted(axis, file[f"entry/data/{name}"][[0, -1]] - VOXEL / 2))
+            for name, axis in zip("yx", grid.coordinates()[1:], strict=True)
+        )
+        assert f"rows {y0}-{y1}, columns {x0}-{x1} of each slice" in result.stdout
         z, y, x = (file[f"entry/data/{name}"][:] for name in "zyx")
         assert labels.shape == (z.size, y.size, x.size)
         for row in rows:

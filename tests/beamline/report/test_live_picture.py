@@ -12,31 +12,37 @@ import pytest
 from beamline.report.live_picture import LivePicture
 from recon.base.volume import Grid, Volume
 
-SIDE, GAP, LINE = 280, 14, 15
+GAP, TOP, LINES = 14, 30, 30  # pixels: between panels, of the title, of a label
 
 
 def shown(picture: LivePicture) -> np.ndarray:
-    """[row, col, rgb] of the picture, row 0 at the bottom."""
-    return matplotlib.image.imread(io.BytesIO(picture.png()))[::-1, :, :3]
+    """[row, col, rgb] of the picture."""
+    return matplotlib.image.imread(io.BytesIO(picture.png()))[..., :3]
 
 
-def panel(image: np.ndarray, across: int, up: int) -> np.ndarray:
-    left, bottom = GAP + across * (SIDE + GAP), GAP + up * (SIDE + 2 * LINE + GAP)
-    return image[bottom : bottom + SIDE, left : left + SIDE]
+def panel(image: np.ndarray, across: int, tall: int, above: int | None = None) -> np.ndarray:
+    """The image below a label, row 0 at the bottom, `tall` pixels high, that far from the left; `above`: the height of
+    the panels above it."""
+    pitch = (image.shape[1] - GAP) // 3
+    top = TOP + GAP + LINES + (0 if above is None else above + GAP + LINES)
+    return image[top : top + tall, GAP + across * pitch : (across + 1) * pitch][::-1]
 
 
-@pytest.mark.parametrize("side", [40, 280, 700])
-def test_slices_are_where_the_matter_is(side: int, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("side", "zoom"), [(40, 7), (160, 2), (280, 1), (700, 0.5)])
+def test_slices_are_where_the_matter_is_and_fill_their_panels(side: int, zoom: float, rng: np.random.Generator) -> None:
     grid = Grid((4, side, side), 0.01)
     volume = np.zeros(grid.shape, np.float32)
     volume[1:3, side // 2 : 3 * side // 4, side // 4 : side // 2] = 2.0
     view = rng.normal(0, 0.1, (20, side)).astype(np.float32)
     image = shown(LivePicture(Volume(volume, grid), view, view, "20 views", "mm"))
-    slice_ = panel(image, 0, 1)
-    scale = SIDE // side if side < SIDE else 1 / -(-side // SIDE)
-    y, x = (round(f * side * scale) for f in (0.625, 0.375))
+    tall, low = round(side * zoom), round(20 * zoom)
+    assert image.shape[1] == 3 * tall + 4 * GAP  # nothing between the panels but gaps
+    assert image.shape[0] == TOP + 2 * (GAP + LINES) + tall + low + GAP
+    slice_ = panel(image, 0, tall)
+    y, x = (round(f * tall) for f in (0.625, 0.375))
     assert slice_[y, x].min() > 0.95 and slice_[x, y].max() < 0.05  # y up, x to the right
-    assert panel(image, 2, 0)[: round(20 * scale)].min() > 0.99  # a view like its render differs by nothing
+    assert panel(image, 1, round(4 * zoom))[-1, 0].max() < 0.05  # right below its label
+    assert panel(image, 2, low, tall).min() > 0.99  # a view like its render differs by nothing
 
 
 def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None:
@@ -45,9 +51,9 @@ def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None
     view = rng.normal(0, 0.1, (64, 64)).astype(np.float32)
     render = np.zeros((64, 64), np.float32)
     render[:32] = -0.5  # five times the noise less than the view
-    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 0)
+    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 256, 256)
     red, _, blue = (difference[..., k].mean(axis=1) for k in range(3))
-    assert blue[10:110].mean() < 0.35 < 0.8 < red[10:110].mean()
+    assert blue[10:100].mean() < 0.35 < 0.8 < red[10:100].mean()
     assert blue[150:250].mean() == pytest.approx(red[150:250].mean(), abs=0.05)  # noise alone
 
 

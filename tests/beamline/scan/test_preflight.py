@@ -50,13 +50,14 @@ def test_a_pause_that_one_pass_cannot_make_is_told() -> None:
     assert said("scan.mode=step") == said("scan.angles={scheme: interlaced, views: 360, passes: 2}") == []
 
 
-def test_a_live_volume_of_binned_pixels_is_told() -> None:
+def test_what_a_live_volume_takes_is_told() -> None:
     def said(name: str, *overrides: str) -> list[str]:
         return [remark for remark in dry_run(shipped(name, *overrides)).timeline.remarks if "live volume" in remark]
 
     here = f"storage.folder={REPOSITORY.as_posix()}"
     assert "`beamline recon` makes the full one" in said("instrument", here)[0]
-    assert said("instrument", here, "recon.live=false") == said("simulated") == []
+    assert "of 360 views of 144 x 160 pixels, in about" in said("simulated")[0]
+    assert said("simulated", "recon.live=false") == said("simulated", "recon.method=fbp") == []
 
 
 def test_violations_are_refused_all_at_once() -> None:
