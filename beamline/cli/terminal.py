@@ -81,8 +81,9 @@ class Terminal:
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
-        elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study"):
-            self._show("trials", event.data["n"], event.data["of"], trials(event.data))
+        elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study", "batch"):
+            what = "scans" if event.data["stage"] == "batch" else "trials"
+            self._show(what, event.data["n"], event.data["of"], trials(event.data, what))
         elif event.event == "progress" and event.data.get("stage") == "kernels":
             note = f"{event.data['n']} compiled in {event.data['seconds']:.0f} s; once on a machine, 1 to 2 minutes"
             self._show("kernels", event.data["n"], 0, note)
@@ -149,11 +150,11 @@ def copied(data: Mapping[str, Any]) -> str:
     return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
 
 
-def trials(data: Mapping[str, Any]) -> str:
-    """n/N, trials/min, the time left if known, and the running trial, of a `progress` event of a trade-off or study."""
+def trials(data: Mapping[str, Any], what: str = "trials") -> str:
+    """n/N, trials/min, the time left if known, and the running one, of a `progress` event of many trials or scans."""
     parts = [f"{data['n']}/{data['of']}"]
     if data["eta_s"] is not None:
-        parts += [f"{data['per_min']:.1f} trials/min", f"{_clock_time(data['eta_s'])} left"]
+        parts += [f"{data['per_min']:.1f} {what}/min", f"{_clock_time(data['eta_s'])} left"]
     return "  ".join([*parts, str(data["label"])])
 
 

@@ -1,0 +1,66 @@
+"""`beamline batch`: reconstructs many scans by one recipe, and keeps a table of them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.options import json_option
+from beamline.cli.terminal import Terminal
+from beamline.core.errors import DataError, ScanStopped
+from beamline.core.events import Event, fan_out
+from beamline.reconstruct.batch import TABLE, BatchOptions, run_batch
+from drivers.clock import SystemClock
+
+
+def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
+    """The files that names and patterns mean, each once, in the order of the names."""
+    found: dict[Path, None] = {}
+    for name in value:
+        path, root = Path(name), Path(Path(name).anchor)
+        matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
+        if not matches:
+            raise click.BadParameter(f"{name!r} is no file, and no pattern that any file matches")
+        found.update((match.resolve(), None) for match in matches)
+    return list(found)
+
+
+@click.command()
+@click.argument("scans", nargs=-1, required=True, callback=scans_of)
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Recipe of the reconstructions, such as `beamline recon ... --write-config` writes. Default: -m auto.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="Folder of the results: new, or that of an earlier call with the same recipe, which is continued.",
+)
+@json_option
+def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -> None:
+    """Reconstruct all SCANS, files or patterns such as "runs/*/scan.h5", one after the other, by one recipe.
+
+    Each scan gets a folder in --output with its volume, report and log; batch.csv says what became of it, and why it
+    failed. Called again, only scans without a volume are reconstructed. Ctrl-C keeps the scans that are done (exit
+    code 4). Exit code 5: a scan failed.
+    """
+    options, clock = BatchOptions(scans, config, output), SystemClock()
+    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        sink = fan_out(*(json_sinks or [terminal]))
+        try:
+            rows = run_batch(options, sink, clock)
+        except KeyboardInterrupt as stop:
+            raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
+        failed = [row for row in rows if not row.has_volume]
+        counts = {"done": len(rows) - len(failed), "failed": len(failed), "output": output / TABLE}
+        sink(Event("done", clock.now(), counts))
+    if failed:
+        raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")
+    if not as_json:
+        click.echo(f"{len(rows)} of {len(rows)} scans have a volume: {output / TABLE}")

@@ -1,0 +1,226 @@
+"""Batches: many scans by one recipe, each in a process of its own, and a table of what became of them."""
+
+from __future__ import annotations
+
+import csv
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from beamline.core.errors import DataError, QualityError
+from beamline.core.events import Event, Sink
+from beamline.core.files import named_on_failure, remove, whole_file
+from beamline.core.process import ChildProcess, json_object
+from drivers.clock import Clock
+
+State = Literal["waiting", "done", "poor", "failed"]
+
+TABLE, RECIPE, VOLUME = "batch.csv", "recipe.yaml", "recon.h5"
+_WITH_VOLUME: Mapping[int | None, State] = {0: "done", QualityError.exit_code: "poor"}
+_OURS = ("done", "failed")  # events of a scan that become its row
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scan of a batch.
+
+    Attributes:
+        name: of its folder of results, inside the batch's.
+        scan: its file, absolute.
+        state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
+            one; "waiting": not tried yet.
+        seconds: that it took.
+        method: that made the volume.
+        residual: of the volume, of views held out where there were any.
+        message: why it failed, or is poor.
+    """
+
+    name: str
+    scan: str
+    state: State = "waiting"
+    seconds: float | None = None
+    method: str = ""
+    residual: float | None = None
+    message: str = ""
+
+    @property
+    def has_volume(self) -> bool:
+        return self.state in ("done", "poor")
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """What to reconstruct, how and where.
+
+    Attributes:
+        scans: files or folders, each once.
+        recipe: file with the options of `beamline recon`; None: its defaults.
+        folder: of the results, new or of an earlier call with the same recipe.
+        command: arguments that reconstruct a scan, before its name.
+    """
+
+    scans: Sequence[Path]
+    recipe: Path | None
+    folder: Path
+    command: Sequence[str] = field(default=(sys.executable, "-m", "beamline.cli.main", "recon"))
+
+
+def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
+    """Reconstruct the scans that have no volume in the folder yet; the table is written after each.
+
+    A folder of results comes into place when it is whole. A scan that fails leaves none, and the next one follows; it
+    is tried again by the next call. Ctrl-C ends the scan under way, which leaves nothing; the others stay.
+
+    Returns:
+        All rows of the table, also those of earlier calls.
+
+    Raises:
+        DataError: the folder is not that of a batch, or of one with another recipe; nothing was touched.
+        KeyboardInterrupt: stopped; the table has the scans that were done.
+    """
+    folder = options.folder
+    _begin(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+    rows = _rows(options.scans, _read(folder))
+    _write(folder, rows)
+    begun, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
+    for tried, n in enumerate(waiting):
+        spent = clock.now() - begun
+        progress = {"stage": "batch", "n": tried, "of": len(waiting), "label": rows[n].scan}
+        left = spent / tried * (len(waiting) - tried) if tried else None
+        sink(Event("progress", clock.now(), {**progress, "eta_s": left, "per_min": 60 * tried / max(spent, 1e-9)}))
+        rows[n] = _one(rows[n], options, sink, clock)
+        _write(folder, rows)
+        row = rows[n]
+        said = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
+        sink(Event("state" if row.has_volume else "warning", clock.now(), {"state": "batch", "message": said}))
+    return rows
+
+
+def names_of(scans: Sequence[Path]) -> list[str]:
+    """A name for each file: its stem, with as many of its folders before it as tell it from the others."""
+    parts = [(*path.resolve().parent.parts[1:], path.stem) for path in scans]
+    names = [own[-1] for own in parts]
+    for depth in range(2, max(map(len, parts), default=0) + 1):
+        shared = {name for name in names if names.count(name) > 1}
+        names = ["_".join(own[-depth:]) if name in shared else name for own, name in zip(parts, names, strict=True)]
+    return [f"{name}_{n}" if names.count(name) > 1 else name for n, name in enumerate(names)]
+
+
+def _begin(folder: Path, recipe: bytes) -> None:
+    """Make the folder, or see that it is one of this recipe."""
+    kept = folder / RECIPE
+    if folder.exists() and not (folder / TABLE).is_file():
+        raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
+    if not folder.exists():
+        if not folder.parent.is_dir():
+            raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
+        with whole_file(folder) as partial, named_on_failure(folder):
+            partial.mkdir()
+            (partial / RECIPE).write_bytes(recipe)
+            _write(partial, [])
+    elif not kept.is_file() or kept.read_bytes() != recipe:
+        raise DataError(
+            f"{folder} holds results of another recipe, {kept}. Give that one as --config, or name another folder. "
+            "Nothing was touched."
+        )
+
+
+def _rows(scans: Sequence[Path], known: Sequence[Row]) -> list[Row]:
+    """The rows known, and one for each scan that is new."""
+    old = {row.scan for row in known}
+    new = [path for path in scans if str(path.resolve()) not in old]
+    names = names_of([*(Path(row.scan) for row in known), *new])[len(known) :]
+    taken = {row.name for row in known}
+    free = [f"{name}_{len(known) + n}" if name in taken else name for n, name in enumerate(names)]
+    return [*known, *(Row(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
+
+
+def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
+    """Reconstruct a scan in a process of its own, which has ended when this returns or raises."""
+    began, last = clock.now(), dict[str, Any]()
+
+    def pass_on(line: str) -> None:
+        nonlocal last
+        data = json_object(line) or {}
+        event = str(data.pop("event", ""))
+        if event in _OURS:
+            last = data
+        elif event:
+            sink(Event(event, float(data.pop("time", clock.now())), {**data, "scan": row.scan}))
+
+    place, work = options.folder / row.name, options.folder / f".{row.name}.partial"
+    remove(work)  # of a batch that was killed
+    try:
+        with named_on_failure(work):
+            work.mkdir()
+        code, stderr = _run(_command(options, row.scan, work), work / "stderr.txt", pass_on)
+        state = _WITH_VOLUME.get(code, "failed")
+        if state != "failed":
+            with named_on_failure(place):
+                work.replace(place)
+    finally:
+        remove(work)
+    residual = last.get("residual_held_out", last.get("residual"))
+    said = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
+    message = "" if state == "done" else said or f"its process ended with code {code}"
+    return replace(
+        row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")), residual=residual,
+        message=message,
+    )  # fmt: skip
+
+
+def _command(options: BatchOptions, scan: str, work: Path) -> list[str]:
+    recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
+    return [*options.command, scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
+
+
+def _run(command: Sequence[str], log: Path, on_line: Callable[[str], None]) -> tuple[int | None, str]:
+    """The exit code of a command, and the last line of its stderr."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with log.open("w", encoding="utf-8") as stderr, ChildProcess(command, stderr, on_line, environment) as process:
+        process.wait()
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    log.unlink()
+    return process.code, lines[-1] if lines else ""
+
+
+def _read(folder: Path) -> list[Row]:
+    """The table of an earlier call.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    path = folder / TABLE
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [_row(record) for record in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise DataError(f"{path} is no table of a batch ({error}). Nothing was touched.") from error
+
+
+def _row(record: Mapping[str, str]) -> Row:
+    states: Mapping[str, State] = {state: state for state in get_args(State)}
+    numbers = {name: float(record[name]) if record[name] else None for name in ("seconds", "residual")}
+    return Row(
+        record["name"],
+        record["scan"],
+        states[record["state"]],
+        method=record["method"],
+        message=record["message"],
+        **numbers,
+    )
+
+
+def _write(folder: Path, rows: Sequence[Row]) -> None:
+    path = folder / TABLE
+    with (
+        whole_file(path, replace=True) as partial,
+        named_on_failure(path),
+        partial.open("w", encoding="utf-8", newline="") as file,
+    ):
+        table = csv.DictWriter(file, [column.name for column in fields(Row)])
+        table.writeheader()
+        table.writerows(asdict(row) for row in rows)

@@ -1,0 +1,128 @@
+"""Batches: each scan gets its volume, a failure is named, and a second call does only what is left."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.cli import batch as command
+from beamline.reconstruct import batch
+from beamline.reconstruct.batch import BatchOptions, Row, names_of, run_batch
+from beamline.storage.writers.recon_file import read_reconstruction
+from drivers.clock import SystemClock
+from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scans import write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _table(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "batch.csv").open(encoding="utf-8", newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans are reconstructed without a process of their own, which takes seconds to start."""
+
+    def run(line: Sequence[str], log: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
+        result = beamline(*line[len(BatchOptions([], None, Path()).command) - 1 :])
+        for text in result.stdout.splitlines():
+            on_line(text)
+        return result.exit_code, (result.stderr.splitlines() or [""])[-1]
+
+    monkeypatch.setattr(batch, "_run", run)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
+    (folder / "a").mkdir()
+    write_exchange(folder / "a" / "scan.h5", SCAN)
+    Path("cut.h5").write_bytes((folder / "scan.h5").read_bytes()[:2000])
+    given = ("batch", "*scan.h5", "a/*.h5", "cut.h5", "--config", "recipe.yaml", "-o", "out")
+
+    first = beamline(*given)
+    assert first.exit_code == 5
+    assert "1 of 3 scans failed" in first.output
+    table = _table(folder / "out")
+    assert {name: row["state"] for name, row in table.items()} == {
+        f"{folder.name}_scan": "done", "a_scan": "done", "cut": "failed",
+    }  # fmt: skip
+    assert "cut.h5" in table["cut"]["message"]
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", "a_scan", f"{folder.name}_scan"}
+    assert left(folder / "out" / "a_scan") == {"recon.h5", "report.html", "log.txt"}
+    beamline("recon", "scan.h5", "--config", "recipe.yaml", "-o", "alone.h5", "--no-report")
+    alone, found = (read_reconstruction(Path(name)) for name in ("alone.h5", "out/a_scan/recon.h5"))
+    np.testing.assert_array_equal(found.volume.data, alone.volume.data)
+    assert float(table["a_scan"]["residual"]) == alone.metrics["residual"]
+
+    before = (folder / "out" / "a_scan" / "recon.h5").stat().st_mtime_ns
+    Path("cut.h5").write_bytes((folder / "scan.h5").read_bytes())
+    second = beamline(*given)
+    assert second.exit_code == 0, second.output
+    assert _table(folder / "out")["cut"]["state"] == "done"
+    assert (folder / "out" / "a_scan" / "recon.h5").stat().st_mtime_ns == before
+
+    Path("recipe.yaml").write_text("method: sirt\n")
+    other = beamline(*given)
+    assert other.exit_code == 5
+    assert "another recipe" in other.output
+
+
+def test_a_folder_of_something_else_is_refused(folder: Path) -> None:
+    (folder / "out").mkdir()
+    result = beamline("batch", "scan.h5", "-o", "out")
+    assert result.exit_code == 5
+    assert left(folder / "out") == set()
+    assert beamline("batch", "no*.h5", "-o", "new").exit_code == 2
+
+
+def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(folder / "second.h5", SCAN)
+    done: list[str] = []
+
+    def run(line: Sequence[str], log: Path, on_line: object) -> tuple[int, str]:
+        if done:
+            (log.parent / "recon.h5.partial").touch()
+            raise KeyboardInterrupt
+        done.append(line[len(BatchOptions([], None, folder).command)])
+        return 0, ""
+
+    monkeypatch.setattr(batch, "_run", run)
+    result = beamline("batch", "scan.h5", "second.h5", "-o", "out")
+    assert result.exit_code == 4
+    assert {name: row["state"] for name, row in _table(folder / "out").items()} == {"scan": "done", "second": "waiting"}
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", "scan"}
+
+
+def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_kept_and_named(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\nmax-residual: 1e-6\n")
+    (row,) = run_batch(BatchOptions([Path("scan.h5")], Path("recipe.yaml"), Path("out")), lambda _: None, SystemClock())
+    assert row.state == "poor"
+    assert "--max-residual" in row.message
+    assert Path("out/scan/recon.h5").is_file()
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (("/x/a.h5", "/x/b.h5"), ["a", "b"]),
+        (("/x/run1/scan.h5", "/x/run2/scan.h5", "/x/c.h5"), ["run1_scan", "run2_scan", "c"]),
+        (("/1/r/s.h5", "/2/r/s.h5"), ["1_r_s", "2_r_s"]),
+        (("/x/s.h5", "/x/s.tif"), ["x_s_0", "x_s_1"]),
+    ],
+)  # fmt: skip
+def test_names_tell_files_apart(paths: tuple[str, ...], names: list[str]) -> None:
+    assert names_of([Path(path) for path in paths]) == names
+
+
+def test_rows_of_an_earlier_call_keep_their_names() -> None:
+    known = [Row("scan", "/x/run1/scan.h5", "done")]
+    rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
+    assert [row.name for row in rows] == ["scan", "run2_scan"]
+    assert command.batch.name == "batch"
