@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -15,7 +16,7 @@ from beamline.cli.scan_options import scan_options
 from recon.base.choices import FEW_PHOTONS, Noise, Rings
 
 if TYPE_CHECKING:
-    from beamline.projections.selection import Selection
+    from beamline.projections.selection import Hardening, Phase, Selection
     from beamline.storage.readers.open import SourceOptions
 
 
@@ -98,10 +99,76 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         noise=rest.pop("noise"),
         rings=rest.pop("rings"),
         gain=rest.pop("gain"),
+        phase=_phase(rest),
+        hardening=_hardening(rest.pop("hardening")),
     )
     if selection.gain is not None and selection.noise == "log":
         raise click.UsageError("--gain is for counted photons; it does not go with --noise log.")
     return SourceOptions(file, **rest), selection
+
+
+def phase_of(ctx: click.Context, param: click.Parameter, value: str) -> str | None:
+    """What `paganin:` is followed by; None for "none"."""
+    way, _, material = value.partition(":")
+    if value != "none" and (way != "paganin" or not material):
+        raise click.BadParameter(f"{value!r} is none of none, paganin:RATIO (delta/beta), paganin:MATERIAL")
+    return material or None
+
+
+def unsharp_mask(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, float] | None:
+    """`sigma:weight`."""
+    if value is None:
+        return None
+    try:
+        sigma, weight = (float(part) for part in value.split(":"))
+    except ValueError:
+        sigma = weight = math.nan
+    if not (0 < sigma < math.inf and 0 <= weight < math.inf):
+        raise click.BadParameter(f"{value!r} is not SIGMA:WEIGHT with SIGMA > 0 in pixels, e.g. 1.5:2")
+    return sigma, weight
+
+
+def _phase(rest: dict[str, Any]) -> Phase | None:
+    """Phase retrieval by its options, which are taken out of `rest`."""
+    from beamline.projections.selection import Phase
+
+    material, *others = (rest.pop(name) for name in ("phase", "distance_mm", "energy_kev", "unsharp"))
+    if material is None:
+        if any(other is not None for other in others):
+            raise click.UsageError("--distance-mm, --energy-kev and --unsharp are for --phase.")
+        return None
+    try:
+        ratio = float(material)
+    except ValueError:
+        from beamline.simulate.matter import delta_beta
+
+        return Phase(material, partial(delta_beta, material), *others)
+    if not 0 <= ratio < math.inf:
+        raise click.UsageError(f"--phase: delta/beta is 0 or more, got {material}.")
+    return Phase(material, lambda _: ratio, *others)
+
+
+def hardening_of(ctx: click.Context, param: click.Parameter, value: str) -> str | None:
+    """`fit` or `material:beam`; None for "none"."""
+    if value not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", value):
+        raise click.BadParameter(
+            f"{value!r} is none of none, fit, MATERIAL:BEAM (Al:60kV,Al=1 is a tube behind 1 mm Al; or Al:FILE)"
+        )
+    return None if value == "none" else value
+
+
+def _hardening(value: str | None) -> Hardening | None:
+    """Correction of beam hardening by its option."""
+    from beamline.projections.selection import Hardening
+
+    if value is None or value == "fit":
+        return None if value is None else Hardening(value)
+    from beamline.simulate.matter import in_beam
+
+    try:
+        return Hardening(value, in_beam(*value.split(":", 1)))
+    except ValueError as error:
+        raise click.UsageError(f"--hardening {value}: {error}.") from error
 
 
 _BEFORE = (
@@ -189,6 +256,34 @@ _AFTER = (
         show_default=True,
         help="Stripes of the sinograms, which make rings. sort: small ones; vo: dead columns, large and small ones; "
         "wavelet: by their wavelets; auto: sort or vo where there are some, and says so.",
+    ),
+    click.option(
+        "--phase",
+        callback=phase_of,
+        metavar="none|paganin:X",
+        default="none",
+        show_default=True,
+        help="Phase retrieval from one distance (Paganin); X is delta/beta, or a material: a chemical formula or a "
+        "name that scenes know.",
+    ),
+    click.option(
+        "--distance-mm", type=POSITIVE, help="For --phase: from the sample to the detector. Default: as in the file."
+    ),
+    click.option("--energy-kev", type=POSITIVE, help="For --phase. Default: as in the file."),
+    click.option(
+        "--unsharp",
+        callback=unsharp_mask,
+        metavar="SIGMA:WEIGHT",
+        help="For --phase: unsharp mask after it, which gives fine detail back; SIGMA in pixels.",
+    ),
+    click.option(
+        "--hardening",
+        callback=hardening_of,
+        metavar="none|fit|MATERIAL:BEAM",
+        default="none",
+        show_default=True,
+        help="Beam hardening of a sample of one material. fit: by its own views; BEAM: 60kV (a tube), 60kV,Al=1,Cu=0.1 "
+        "(behind mm of filters), or a text file of lines: keV weight.",
     ),
     click.option(
         "--gain", type=POSITIVE, metavar="COUNTS", help="Counts a photon, for --noise. Default: as the flats vary."

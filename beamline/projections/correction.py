@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import spans
+from beamline.projections.phase import filter_of
 from beamline.projections.read import open_beam, photons_of, read_binned, read_references
 from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
@@ -40,8 +41,16 @@ class ScanCorrection:
                 without the counts of a photon.
             DataError: references that cannot be used.
         """
-        self._source, self._selection, self._warn = source, selection, warn
         self.rows, self.binning = rows_of(source, selection), selection.binning
+        self._filter, self.phase = filter_of(source, selection)
+        if self._filter is not None:
+            if selection.noise == "counts":
+                raise ConfigError(
+                    "--phase mixes neighbouring pixels, so that --noise counts has no likelihood for them."
+                )
+            selection = replace(selection, noise="log")
+        self._source, self._selection, self._warn = source, selection, warn
+        wide, _ = self._widened(None)
         self._n_references = _count_references(source)
         self._references: References | None = None
         self.photons: Photons | None = None
@@ -50,7 +59,7 @@ class ScanCorrection:
         if source.quantity == "counts":
             groups = reference_groups(source)
             used = groups if selection.accept_references else groups.good()
-            self._references = read_references(source, used, self.rows, self.binning, not selection.use_flags)
+            self._references = read_references(source, used, wide, self.binning, not selection.use_flags)
             self._tell_damaged(np.concatenate([*used.darks, *used.flats]))
             self.photons = photons_of(source, used, self._references, self.rows, selection)
         self._stream: Correction | None = None
@@ -70,8 +79,8 @@ class ScanCorrection:
         if not frames.size:
             raise self._no_view()
         if self._references is None:
-            return _as_given(data, frames)
-        return self._corrected(self._correction(rows), data, frames, last=True)
+            return self._retrieved(_as_given(data, frames), rows)
+        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows)
 
     def in_batches(
         self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, told: Callable[[int, int], None]
@@ -111,7 +120,7 @@ class ScanCorrection:
             if stream is not None:
                 corrected = self._corrected(stream, data, found, last)
             elif found.size:
-                corrected = _as_given(data, found)
+                corrected = self._retrieved(_as_given(data, found), None)
             else:
                 continue
             n = len(corrected.data)
@@ -135,7 +144,7 @@ class ScanCorrection:
         """
         data, frames = self._read(frames, None)
         if self._references is None:
-            return _as_given(data, frames) if frames.size else None
+            return self._retrieved(_as_given(data, frames), None) if frames.size else None
         if self._stream is None:
             self._stream = self._correction(None)
         if not frames.size and not (last and self._stream.waiting):
@@ -170,11 +179,7 @@ class ScanCorrection:
 
     def _read(self, frames: NDArray[np.int64], rows: slice | None) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one and are not damaged, and these frames."""
-        first, end = self.rows.start, self.rows.stop
-        if rows is not None:
-            start, stop, _ = rows.indices((end - first) // self.binning)
-            first, end = first + start * self.binning, first + stop * self.binning
-        data = read_binned(self._source, frames, slice(first, end), self.binning)
+        data = read_binned(self._source, frames, self._widened(rows)[0], self.binning)
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             lost = frames[~alive]
@@ -203,21 +208,49 @@ class ScanCorrection:
 
     def _correction(self, rows: slice | None) -> Correction:
         assert self._references is not None
-        references = self._references if rows is None else _narrowed(self._references, rows)
+        first = self._widened(None)[0].start
+        part = self._widened(rows)[0]
+        within = slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
+        references = _narrowed(self._references, within)
         try:
             return Correction(references, self._selection.correction, photons=self.photons)
         except ValueError as error:
             raise self._refusal(error) from error
 
+    def _widened(self, rows: slice | None) -> tuple[slice, slice]:
+        """Detector rows to read for some binned rows (None: all), with those that a filter takes from; and which of
+        what is read are wanted, in binned rows."""
+        first, end = self.rows.start, self.rows.stop
+        if rows is not None:
+            start, stop, _ = rows.indices((end - first) // self.binning)
+            first, end = first + start * self.binning, first + stop * self.binning
+        reach, n = 0 if self._filter is None else self._filter.reach, self.binning
+        above = min(reach, first // n)
+        below = min(reach, (self._source.shape[0] - end) // n)
+        return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
+
+    def _retrieved(self, part: Projections, rows: slice | None) -> Projections:
+        """The views through the filter, in the rows wanted."""
+        if self._filter is None or not part.view_ids.size:
+            return part
+        self._filter.retrieve(part.data, self._selection.correction.floor)
+        _, wanted = self._widened(rows)
+        return replace(part, data=np.ascontiguousarray(part.data[:, wanted]), masked=part.masked[wanted])
+
     def _corrected(
-        self, correction: Correction, data: NDArray[Any], frames: NDArray[np.int64], last: bool
+        self,
+        correction: Correction,
+        data: NDArray[Any],
+        frames: NDArray[np.int64],
+        last: bool,
+        rows: slice | None = None,
     ) -> Projections:
         try:
             views = None
             if frames.size:
                 views = correction.transmission(data, frames.astype(np.float64), frames)
                 correction.survey(views)
-            return correction.line_integrals(views, last)
+            return self._retrieved(correction.line_integrals(views, last), rows)
         except UnlitViewsError as error:
             advice = "" if self._selection.judge else " (--flags judge leaves out what the monitor finds dark)"
             raise DataError(

@@ -15,9 +15,11 @@ from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
+from beamline.projections.hardening import curve_of
 from beamline.projections.jumps import find_jumps, longest_part
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import (
+    Hardening,
     Selection,
     check_axis,
     choose_views,
@@ -68,6 +70,8 @@ class PreparedProjections:
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
         rings: what was done about rings; empty where nothing was asked.
+        phase: what was done about phase; empty where nothing was asked.
+        hardening: what was done about beam hardening; empty where nothing was asked.
         shares_of: `shares` of some rows [view, row, col], where line integrals lie on disk and these are made when
             wanted; None: as `shares` says.
     """
@@ -88,6 +92,8 @@ class PreparedProjections:
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
     rings: str = ""
+    phase: str = ""
+    hardening: str = ""
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
 
     @property
@@ -219,12 +225,25 @@ def prepare_projections(
         geometry=jumps.corrected(found.geometry, projections.view_ids),
         jumps=jumps.said,
         noise=correction.noise,
+        phase=correction.phase,
         rings=rings,
         shares_of=shares_of,
     )
+    if selection.hardening is not None:
+        found = _linearised(found, selection.hardening)
     if spill is not None:
         _fill_unknown(found, regions, rows_of(source, selection), selection.binning)
     return found
+
+
+def _linearised(found: PreparedProjections, wanted: Hardening) -> PreparedProjections:
+    """The same with beam hardening corrected, in place."""
+    curve, said = curve_of(found.projections.data, found.geometry, wanted)
+    if curve is not None:
+        curve.linearise(found.projections.data, found.projections.weights)
+        if found.held_out is not None:
+            curve.linearise(found.held_out[0])
+    return replace(found, hardening=said)
 
 
 def _fill_unknown(found: PreparedProjections, regions: Regions, rows: slice, binning: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,39 @@ from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
+
+
+@dataclass(frozen=True)
+class Phase:
+    """How phase is retrieved.
+
+    Attributes:
+        material: as the user said it, a ratio or a material, for the record.
+        delta_beta: the ratio of delta to beta at an energy in keV.
+        distance_mm: from the sample to the detector; None takes the file's.
+        energy_kev: None takes the file's.
+        unsharp: (sigma in pixels as they are used, weight), see `recon.prep.phase.Paganin`; None: none.
+    """
+
+    material: str
+    delta_beta: Callable[[float], float]
+    distance_mm: float | None = None
+    energy_kev: float | None = None
+    unsharp: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Hardening:
+    """How beam hardening is corrected.
+
+    Attributes:
+        said: the material and the beam as the user said them, for the record.
+        spectrum: the material's attenuation, in any unit, at the energies of the beam, and their shares of the detected
+            light; None: the curve is fitted on the views.
+    """
+
+    said: str
+    spectrum: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
 
 @dataclass(frozen=True)
@@ -39,6 +73,8 @@ class Selection:
             counts; "auto": that where the open beam has few photons a pixel.
         rings: how stripes are removed from line integrals, see `recon.prep.rings.remove_rings`.
         gain: counts a photon, of single pixels; None finds it by the flats.
+        phase: None: it is not retrieved.
+        hardening: None: it is not corrected.
     """
 
     views: str = "all"
@@ -55,6 +91,8 @@ class Selection:
     noise: Noise = "auto"
     rings: Rings = "none"
     gain: float | None = None
+    phase: Phase | None = None
+    hardening: Hardening | None = None
 
 
 def choose_views(

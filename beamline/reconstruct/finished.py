@@ -98,11 +98,10 @@ def reconstruct_file(
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
-    """Send the event `recon_started`; before it, how photons were counted."""
-    if prepared.noise:
-        sink(Event("state", clock.now(), {"state": "noise", "message": prepared.noise}))
-    if prepared.rings:
-        sink(Event("state", clock.now(), {"state": "rings", "message": prepared.rings}))
+    """Send the event `recon_started`; before it, what was done to the views on request."""
+    for state in ("noise", "phase", "rings", "hardening"):
+        if message := getattr(prepared, state):
+            sink(Event("state", clock.now(), {"state": state, "message": message}))
     data = {
         "file": options.source.path,
         "method": options.method.name,

@@ -95,8 +95,9 @@ class ScanFollower:
                 return grown
             refuse(self.source, blockers)
             self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
-            if noise := self._correction.noise:
-                self._sink(Event("state", self._clock.now(), {"state": "noise", "message": noise}))
+            for state in ("noise", "phase"):
+                if message := getattr(self._correction, state):
+                    self._sink(Event("state", self._clock.now(), {"state": state, "message": message}))
         if not self._axis.settled:
             self._settle_axis(self._correction, views, ended)
         if self.axis_col is None:
@@ -304,4 +305,4 @@ class ScanFollower:
         found = assemble(
             self.source, self._options.selection, projections, (axis_col, self._axis.estimate), usable, self._warn
         )
-        return replace(found, noise=self._correction.noise)
+        return replace(found, noise=self._correction.noise, phase=self._correction.phase)

@@ -181,6 +181,8 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "quantity": prepared.quantity,
         **(_flat("correction", asdict(selection.correction)) if corrected else {}),
         **({"noise": prepared.noise or "logarithms of counts"} if corrected else {}),
+        "phase": prepared.phase or "not retrieved",
+        "hardening": prepared.hardening or "not corrected",
         "rings": selection.rings,
         **({"rings_removed": prepared.rings} if prepared.rings else {}),
         "floored_fraction": float(prepared.projections.floored),

@@ -205,3 +205,41 @@ def test_rings_need_a_finished_scan_and_columns(folder: Path) -> None:
     assert result.exit_code == 2 and "--rings is for a finished scan" in result.stderr
     result = beamline("recon", "scan.h5", "-m", "fbp", "--rings", "sort", "--no-report")
     assert result.exit_code == 0 and "30 views of 40 columns are too few" in result.stderr
+
+
+def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
+    way = ("--phase", "paganin:Al", "--energy-kev", "20", "--pixel-size-um", "1", "--no-report")
+    result = beamline("recon", "scan.h5", "-m", "fbp", *way, "--distance-mm", "20")
+    assert result.exit_code == 0, result.output
+    said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["phase"])
+    assert said in result.stderr and said.startswith("Phase: Paganin's filter over 5.4") and "delta/beta 295.8" in said
+    for options, code, error in (
+        (way, 2, "--phase needs --distance-mm, which scan.h5 does not say"),
+        (("--distance-mm", "20"), 2, "--distance-mm, --energy-kev and --unsharp are for --phase"),
+        (("--phase", "born:3"), 2, "none of none, paganin:RATIO"),
+        ((*way, "--distance-mm", "20", "--phase", "paganin:bone"), 2, "'bone' is neither a material"),
+        ((*way, "--distance-mm", "20", "--unsharp", "3"), 2, "is not SIGMA:WEIGHT"),
+    ):
+        result = beamline("recon", "scan.h5", "-m", "fbp", *options, "-o", "other.h5")
+        assert (result.exit_code, error in " ".join(result.stderr.replace("│", " ").split())) == (code, True), (
+            result.stderr
+        )
+    assert left(folder) == {"scan.h5", "scan_fbp.h5"}
+
+
+def test_hardening_is_corrected_recorded_and_told(folder: Path) -> None:
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--hardening", "Al:60kV,Al=1", "--no-report")
+    assert result.exit_code == 0, result.output
+    said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["hardening"])
+    assert said in result.stderr and said.startswith("Hardening: corrected by the curve of Al:60kV,Al=1")
+    for options, error in (
+        (("--hardening", "Al:80"), "80 is neither a tube such as 60kV,Al=1 nor a table"),
+        (("--hardening", "bone:60kV"), "'bone' is neither a material"),
+        (("--hardening", "Al"), "is none of none, fit, MATERIAL:BEAM"),
+        (("--hardening", "fit", "--follow"), "--hardening is for a finished scan"),
+    ):
+        result = beamline("recon", "scan.h5", *options, "-o", "other.h5")
+        assert (result.exit_code, error in " ".join(result.stderr.replace("│", " ").split())) == (2, True), (
+            result.stderr
+        )
+    assert left(folder) == {"scan.h5", "scan_fbp.h5"}

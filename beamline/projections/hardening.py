@@ -1,0 +1,67 @@
+"""Beam hardening of a scan: the curve of its material, or of what its own views show, and the views by that curve."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from beamline.projections.selection import Hardening
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.post.clusters import k_means
+from recon.prep.hardening import F32, Curve, NoCurveError, curve_of_paths, curve_of_spectrum
+from recon.reconstruction import reconstruct
+from recon.voxels.projector import project
+
+_COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
+_ROUNDS, _SETTLED = 12, 0.01
+_LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
+_RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
+
+
+def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve | None, str]:
+    """The curve of a scan's line integrals [view, row, col], and a sentence about it; None where none is to be used."""
+    highest = max(float(view.max()) for view in views)
+    if wanted.spectrum is not None:
+        curve, how = curve_of_spectrum(*wanted.spectrum, highest), f"of {wanted.said}"
+    else:
+        try:
+            curve, explained = fitted(views, geometry)
+        except NoCurveError as error:
+            return None, f"Hardening: not determined by the views ({error}); none corrected."
+        how = f"fitted on the views, of which one material explains {explained:.1%}"
+    meant = float(np.interp(highest, curve.seen, curve.meant))
+    if meant < (1 + _LEAST_SEEN) * highest:
+        return None, f"Hardening: none seen ({how}); none corrected."
+    return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {meant:.3g}."
+
+
+def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
+    """The curve by the paths through the sample as its own reconstruction shows it, taken as one material.
+
+    The paths are those through what is brighter than the middle between matter and air; the next round's volume is of
+    views corrected by the last curve, until it stays (after Krumm, Kasperl & Franz 2008, NDT & E Int. 41, 242).
+
+    Raises:
+        NoCurveError: the sample is not of one material, or the curve does not settle.
+    """
+    n, rows, cols = views.shape
+    factor = max(1, min(round(cols / _COLS), rows))
+    some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
+    seen = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
+    small = geometry.select(some).binned(factor)
+    grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), seen, math.inf
+    for _ in range(_ROUNDS):
+        volume = reconstruct(now, small, "fbp", grid=grid).volume.data
+        air, matter = k_means(volume, 2)
+        paths = project(Volume((volume > (air + matter) / 2).astype(np.float32), grid), small)
+        clear = (paths == 0) | (paths > _RIM * grid.voxel_size)
+        curve, explained = curve_of_paths(seen[clear], paths[clear], highest)
+        meant = float(np.interp(highest, curve.seen, curve.meant))
+        if abs(meant - before) < _SETTLED * meant:
+            return curve, explained
+        before, now = meant, seen.copy()
+        curve.linearise(now)
+    raise NoCurveError(f"the curve does not settle in {_ROUNDS} rounds")

@@ -1,0 +1,108 @@
+"""Beam hardening: line integrals of many energies turned into those of a thin layer's attenuation, for one material.
+
+A beam of several energies loses the soft ones first, so that line integrals grow more slowly than thickness: bodies are
+darker inside (cupping), and between dense parts are streaks. For one material the relation is a curve, which is
+inverted (Herman 1979, Phys. Med. Biol. 24, 81).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_NODES = 2048
+_FEWEST_RAYS, _MOST_RAYS = 100, 5000
+_LEAST_EXPLAINED = 0.9  # of the variance of line integrals, by thickness, for a sample of one material
+
+
+class NoCurveError(ValueError):
+    """The line integrals do not show a curve of hardening; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Line integrals as they should be by line integrals as they were seen.
+
+    Attributes:
+        seen: float64 [node], ascending from 0.
+        meant: float64 [node], ascending from 0. Below 0 the curve goes on along its first piece, at the end along its
+            last.
+    """
+
+    seen: F64
+    meant: F64
+
+    def __post_init__(self) -> None:
+        rising = (np.diff(self.seen) > 0).all() and (np.diff(self.meant) > 0).all()
+        if self.seen.shape != self.meant.shape or self.seen.size < 2 or not rising:
+            raise ValueError("a curve needs two nodes or more, seen and meant ascending")
+
+    def linearise(self, views: F32, weights: F32 | None = None) -> None:
+        """Replace line integrals of any shape by those meant, and inverse variances by theirs, in place."""
+        slopes = np.diff(self.meant) / np.diff(self.seen)
+        for n, view in enumerate(views):
+            piece = np.clip(np.searchsorted(self.seen, view) - 1, 0, slopes.size - 1)
+            slope = slopes[piece]
+            view[...] = self.meant[piece] + slope * (view - self.seen[piece])
+            if weights is not None:
+                weights[n] /= slope**2
+
+
+def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: float) -> Curve:
+    """The curve of a material whose attenuation is `attenuations`, in any unit, at the energies of a beam.
+
+    Args:
+        weights: shares of the light detected at these energies, of any sum.
+        highest: line integral seen that it must reach.
+    """
+    mu, w = np.asarray(attenuations, np.float64), np.asarray(weights, np.float64)
+    mu = mu / (mu @ w / w.sum())
+    meant = np.linspace(0, 1, _NODES) ** 2 * max(highest, 0.1) / mu[w > 0].min()
+    seen = mu[w > 0].min() * meant - np.log(np.exp(-np.outer(meant, mu - mu[w > 0].min())) @ (w / w.sum()))
+    return Curve(seen, meant)
+
+
+def curve_of_paths(seen: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
+    """The curve of two energies that is closest to line integrals over paths through the material (Van de Casteele et
+    al. 2002, Phys. Med. Biol. 47, 4181): it always rises, and less and less.
+
+    Args:
+        seen: line integrals.
+        paths: lengths of the rays inside the material, in any unit; 0 of rays beside it, which have to be air.
+        highest: as of `curve_of_spectrum`.
+
+    Returns:
+        The curve, and the share of the line integrals' variance that it explains.
+
+    Raises:
+        NoCurveError: there are few rays, or the sample is not of one material.
+    """
+    p, length = np.ravel(np.asarray(seen, np.float64)), np.ravel(np.asarray(paths, np.float64))
+    few = slice(None, None, max(1, p.size // _MOST_RAYS))
+    p, length = p[few], length[few]
+    if (inside := np.count_nonzero(length)) < _FEWEST_RAYS:
+        raise NoCurveError(f"{inside} rays through the material are too few")
+    slope = float(p @ length / (length @ length))
+
+    def of(soft: float, hard: float, share: float) -> F64:
+        return hard * length - np.log(share * np.exp(-(soft - hard) * length) + 1 - share)
+
+    def residuals(x: F64) -> F64:
+        return np.asarray(of(x[0] + x[1], x[0], x[2]) - p)
+
+    bounds = (1e-6 * slope, 0, 0.01), (np.inf, np.inf, 0.99)
+    found = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
+    hard, more, share = found.x
+    explained = 1 - float(np.mean(found.fun**2) / p.var())
+    if explained < _LEAST_EXPLAINED:
+        raise NoCurveError(
+            f"thickness explains {max(explained, 0):.0%} of the line integrals, of one material it would be "
+            f"{_LEAST_EXPLAINED:.0%} and more"
+        )
+    return curve_of_spectrum((hard + more, hard), (share, 1 - share), highest), explained
