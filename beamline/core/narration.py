@@ -19,8 +19,8 @@ def sentence(event: Event) -> str | None:
             size_text = size(data["total_bytes"])
             return f"Run {data['folder']}: {data['n_frames']} frames, {size_text}, {data['duration']:.0f} s"
         case "state" | "warning":
-            text = str(data.get("message") or data.get("state"))
-            return f"Warning: {text}" if event.event == "warning" else text
+            text = str(data["message"])
+            return f"Warning: {text}" if event.event == "warning" else text or None
         case "block_started":
             return f"{data['n']} {data['kind']} frames ({data['mode']}, {data['exposure']:g} s each)"
         case "block_done":

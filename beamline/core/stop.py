@@ -44,19 +44,18 @@ class ScanAborted(ScanStopped):
     exit_code = INTERRUPTED
 
 
-class HoldRequest:
-    """A request to hold a scan before its next view, from another thread; it is granted once."""
+class PauseRequest:
+    """A request to pause a scan until somebody resumes it. From any thread: it is one assignment, without a lock."""
 
     def __init__(self) -> None:
-        self._reason: str | None = None
+        self.reason = ""
+        """Why the scan should wait; "" where it should not."""
 
-    def hold(self, reason: str) -> None:
-        self._reason = reason
+    def pause(self, reason: str = "the operator asked for it") -> None:
+        self.reason = reason
 
-    def take(self) -> str | None:
-        """Why the scan should be held; None where it should not. The request is then over."""
-        reason, self._reason = self._reason, None
-        return reason
+    def resume(self) -> None:
+        self.reason = ""
 
 
 class StopRequest:

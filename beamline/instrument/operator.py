@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import sys
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import select
+
 import click
 
 from drivers.errors import DeviceError
@@ -34,3 +39,17 @@ def ask_operator(request: str) -> None:
             request=request,
             state="What was acquired so far is in the file",
         ) from error
+
+
+def enter_pressed() -> bool:
+    """Whether Enter was pressed at the terminal since the last look; False where there is none. Does not wait."""
+    pressed = False
+    if not sys.stdin.isatty():
+        return False
+    if sys.platform == "win32":
+        while msvcrt.kbhit():
+            pressed |= msvcrt.getwch() in "\r\n"
+    else:
+        while select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline():
+            pressed = True
+    return pressed

@@ -78,7 +78,6 @@ class ScanContext:
         saturation: the count from which a pixel is saturated.
         pixels: of a frame.
         period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
-        pass_starts: triggers at which a new pass of a fly scan begins, after any pause.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
         model: line integrals that a volume has at an angle in radians, float32 [row, col] means of cells of so many
@@ -98,7 +97,6 @@ class ScanContext:
     saturation: float
     pixels: int
     period: float | None = None
-    pass_starts: frozenset[int] = frozenset({0})
     cone: bool = False
     axis_col: float | None = None
     model: Callable[[float, int], Cells] | None = None

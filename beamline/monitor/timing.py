@@ -14,9 +14,10 @@ from drivers.frame import Frame, FrameKind
 
 @dataclass(frozen=True)
 class TimingState:
-    """Trigger and time of the projection before; -1 before the first."""
+    """Trigger, framestamp and time of the projection before; -1 before the first."""
 
     trigger: int = -1
+    framestamp: int = -1
     time: float = 0.0
 
 
@@ -42,13 +43,13 @@ class Timing:
         again = frame.replaces >= 0 or frame.trigger < state.trigger  # a view that gave no frame has its old trigger
         if frame.kind is not FrameKind.PROJECTION or context.period is None or again:
             return Look(state)
-        after = TimingState(frame.trigger, frame.time)
+        after = TimingState(frame.trigger, frame.framestamp, frame.time)
         steps = frame.trigger - state.trigger
         if steps > 1:
             advice = f"{steps - 1} trigger{'s' if steps > 2 else ''} before this one exposed no frame, or it was lost."
             return Look(after, Flag(self.name, Level.INFO, frame.index, steps - 1, 0, advice))
-        if state.trigger < 0 or frame.trigger in context.pass_starts:
-            return Look(after)
+        if state.trigger < 0 or 0 <= frame.framestamp <= state.framestamp:
+            return Look(after)  # armed anew, for another pass or after a pause
         score = (frame.time - state.time) / context.period - steps
         if abs(score) <= self.warn:
             return Look(after)

@@ -144,16 +144,10 @@ def context_of(source: ScanSource) -> ScanContext:
     The period is known of our own fly scans only.
     """
     rows, cols = source.shape
-    plan, period = source.plan, None
-    starts = frozenset({0})
-    if plan.get("mode") == "fly":
-        period = float(source.attributes.get("period_s", 0)) or None
-        angles = np.asarray(plan.get("angles_deg", ()), np.float64)
-        if angles.size > 2:
-            steps = np.diff(angles)
-            starts = frozenset([0, *(np.flatnonzero(steps * np.median(steps) < 0) + 1).tolist()])
+    fly = source.plan.get("mode") == "fly"
+    period = (float(source.attributes.get("period_s", 0)) or None) if fly else None
     context = ScanContext(
-        _saturation(source), rows * cols, period, starts, cone=source.cone is not None, axis_col=source.axis_col
+        _saturation(source), rows * cols, period, cone=source.cone is not None, axis_col=source.axis_col
     )
     if source.quantity != "line_integrals":
         return context

@@ -15,13 +15,16 @@ from beamline.plan.plan import Block, Timeline
 from beamline.plan.retake import middle_of_exposure, retake_block
 from beamline.scan.exposures import Exposures, Taken
 from beamline.scan.ledger import LedgerError
-from beamline.scan.supervision import UNSUPERVISED, Supervision
+from beamline.scan.states import State
+from beamline.scan.supervision import Supervision
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, Devices
 
 DOUBTFUL = 0.2  # steps by which an angle may be wrong, from which that is told
+
+GO_ON = "Enter or `beamline resume` goes on, Ctrl-C or `beamline stop` ends the scan"
 
 NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DARK: "dark"}
 
@@ -43,7 +46,7 @@ class Acquisition:
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: takes (event, data) for block_started, block_done and warning.
-        supervision: what may hold the scan, or end it before its first projection.
+        supervision: what may pause the scan, or end it before its first projection, and is told its states.
     """
 
     def __init__(
@@ -55,11 +58,13 @@ class Acquisition:
         clock: Clock,
         stop: StopRequest,
         emit: Emit = lambda event, data: None,
-        supervision: Supervision = UNSUPERVISED,
+        supervision: Supervision | None = None,
     ) -> None:
         self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
-        self._exposures = Exposures(devices, camera_settings, settle, clock, stop, emit, self._hold)
-        self._supervision, self._refused = supervision, ""
+        self._supervision, self._refused = supervision or Supervision(), ""
+        self._exposures = Exposures(
+            devices, camera_settings, settle, clock, stop, emit, self._supervision, self._wait_while_paused
+        )
         self._done: list[TakenBlock] = []
         self.recovered = 0
         """Views that gave no frame at first, and did when they were taken again."""
@@ -131,6 +136,7 @@ class Acquisition:
         self._done.append(done)
         what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.n, "first_row": self.n_frames}
         self._emit("block_started", {**what, "exposure": block.exposure, "period": block.period})
+        self._supervision.states.enter(_state_of(block))
         self._set_shutter_and_sample(block.kind)
         yield from self._exposures.take(block, self.n_frames, taken)
         if block.kind is FrameKind.FLAT:
@@ -190,20 +196,20 @@ class Acquisition:
                 "What was taken before is in the file."
             )
 
-    def _hold(self) -> None:
-        """Wait with a closed shutter until the operator lets the scan go on, where supervision asks for that."""
-        reason, shutter = self._supervision.hold(), self._devices.shutter
-        if reason is None:
+    def _wait_while_paused(self) -> None:
+        """Wait with a closed shutter as long as a pause is asked for; a stop ends it."""
+        pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
+        if not pause.reason or self._stop.stopping:
             return
-        shutter.close()
-        self._emit("state", {"state": "held", "message": f"Held with a closed shutter: {reason}"})
-        try:
-            self._supervision.ask(f"The scan is held: {reason}. Mend what can be mended.")
-        except DeviceError as error:
-            self._stop.stop(f"{reason}; the scan was held, and nobody let it go on: {error.problem}")
+        self._devices.shutter.close()
+        self._supervision.rest()  # what was typed before does not count
+        states.enter(State.PAUSED, f"Paused with a closed shutter: {pause.reason.rstrip('.')}. {GO_ON}")
+        while pause.reason and not self._stop.stopping:
+            if self._supervision.rest():
+                pause.resume()
         if not self._stop.stopping:
-            shutter.open()
-            self._emit("state", {"state": "acquiring", "message": "The scan goes on"})
+            self._set_shutter_and_sample(block.kind)
+            states.enter(_state_of(block), "The scan goes on")
 
     def _make_safe(self, home: float | None) -> list[Exception]:
         """Stop the stage, disarm, close the shutter; all steps are tried. Returns the first error of each one."""
@@ -270,6 +276,13 @@ class Acquisition:
     def _discrepancies(self) -> str:
         """Sentences on missing, extra and doubtful frames so far, each after a space."""
         return "".join(f" {text}" for done in self._done if not done.again and (text := _describe(done)))
+
+
+def _state_of(block: Block) -> State:
+    """The state in which a block begins, and goes on after a pause."""
+    if block.kind is FrameKind.PROJECTION:
+        return State.TAXI if block.trains else State.ACQUIRING
+    return State.DARKS if block.kind is FrameKind.DARK else State.FLATS
 
 
 def _in_words(error: Exception) -> str:

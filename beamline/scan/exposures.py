@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,10 +15,12 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, pass_ends
 from beamline.scan.ledger import EXTRA, Account, Exposed, Ledger, Train, enter, settle
+from beamline.scan.states import State
+from beamline.scan.supervision import Supervision
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraFrame, CameraSettings, Devices, TriggerSource
+from drivers.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 
 SLICE = 0.5  # s: the longest wait for a frame before the stop request is looked at again
 POLL = 0.02  # s between looks at a moving stage
@@ -63,14 +65,16 @@ class Taken:
 class _Pass:
     """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes.
 
-    `braked`: time at which the stage was ordered to stop during the pass. `waiting`: frames whose trigger is told by
-    those that follow.
+    `braked`: time at which the stage was ordered to stop during the pass. `paused`: for a pause, after which the
+    triggers that come after the last frame stored are exposed anew. `waiting`: frames whose trigger is told by those
+    that follow.
     """
 
     ledger: Ledger
     first: int
     seconds: float
     braked: float = math.inf
+    paused: bool = False
     waiting: list[CameraFrame] = field(default_factory=list)
 
     @property
@@ -115,7 +119,8 @@ class Exposures:
         camera_settings: roi, binning and readout for all blocks; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: where warnings go.
-        hold: called before each view of a step scan and each pass of a fly scan; may wait.
+        supervision: says when to pause, and is told the states of a fly scan.
+        wait_while_paused: called before each frame of a stage that stands, and before each run-up.
     """
 
     def __init__(
@@ -126,11 +131,13 @@ class Exposures:
         clock: Clock,
         stop: StopRequest,
         emit: Emit,
-        hold: Callable[[], None] = lambda: None,
+        supervision: Supervision,
+        wait_while_paused: Callable[[], None],
     ) -> None:
         self._stage, self._camera = devices.stage, devices.camera
         self._settings, self._settle = camera_settings, settle
-        self._clock, self._stop, self._emit, self._hold = clock, stop, emit, hold
+        self._clock, self._stop, self._emit = clock, stop, emit
+        self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
     def take(self, block: Block, first_row: int, taken: Taken) -> Iterator[Frame]:
         """The block's frames, numbered from `first_row`; `taken` records what is missing.
@@ -169,36 +176,51 @@ class Exposures:
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         first = 0
         for train, (start, end) in zip(block.trains, pass_ends(block), strict=True):
-            self._hold()
-            if self._stop.stopping or not self.go(start):
-                return
-            angles = block.angles[first : first + train.n]
-            self._camera.arm(train.n)
-            self._stage.arm(train)
-            before = self._clock.now()
-            self._stage.start_move(end, block.speed)
-            seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
-            flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), first, seconds)
-            cut_short = True
-            try:
-                try:
-                    yield from self._until_standing(block, flight)
-                except (BeamlineError, DeviceError):
-                    yield from flight.enter(last=True)
-                    raise
-                yield from flight.enter(last=True)
-                cut_short = self._stop.stopping
-            finally:
-                taken.enter(settle(flight.ledger, cut_short), first)
-            self._stage.disarm()
-            self._camera.disarm()
-            if flight.ledger.last < 0 and not self._stop.stopping:
-                raise InstrumentError(
-                    f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned from "
-                    f"{math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Check the trigger cable, its polarity "
-                    "and the stage's trigger output. What was taken before is in the file."
-                )
+            done = 0
+            while done < train.n:  # more than once only where it is paused
+                self._wait_while_paused()
+                self._supervision.states.enter(State.TAXI)
+                begin = start + float(block.angles[first + done] - block.angles[first])
+                if self._stop.stopping or not self.go(begin):
+                    return
+                ahead = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
+                done += yield from self._pass(block, taken, ahead, first + done, (begin, end))
             first += train.n
+
+    def _pass(
+        self, block: Block, taken: Taken, train: TriggerTrain, first: int, ends: tuple[float, float]
+    ) -> Generator[tuple[CameraFrame, int, float], None, int]:
+        """Fly once over a train whose first trigger within the block is `first`; the stage stands at the first of the
+        ends. Returns how many of its triggers are done with: all, or those up to the last frame before a pause."""
+        start, end = ends
+        self._camera.arm(train.n)
+        self._stage.arm(train)
+        before = self._clock.now()
+        self._stage.start_move(end, block.speed)
+        self._supervision.states.enter(State.ACQUIRING)
+        seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
+        angles = block.angles[first : first + train.n]
+        flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), first, seconds)
+        cut_short = True
+        try:
+            try:
+                yield from self._until_standing(block, flight)
+            except (BeamlineError, DeviceError):
+                yield from flight.enter(last=True)
+                raise
+            yield from flight.enter(last=True)
+            cut_short = self._stop.stopping or flight.paused
+        finally:
+            taken.enter(settle(flight.ledger, cut_short), first)
+        self._stage.disarm()
+        self._camera.disarm()
+        if flight.ledger.last < 0 and not cut_short:
+            raise InstrumentError(
+                f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned from "
+                f"{math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Check the trigger cable, its polarity "
+                "and the stage's trigger output. What was taken before is in the file."
+            )
+        return flight.ledger.last + 1 if flight.paused else train.n
 
     def _expected(self, block: Block, angles: NDArray[np.float64], before: float, after: float) -> Train:
         """When the pulses should come: taxi at constant acceleration, then constant speed.
@@ -210,7 +232,8 @@ class Exposures:
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
-        """Frames while the stage turns; after a stop, the frames that are still being transferred.
+        """Frames while the stage turns; after a stop, the frames that are still being transferred. After a pause only
+        those exposed before the stage was told to stand: they look as if the scan had gone on.
 
         Waits for frames, not for the stage, so that a camera without frames is noticed at once.
         """
@@ -220,15 +243,16 @@ class Exposures:
         wait = patience + max(0.0, first_pulse - self._clock.now())
         braking = False
         while not flight.so_far.complete:
-            if self._stop.stopping and not braking:
-                flight.braked = self._clock.now()
+            if self._interrupted and not braking:
+                flight.braked, flight.paused = self._clock.now(), not self._stop.stopping
                 self._stage.stop()
                 braking = True
             frame = self._next_frame(tail + 2 * block.period if braking else wait, until_stop=not braking)
             if frame is not None:
                 wait = patience
-                yield from flight.enter(frame)
-            elif braking or not self._stop.stopping:
+                if not flight.paused or frame.time + tail <= flight.braked:
+                    yield from flight.enter(frame)
+            elif braking or not self._interrupted:
                 if not self._stage.moving():
                     break
                 if not braking and self._clock.now() >= flight.last_due + tail:
@@ -240,6 +264,9 @@ class Exposures:
                     )
         if not braking:
             self._wait(flight.seconds)
+        elif flight.paused:
+            self.stand()
+            return
         while (frame := self._next_frame(0.0, until_stop=False)) is not None:
             yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
@@ -252,8 +279,7 @@ class Exposures:
         triggered, silent = -math.inf, 0
         owed = self._stop.stopping
         for i, angle in enumerate(block.angles):
-            if math.isfinite(angle):
-                self._hold()
+            self._wait_while_paused()
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):
@@ -282,7 +308,7 @@ class Exposures:
         self._camera.disarm()
 
     def _next_frame(self, timeout: float, until_stop: bool) -> CameraFrame | None:
-        """The next frame, or None after `timeout` s (with `until_stop`, also at a stop request).
+        """The next frame, or None after `timeout` s (with `until_stop`, also at a request to stop or pause).
 
         A first error of the camera is a warning (frames lost from its ring buffer become missing ones); a second is
         raised.
@@ -295,7 +321,7 @@ class Exposures:
             try:
                 return self._camera.next_frame(max(0.0, min(SLICE, remaining)))
             except DeviceTimeout:
-                if remaining <= SLICE or (until_stop and self._stop.stopping):
+                if remaining <= SLICE or (until_stop and self._interrupted):
                     return None
             except DeviceError as error:
                 if failed:
@@ -331,6 +357,11 @@ class Exposures:
             if self._clock.now() > deadline:
                 raise InstrumentError(f"{self._stage.name}: it still moves after a stop. Use its emergency stop.")
             self._clock.sleep(POLL)
+
+    @property
+    def _interrupted(self) -> bool:
+        """A stop or a pause is asked for."""
+        return self._stop.stopping or bool(self._supervision.pause.reason)
 
     def _check_abort(self) -> None:
         if self._stop.aborting:

@@ -194,13 +194,10 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
 
 
 def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: ScanInfo) -> ScanContext:
-    views = timeline.views
-    starts = np.cumsum([0, *(train.n for train in views.trains)])[:-1]
     return ScanContext(
         saturation=2**timing.bits - 1,
         pixels=math.prod(timing.shape),
-        period=views.period if plan.mode is Mode.FLY else None,
-        pass_starts=frozenset(starts.tolist()),
+        period=timeline.views.period if plan.mode is Mode.FLY else None,
         cone=info.source_distance_mm is not None,
         axis_col=info.axis_col,
     )

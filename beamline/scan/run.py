@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
-from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,44 +18,29 @@ from beamline.config.references import reference_limits
 from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.narration import UserLog
-from beamline.core.stop import HoldRequest, ScanAborted, StopRequest
+from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count
 from beamline.instrument.connect import Instrument, connect
-from beamline.instrument.operator import ask_operator
+from beamline.instrument.operator import enter_pressed
 from beamline.plan.plan import Block
 from beamline.plan.retake import Retake, spread
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
+from beamline.scan.control import obeying
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction
 from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
-from beamline.scan.supervision import AlarmPolicy, AlarmReaction, Supervision
+from beamline.scan.states import NEXT, State, StateMachine
+from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, Supervision
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
 from drivers.manual import Ask
 
-
-class State(StrEnum):
-    """What a run is doing, in this order; any but `done` may be followed by `failed`."""
-
-    PREPARING = "preparing"
-    ACQUIRING = "acquiring"
-    STOPPING = "stopping"
-    DONE = "done"
-    FAILED = "failed"
-
-
-MESSAGES: Mapping[State, str] = {
-    State.PREPARING: "Preparing",
-    State.ACQUIRING: "Acquiring",
-    State.STOPPING: "Stage stopped, shutter closed; the last frames are being written",
-    State.DONE: "Finished",
-    State.FAILED: "Ended early",
-}
-
+SAFE = "Stage stopped, shutter closed; the last frames are being written"
+"""Message of the state `finishing`."""
 
 LAST_ROUND = 5.0
 """Real s that a live reconstruction has after a scan that was stopped, before it is asked for the volume it has."""
@@ -67,7 +52,7 @@ UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
     "the last frames are being written"
 )
-"""Message of the state `stopping` where a device failed while the instrument was made safe; warnings name it."""
+"""The same where a device failed while the instrument was made safe; warnings name it."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +135,8 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
-            run = _Run(config, instrument, ready, folder, stop, emit, began, ask or ask_operator)
+            run = _Run(config, instrument, ready, folder, stop, emit, began)
+            stack.enter_context(obeying(folder, stop, run.pause))
             return run.go(live, afterwards, release=connected.close)
 
 
@@ -169,23 +155,26 @@ class _Run:
     stop: StopRequest
     emit: Emit
     began: float
-    ask: Ask
-    hold: HoldRequest = field(default_factory=HoldRequest)
+    pause: PauseRequest = field(default_factory=PauseRequest)
     told: set[str] = field(default_factory=set)
     """Groups of references whose faults were told."""
+
+    @cached_property
+    def states(self) -> StateMachine:
+        return StateMachine(self.emit)
 
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
         try:
-            self._enter(State.PREPARING)
+            self.states.enter(State.PREPARING, "Preparing")
             result = self._scan(live, release)
             if afterwards is not None:
                 result = self._reconstructed(afterwards, result)
         except BaseException as error:
-            self._enter(State.FAILED)
+            self.states.enter(self._end_by(error), "Ended early")
             self.emit("failed", {"message": user_message(error), "exit_code": exit_code(error), "folder": self.folder})
             raise
-        self._enter(State.DONE)
+        self.states.enter(State.DONE, "Finished")
         self.emit("done", {**asdict(result), "folder": self.folder})
         return result
 
@@ -220,10 +209,9 @@ class _Run:
         recorder = self._recorder(writer)
         acquisition = self._acquisition(recorder)
         labels = LabelLog()
-        self._enter(State.ACQUIRING)
         with self._beam_log() as beam:
             error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
-        self._enter(State.STOPPING, UNSAFE if acquisition.unsafe else None)
+        self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
         disk = _failure_of(recorder.finish)
         error = self._worse(error, disk)
         faults = self._reference_faults(recorder)
@@ -291,8 +279,10 @@ class _Run:
         self.emit("warning", {"message": str(after)})
         return error
 
-    def _enter(self, state: State, message: str | None = None) -> None:
-        self.emit("state", {"state": state, "message": message or MESSAGES[state]})
+    def _end_by(self, error: BaseException) -> State:
+        """The state in which an error ends the run."""
+        stopped = State.ABORTED if isinstance(error, ScanAborted) else State.STOPPED
+        return stopped if isinstance(error, ScanStopped) and stopped in NEXT[self.states.state] else State.FAILED
 
     def _writer(self, path: Path) -> NXtomoWriter:
         storage = self.config.storage
@@ -314,7 +304,7 @@ class _Run:
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             emit=self.emit,
-            react=AlarmReaction(policy, self.stop, self.hold, self.emit),
+            react=AlarmReaction(policy, self.stop, self.pause, self.emit),
         )
 
     def _acquisition(self, recorder: Recorder) -> Acquisition:
@@ -323,7 +313,7 @@ class _Run:
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.emit,
             Supervision(
-                lambda: self._refusal(recorder), self.hold.take, self.ask,
+                lambda: self._refusal(recorder), self.pause, _rest, self.states,
                 lambda missing: self._retakes(recorder, missing),
             ),
         )  # fmt: skip
@@ -360,7 +350,7 @@ class _Run:
             )
             self.emit("warning", {"message": message})
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
-        self.emit("state", {"state": "retaking", "message": f"Taking {count(len(chosen), 'view')} again"})
+        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
 
     def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:
@@ -388,6 +378,12 @@ class _Run:
             "total_bytes": timeline.total_bytes,
             "remarks": timeline.remarks,
         }
+
+
+def _rest() -> bool:
+    """Wait a moment, while paused; whether Enter was pressed at the terminal."""
+    time.sleep(PAUSE_POLL)
+    return enter_pressed()
 
 
 def _failure_of(action: Callable[[], None]) -> BaseException | None:

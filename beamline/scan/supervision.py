@@ -2,41 +2,44 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from beamline.core.events import Emit
-from beamline.core.stop import HoldRequest, StopRequest
+from beamline.core.stop import PauseRequest, StopRequest
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.plan.retake import Retake
-from drivers.manual import Ask
+from beamline.scan.states import State, StateMachine
+
+PAUSE_POLL = 0.05  # real s between looks at a paused scan
 
 
-def _nobody(request: str) -> None:
-    """For scans that are never held."""
+def _rest() -> bool:
+    time.sleep(PAUSE_POLL)
+    return False
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """What acquisition asks while it goes on.
+    """What acquisition asks and tells while it goes on.
 
     Attributes:
         refusal: asked once, before the first projection, when all frames before it were taken over: why no projection
             should be taken; None: they may be.
-        hold: asked before each view of a step scan and before each pass of a fly scan: why it should wait; None: it
-            goes on.
-        ask: puts the request to go on to the operator, and returns when it was confirmed.
+        pause: looked at before each frame of a stage that stands, and all the time while it turns.
+        rest: called again and again while the scan is paused: waits a moment, and says whether the operator at the
+            terminal let it go on since the last call.
+        states: told what the scan is doing.
         retakes: asked once, after the last projection: which to take again; is given the triggers without a frame.
     """
 
     refusal: Callable[[], str | None] = lambda: None
-    hold: Callable[[], str | None] = lambda: None
-    ask: Ask = _nobody
+    pause: PauseRequest = field(default_factory=PauseRequest)
+    rest: Callable[[], bool] = _rest
+    states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
-
-
-UNSUPERVISED = Supervision()
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,8 @@ class AlarmPolicy:
 class AlarmReaction:
     """Carries out the policy while frames come."""
 
-    def __init__(self, policy: AlarmPolicy, stop: StopRequest, hold: HoldRequest, emit: Emit) -> None:
-        self._policy, self._stop, self._hold, self._emit = policy, stop, hold, emit
+    def __init__(self, policy: AlarmPolicy, stop: StopRequest, pause: PauseRequest, emit: Emit) -> None:
+        self._policy, self._stop, self._pause, self._emit = policy, stop, pause, emit
         self._in_a_row: Counter[str] = Counter()
 
     def __call__(self, flags: tuple[Flag, ...]) -> None:
@@ -75,6 +78,6 @@ class AlarmReaction:
             case Policy.WARN:
                 self._emit("warning", {"message": f"{reason}."})
             case Policy.PAUSE:
-                self._hold.hold(reason)
+                self._pause.pause(reason)
             case Policy.STOP if not self._stop.stopping:
                 self._stop.stop(reason)

@@ -10,6 +10,7 @@ import pytest
 from beamline.core.stop import StopRequest
 from beamline.plan.plan import Timeline
 from beamline.scan.acquisition import Acquisition
+from beamline.scan.supervision import Supervision
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, TriggerSource
 from tests.beamline.fakes import COUNT, HOME, FakeInstrument, seen
@@ -20,7 +21,13 @@ SETTLE = 0.05
 class Run:
     """A scan run to its end, whatever that is."""
 
-    def __init__(self, instrument: FakeInstrument, timeline: Timeline, stop: StopRequest | None = None) -> None:
+    def __init__(
+        self,
+        instrument: FakeInstrument,
+        timeline: Timeline,
+        stop: StopRequest | None = None,
+        supervision: Supervision | None = None,
+    ) -> None:
         self.events: list[tuple[str, Mapping[str, Any]]] = []
         self.frames: list[Frame] = []
         self.error: BaseException | None = None
@@ -32,6 +39,7 @@ class Run:
             instrument.clock,
             stop or StopRequest(),
             lambda event, data: self.events.append((event, data)),
+            supervision,
         )
         try:
             self.frames.extend(self.scan.frames())

@@ -14,7 +14,6 @@ from beamline.core.stop import StopRequest
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
-from drivers.manual import Ask
 from tests.beamline.fakes import COUNT, FakeInstrument, decode
 
 SMALL = (
@@ -42,7 +41,7 @@ class Ran:
         *overrides: str,
         stop: StopRequest | None = None,
         live: Callable[[Path, Path], Sequence[str]] | None = None,
-        ask: Ask | None = None,
+        heard: Callable[[Event], None] = lambda event: None,
     ) -> None:
         self.events: list[Event] = []
         self.result: RunResult | None = None
@@ -51,7 +50,7 @@ class Ran:
         try:
             devices = instrument.connected()
             self.result = run_scan(
-                small(*overrides), runs, [self.events.append], stop, live=live, instrument=devices, ask=ask
+                small(*overrides), runs, [self.events.append, heard], stop, live=live, instrument=devices
             )
         except BaseException as error:
             self.error = error

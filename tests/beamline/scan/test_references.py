@@ -39,7 +39,7 @@ def test_no_projection_is_taken_after_references_that_cannot_be_used(
     assert [event.data["kind"] for event in ran.of("block_started")] == ["dark", "flat"]
     (done,), (failed,) = ran.of("scan_done"), ran.of("failed")
     assert (done.data["status"], failed.data["exit_code"]) == ("stopped", 6)
-    assert ran.states == [State.PREPARING, State.ACQUIRING, State.STOPPING, State.FAILED]
+    assert ran.states == [State.PREPARING, State.DARKS, State.FLATS, State.FINISHING, State.STOPPED]
     assert any(event.data["message"].startswith(said) for event in ran.of("warning"))
     ran.assert_safe()
     assert ran.instrument.is_in

@@ -27,7 +27,8 @@ from beamline.projections.selection import Selection
 from beamline.scan import recorder as recorder_module
 from beamline.scan import run as module
 from beamline.scan.ledger import LedgerError
-from beamline.scan.run import State, run_scan
+from beamline.scan.run import run_scan
+from beamline.scan.states import State
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.errors import DeviceError
@@ -59,8 +60,11 @@ def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
     assert ran.folder is not None
     names = [event.event for event in ran.events if event.event != "frame"]
     block = ["block_started", "block_done"]
-    assert names == ["state", "run_started", "state", *block * 4, "state", "scan_done", "state", "done"]
-    assert ran.states == [State.PREPARING, State.ACQUIRING, State.STOPPING, State.DONE]
+    begun, done = block
+    taken = [begun, "state", done] * 2 + [begun, "state", "state", done] + [begun, "state", done]
+    assert names == ["state", "run_started", *taken, "state", "scan_done", "state", "done"]
+    darks, flats, taxi, views = State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING
+    assert ran.states == [State.PREPARING, darks, flats, taxi, views, flats, State.FINISHING, State.DONE]
     frames = ran.of("frame")
     assert frames[-1].data["n"] == frames[-1].data["of"] == 19
     assert frames[-1].data["eta_s"] == 0
@@ -113,6 +117,7 @@ def test_stop_and_abort_leave_a_readable_file(
     ran.assert_good_file(n, "stopped")
     ran.assert_safe()
     assert ran.of("failed")[0].data["exit_code"] == code
+    assert ran.states[-2:] == [State.FINISHING, State.ABORTED if abort else State.STOPPED]
 
 
 def test_a_stop_before_the_start_makes_no_folder(tmp_path: Path) -> None:

@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ScanStopped
-from beamline.core.stop import HoldRequest, StopRequest
+from beamline.core.events import Event
+from beamline.core.stop import PauseRequest, StopRequest
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
+from beamline.scan.states import State
 from beamline.scan.supervision import AlarmPolicy, AlarmReaction
 from beamline.storage.readers.open import open_scan
-from drivers.errors import DeviceError
 from drivers.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
@@ -42,15 +43,16 @@ A, W, N = Level.ALARM, Level.WARN, None
 def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
     policy: Policy, frames: list[Level | None], acts: int
 ) -> None:
-    stop, hold = StopRequest(), HoldRequest()
+    stop, pause = StopRequest(), PauseRequest()
     events: list[tuple[str, Mapping[str, Any]]] = []
     react = AlarmReaction(
-        AlarmPolicy(act_after=3, policies={"beam": policy}), stop, hold, lambda kind, data: events.append((kind, data))
+        AlarmPolicy(act_after=3, policies={"beam": policy}), stop, pause, lambda kind, data: events.append((kind, data))
     )
     held = 0
     for level in frames:
         react(flags(level))
-        held += hold.take() is not None
+        held += bool(pause.reason)
+        pause.resume()
     assert held == acts * (policy is Policy.PAUSE)
     assert stop.stopping is (policy is Policy.STOP and acts > 0)
     assert len(events) == acts * (policy is Policy.WARN)
@@ -64,48 +66,38 @@ WORDS = ("scan.angles.views=40", "monitor.act_after=2", "scan.settle_s=0")
 
 
 @pytest.mark.parametrize("mode", ["step", "fly"])
-def test_a_held_scan_closes_the_shutter_asks_and_goes_on(
+def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (1, 1))  # the writer keeps up with the virtual clock
     monkeypatch.setattr(recorder_module, "WAITING_BYTES", 1)
-    angles = "scan.angles={scheme: interlaced, views: 40, passes: 2, start_deg: 0, span_deg: 180}"
     instrument = FakeInstrument(Faults(repeats={9, 10}))
-    asked: list[tuple[str, bool]] = []
-    ran = Ran(
-        tmp_path,
-        instrument,
-        *WORDS,
-        "monitor.policy.stuck=pause",
-        f"scan.mode={mode}",
-        *([angles] if mode == "fly" else []),
-        ask=lambda request: asked.append((request, instrument.is_open)),
-    )
+    paused: list[tuple[str, bool]] = []
+
+    def resume(event: Event) -> None:
+        if event.data.get("state") == State.PAUSED:
+            paused.append((event.data["message"], instrument.is_open))
+            (run,) = tmp_path.iterdir()
+            (run / "control" / "resume").touch()
+
+    ran = Ran(tmp_path, instrument, *WORDS, "monitor.policy.stuck=pause", f"scan.mode={mode}", heard=resume)
     assert ran.error is None and ran.result is not None and ran.result.n_frames == 47
-    ((request, was_open),) = asked
-    assert "held: 2 frames in a row have an alarm of the monitor's stuck check" in request
+    ((message, was_open),) = paused
+    assert "Paused with a closed shutter: 2 frames in a row have an alarm of the monitor's stuck check" in message
+    assert "`beamline resume` goes on" in message
     assert not was_open
-    assert ran.states == ["preparing", "acquiring", "held", "acquiring", "stopping", "done"]
+    on = [State.TAXI, State.ACQUIRING] if mode == "fly" else [State.ACQUIRING]
+    refs = [State.PREPARING, State.DARKS, State.FLATS]
+    assert ran.states == [*refs, *on, State.PAUSED, *on, State.FLATS, State.FINISHING, State.DONE]
     with open_scan(ran.result.path) as source:
         assert source.finished
-        for frame in source.frames():
+        views = [frame for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
+        assert [frame.trigger for frame in views] == list(range(40))
+        for frame in views:
             if frame.index not in (9, 10):  # those that show the frame before
                 count, is_open, _, _ = decode(frame.counts)
-                assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
-                assert is_open is (frame.kind is not FrameKind.DARK)
-    ran.assert_safe()
-
-
-def test_a_scan_that_is_held_where_nobody_is_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (1, 1))
-
-    def nobody(request: str) -> None:
-        raise DeviceError("operator", "there is no terminal to ask at")
-
-    words = (*WORDS, "monitor.policy.stuck=pause", "scan.mode=step")
-    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10})), *words, ask=nobody)
-    assert type(ran.error) is ScanStopped
-    assert "nobody let it go on" in str(ran.error)
+                assert frame.angle == pytest.approx(count * COUNT, abs=COUNT) and is_open
+        assert not [flag for flag in ran.of("flag") if flag.data["check"] == "timing"]  # it is no late frame
     ran.assert_safe()
 
 

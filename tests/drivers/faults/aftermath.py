@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from beamline.scan.run import MESSAGES, UNSAFE, State
+from beamline.scan.run import SAFE, UNSAFE
+from beamline.scan.states import State
 from drivers.errors import DeviceError
 from drivers.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, VIEWS, Rig, Scanned
@@ -36,14 +37,14 @@ def assert_at_rest(rig: Rig, scanned: Scanned) -> None:
     assert not rig.moving
     assert not rig.shutter_open
     assert rig.world.live == 0
-    messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
-    assert messages == ([] if scanned.folder is None else [MESSAGES[State.STOPPING]])
+    messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.FINISHING]
+    assert messages == ([] if scanned.folder is None else [SAFE])
 
 
 def assert_known_to_be_unsafe(rig: Rig, scanned: Scanned) -> None:
     """The line is gone, so nothing can be done: that is what the run must say."""
     assert rig.world.live == 0
-    messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.STOPPING]
+    messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.FINISHING]
     assert messages == [UNSAFE]
     text = " ".join([*scanned.warnings, str(scanned.error)])
     assert "The device may still be doing what it did before" in text

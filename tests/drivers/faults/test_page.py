@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from beamline.scan.run import MESSAGES, UNSAFE, State
+from beamline.scan.run import SAFE, UNSAFE
 from tests.drivers.faults.table import WORDS
 
 ROOT = Path(__file__).parents[3]
@@ -29,7 +29,7 @@ def test_every_row_says_what_is_seen_what_was_done_and_what_to_do() -> None:
 
 def test_what_the_run_says_at_the_end_is_quoted() -> None:
     words = re.sub(r"\s+", " ", TEXT)
-    assert MESSAGES[State.STOPPING].split(";")[0] in words
+    assert SAFE.split(";")[0] in words
     assert UNSAFE.split(";")[0] in words
 
 

@@ -1,0 +1,69 @@
+"""States of a scan, and which may follow which; docs/states.md draws them and says what each verb does in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+
+from beamline.core.events import Emit
+
+
+class State(StrEnum):
+    """What a scan is doing."""
+
+    IDLE = "idle"
+    PREPARING = "preparing"
+    DARKS = "darks"
+    FLATS = "flats"
+    TAXI = "taxi"
+    ACQUIRING = "acquiring"
+    PAUSED = "paused"
+    FINISHING = "finishing"
+    DONE = "done"
+    STOPPED = "stopped"
+    ABORTED = "aborted"
+    FAILED = "failed"
+
+    @property
+    def ended(self) -> bool:
+        """Nothing follows."""
+        return not NEXT[self]
+
+
+_TAKING = frozenset({State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING})
+
+NEXT: Mapping[State, frozenset[State]] = MappingProxyType(
+    {
+        State.IDLE: frozenset({State.PREPARING}),
+        State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
+        **{state: (_TAKING - {state}) | {State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
+        State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
+        State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
+        **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
+    }
+)
+"""The states that may follow each one."""
+
+
+class StateMachine:
+    """The state of one scan. Attribute `state`: the present one.
+
+    Args:
+        emit: takes the event `state`.
+    """
+
+    def __init__(self, emit: Emit = lambda event, data: None, state: State = State.IDLE) -> None:
+        self._emit, self.state = emit, state
+
+    def enter(self, state: State, message: str = "") -> None:
+        """Go to a state, with a message for people; to stay in one without a message says nothing.
+
+        Raises:
+            ValueError: the state must not follow the present one; nothing has changed.
+        """
+        if state is not self.state and state not in NEXT[self.state]:
+            raise ValueError(f"a scan cannot go from {self.state} to {state}")
+        if state is not self.state or message:
+            self.state = state
+            self._emit("state", {"state": state, "message": message})

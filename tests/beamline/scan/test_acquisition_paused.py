@@ -1,0 +1,165 @@
+"""A scan that is paused, at any moment, gives the frames of one that was not: none is lost, none is there twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.core.errors import ScanStopped
+from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
+from beamline.plan.plan import Mode, Place
+from beamline.scan.states import State, StateMachine
+from beamline.scan.supervision import Supervision
+from drivers.frame import Frame, FrameKind
+from drivers.protocols import CameraFrame
+from tests.beamline.acquired import Run, assert_safe, assert_true_angles
+from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults
+
+FIRST = 5  # triggers before the views: 3 darks and 2 flats
+
+
+class Still(Camera):
+    """The noise follows from where the stage is, and no pixel from how many triggers there were before."""
+
+    def _expose(self, time: float, number: int, count: int) -> None:
+        super()._expose(time, number, count)
+        if self.ring:
+            self.ring[-1] = replace(self.ring[-1], state=(*self.ring[-1].state[:3], 0))
+
+    def _take(self, frame: Exposed) -> CameraFrame:
+        self.rng = np.random.default_rng(frame.state[0])
+        return super()._take(frame)
+
+
+class Paused:
+    """A fake instrument whose scan is resumed as soon as it is paused; what it was then is noted."""
+
+    def __init__(self, faults: Faults | None = None, stop: StopRequest | None = None) -> None:
+        self.pause, self.stop = PauseRequest(), stop
+        self.instrument = FakeInstrument(faults)
+        self.instrument.camera = Still(self.instrument)
+        self.instrument.devices = replace(self.instrument.devices, camera=self.instrument.camera)
+        self.states: list[State] = []
+        self.at_rest: list[bool] = []
+        self.machine = StateMachine(self._told, State.PREPARING)
+
+    def _told(self, event: str, data: Mapping[str, Any]) -> None:
+        self.states.append(data["state"])
+        if data["state"] is State.PAUSED:
+            self.at_rest.append(not self.instrument.is_open and not self.instrument.stage.moving())
+            self.pause.resume()
+
+    def at_frame(self, number: int) -> Paused:
+        self.instrument.on_frame = lambda seen: self.pause.pause() if seen == number else None
+        return self
+
+    def at_times(self, seconds: list[float]) -> Paused:
+        """Virtual s after now."""
+        clock, due = self.instrument.clock, sorted(self.instrument.clock.now() + at for at in seconds)
+        sleep = clock.sleep
+
+        def on_the_way(s: float) -> None:
+            sleep(s)
+            while due and clock.now() >= due[0]:
+                due.pop(0)
+                self.pause.pause()
+
+        clock.sleep = on_the_way  # type: ignore[method-assign]
+        return self
+
+    def run(self, n: int, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30) -> Run:
+        supervision = Supervision(pause=self.pause, rest=lambda: False, states=self.machine)
+        return Run(self.instrument, self.instrument.timeline(n, mode, passes, at, speed), self.stop, supervision)
+
+
+def assert_same(frames: list[Frame], whole: list[Frame]) -> None:
+    def facts(frame: Frame) -> tuple[object, ...]:
+        return frame.kind, frame.index, frame.trigger, frame.angle, frame.exposure, frame.replaces
+
+    assert [facts(f) for f in frames if f.kind is not FrameKind.DARK] == [
+        facts(f) for f in whole if f.kind is not FrameKind.DARK
+    ]
+    np.testing.assert_array_equal([frame.counts for frame in frames], [frame.counts for frame in whole])
+
+
+def whole(n: int, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30) -> list[Frame]:
+    run = Paused().run(n, mode, passes, at, speed)
+    assert run.error is None
+    return run.frames
+
+
+def every_index(n: int, speed: float, passes: int) -> None:
+    expected = whole(n, passes=passes, speed=speed)
+    for number in range(FIRST, FIRST + n):
+        paused = Paused().at_frame(number)
+        run = paused.run(n, passes=passes, speed=speed)
+        assert run.error is None, number
+        assert_same(run.frames, expected)
+        assert all(paused.at_rest)
+        assert len(paused.at_rest) == 1 or number == FIRST + n - 1  # after the last frame there is nothing to wait for
+        assert_safe(paused.instrument)
+
+
+@pytest.mark.parametrize(("speed", "passes"), [(30, 1), (55, 1), (30, 2)])
+def test_a_fly_scan_paused_at_any_frame_is_pixel_for_pixel_the_one_that_was_not(speed: float, passes: int) -> None:
+    every_index(12, speed, passes)
+
+
+@pytest.mark.slow
+def test_two_hundred_views_paused_at_any_frame() -> None:
+    every_index(200, 30, 1)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.floats(0, 12), max_size=4), st.sampled_from([(Mode.FLY, 1), (Mode.FLY, 3), (Mode.STEP, 1)]))
+def test_a_scan_paused_at_any_times_is_the_one_that_was_not(times: list[float], how: tuple[Mode, int]) -> None:
+    """Also in darks and flats, on the way to the start, during the run-up, and while it brakes for the pause before."""
+    paused = Paused().at_times(times)
+    run = paused.run(12, *how, at=Place.BOTH)
+    assert run.error is None
+    assert_same(run.frames, whole(12, *how, at=Place.BOTH))
+    assert all(paused.at_rest) and len(paused.at_rest) <= len(times)
+    assert_safe(paused.instrument)
+
+
+def test_the_states_of_a_scan_that_is_paused_in_flats_and_in_views() -> None:
+    paused = Paused()
+    paused.instrument.on_frame = lambda number: paused.pause.pause() if number in (3, 8) else None
+    assert paused.run(12).error is None
+    darks, flats, taxi, views, waits = State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING, State.PAUSED
+    assert paused.states == [darks, flats, waits, flats, taxi, views, waits, taxi, views]
+
+
+def test_lost_and_ignored_triggers_before_a_pause_are_named_and_those_after_it_are_taken() -> None:
+    """Trigger 7 is lost; 10 and 11, on the way when the stage brakes, are exposed anew."""
+    paused = Paused(Faults(lost={FIRST + 7})).at_frame(FIRST + 9)
+    run = paused.run(24, speed=55)
+    assert run.scan.missing == [FIRST + 7]
+    assert run.views == [i for i in range(24) if i != 7]
+    assert_true_angles(run)
+
+
+@pytest.mark.parametrize(("abort", "kind"), [(False, ScanStopped), (True, ScanAborted)])
+def test_a_paused_scan_can_be_stopped_and_aborted(abort: bool, kind: type[ScanStopped]) -> None:
+    stop = StopRequest()
+    paused = Paused(stop=stop).at_frame(FIRST + 4)
+    paused.pause.resume = stop.abort if abort else stop.stop  # type: ignore[method-assign]
+    run = paused.run(12, at=Place.BOTH)
+    assert type(run.error) is kind
+    assert run.views == list(range(5))
+    assert [f.kind for f in run.frames][FIRST + 5 :] == []  # darks and flats were taken before
+    assert_safe(paused.instrument, home=not abort)
+
+
+def test_a_pause_asked_for_before_the_first_frame_is_kept() -> None:
+    paused = Paused()
+    paused.pause.pause()
+    run = paused.run(12)
+    assert run.error is None and paused.states[:3] == [State.DARKS, State.PAUSED, State.DARKS]
+    assert_same(run.frames, whole(12))

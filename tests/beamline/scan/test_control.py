@@ -1,0 +1,122 @@
+"""Verbs from another terminal reach a running scan, and nobody waits for one that is dead."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from beamline.cli.main import main
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event
+from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
+from beamline.scan import control
+from beamline.scan.control import Verb, obeying, running, state_of, tell
+from beamline.scan.states import State
+from beamline.storage.writer_lock import WriterLock
+from tests.beamline.fakes import FakeInstrument
+from tests.beamline.ran import Ran
+
+
+def asked(run: Path, verb: Verb) -> None:
+    """Ask as another program does, and wait until it was taken."""
+    request = run / "control" / verb
+    request.touch()
+    deadline = time.monotonic() + 10
+    while request.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_run_is_paused_resumed_and_complete(tmp_path: Path, mode: str) -> None:
+    def at_frame(number: int) -> None:
+        if number == 8:
+            (run,) = tmp_path.iterdir()
+            asked(run, Verb.PAUSE)
+
+    def resume(event: Event) -> None:
+        if event.data.get("state") == State.PAUSED:
+            (run,) = tmp_path.iterdir()
+            (run / "control" / "resume").touch()
+
+    ran = Ran(tmp_path, FakeInstrument(on_frame=at_frame), f"scan.mode={mode}", heard=resume)
+    assert ran.error is None and ran.folder is not None
+    assert ran.states.count(State.PAUSED) == 1
+    ran.assert_good_file(19, "complete")
+    assert not (ran.folder / "control").exists()
+    assert state_of(ran.folder) is State.DONE
+
+
+@pytest.mark.parametrize(
+    ("verb", "error", "end"), [("stop", ScanStopped, State.STOPPED), ("abort", ScanAborted, State.ABORTED)]
+)
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_run_is_ended_also_while_it_is_paused(
+    tmp_path: Path, verb: str, error: type[ScanStopped], end: State, paused: bool
+) -> None:
+    def at_frame(number: int) -> None:
+        if number == 8:
+            (run,) = tmp_path.iterdir()
+            asked(run, Verb.PAUSE if paused else Verb(verb))
+
+    def wish(event: Event) -> None:
+        if event.data.get("state") == State.PAUSED:
+            (run,) = tmp_path.iterdir()
+            (run / "control" / verb).touch()
+
+    ran = Ran(tmp_path, FakeInstrument(on_frame=at_frame), heard=wish)
+    assert type(ran.error) is error
+    assert ran.states[-1] == end and (State.PAUSED in ran.states) is paused
+    ran.assert_safe()
+
+
+def test_only_the_owner_may_ask_and_nothing_is_left(tmp_path: Path) -> None:
+    pause = PauseRequest()
+    with obeying(tmp_path, StopRequest(), pause):
+        if os.name == "posix":
+            assert (tmp_path / "control").stat().st_mode & 0o777 == 0o700
+        asked(tmp_path, Verb.PAUSE)
+        assert pause.reason
+        (tmp_path / "control" / "resume").touch()
+    assert not (tmp_path / "control").exists()
+
+
+def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(control, "_EFFECT", 0.3)
+    runs = [tmp_path / "runs" / name for name in ("a", "b")]
+    for run in runs:
+        run.mkdir(parents=True)
+        (run / "scan.h5").touch()
+    assert "no scan runs in runs" in CliRunner().invoke(main, ["pause"]).stderr
+    stop = StopRequest()
+    (runs[0] / "events.jsonl").write_text('{"event": "frame"}\n{"event": "state", "state": "acquiring"}\n{"event": "st')
+    locks = [WriterLock(runs[0] / "scan.h5")]
+    with obeying(runs[0], stop, PauseRequest()):
+        assert running(Path("runs")) == [Path("runs/a")]
+        result = CliRunner().invoke(main, ["stop"])
+        assert result.exit_code == 0 and result.stdout == f"{Path('runs/a')}: acquiring\n"
+        assert stop.stopping and not stop.aborting
+        locks.append(WriterLock(runs[1] / "scan.h5"))
+        with obeying(runs[1], stop, PauseRequest()):
+            result = CliRunner().invoke(main, ["abort"])
+            assert result.exit_code == 2 and "2 scans run in runs: a, b" in result.stderr
+            assert CliRunner().invoke(main, ["abort", str(runs[1])]).exit_code == 0
+            assert stop.aborting
+    for lock in locks:
+        lock.release()
+
+
+def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "_ANSWER", 0.2)
+    with pytest.raises(ConfigError, match="no scan runs"):
+        tell(tmp_path, Verb.PAUSE)
+    (tmp_path / "control").mkdir()
+    with pytest.raises(ConfigError, match="does not answer"):
+        tell(tmp_path, Verb.PAUSE)
+    assert list((tmp_path / "control").iterdir()) == []

@@ -1,0 +1,43 @@
+"""The table of states is closed, and the page draws it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from beamline.scan.states import NEXT, State, StateMachine
+
+PAGE = Path(__file__).parents[3] / "docs" / "states.md"
+ENDS = {State.DONE, State.STOPPED, State.ABORTED, State.FAILED}
+
+
+def test_every_state_is_reached_from_idle_and_leads_to_an_end() -> None:
+    reached, new = {State.IDLE}, {State.IDLE}
+    while new := {after for state in new for after in NEXT[state]} - reached:
+        reached |= new
+    assert reached == set(State) == set(NEXT)
+    assert {state for state in State if state.ended} == ENDS
+    assert all(State.FAILED in NEXT[state] for state in State if state not in ENDS | {State.IDLE})
+
+
+def test_the_page_draws_the_table() -> None:
+    groups = {"taking": {State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING}}
+    drawn = set()
+    for before, after in re.findall(r"^ *(\w+) --> (\w+)", PAGE.read_text(encoding="utf-8"), re.MULTILINE):
+        for one in groups.get(before) or {State(before)}:
+            drawn |= {(one, other) for other in groups.get(after) or {State(after)} if one is not other}
+    assert drawn == {(before, after) for before in State for after in NEXT[before]}
+
+
+def test_what_the_table_does_not_have_is_refused_and_to_stay_is_silent() -> None:
+    told = []
+    machine = StateMachine(lambda event, data: told.append((event, data["state"], data["message"])))
+    with pytest.raises(ValueError, match="cannot go from idle to paused"):
+        machine.enter(State.PAUSED)
+    machine.enter(State.PREPARING)
+    machine.enter(State.PREPARING)
+    machine.enter(State.PREPARING, "still")
+    assert told == [("state", "preparing", ""), ("state", "preparing", "still")]
+    assert machine.state is State.PREPARING
