@@ -38,6 +38,7 @@ from recon.base.choices import AUTO, Filter
 from recon.methods import DEFAULT, names
 
 if TYPE_CHECKING:
+    from beamline.reconstruct.axis_trials import AxisRange
     from beamline.reconstruct.options import ReconOptions
 
 
@@ -197,12 +198,15 @@ def recon(
         raise click.UsageError("--memory does not go with --follow or --budget, which hold everything in memory.")
     if dry and (follow or budget is not None):
         raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
-    output = output or Path(f"{file.stem}_{method}.h5")
+    typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     refuse_shared(
         {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume, "--log": log}
     )
-    source, selection = chosen(file, seed, values)
+    tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
+    if tried is not None and follow:
+        raise click.UsageError("--axis try is for a finished scan: it needs all views.")
+    source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=source,
         target=OutputPaths(output, page),
@@ -225,6 +229,11 @@ def recon(
         _write_recipe(write_config, options.recipe)
         return
     clock = SystemClock()
+    if tried is not None:
+        _try_axes(
+            options, tried, Path(f"{file.stem}_axis.png") if typed is None else typed.with_suffix(".png"), as_json
+        )
+        return
     if dry:
         _dry_run(options, clock, as_json)
         return
@@ -283,6 +292,19 @@ def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
             sink(Event("done", clock.now(), asdict(found)))
     if not as_json:
         click.echo("\n".join(found.lines()))
+
+
+def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: bool) -> None:
+    """One slice by each of some axes, as a picture."""
+    from beamline.reconstruct.axis_trials import try_axes
+
+    last: list[Event] = []
+    with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
+        try_axes(options, wanted, path, fan_out(last.append, *(sinks or [terminal])), SystemClock())
+    if not as_json:
+        done = last[-1].data
+        scores = "\n".join(f"  {col:>8}  {score:.4f}" for col, score in done["scores"].items())
+        click.echo(f"axis    share below 0 (lower is better)\n{scores}\nbest    {done['axis_col']:g}\nsheet   {path}")
 
 
 def _write_recipe(path: Path, text: str) -> None:

@@ -17,6 +17,7 @@ from recon.base.choices import FEW_PHOTONS, Noise, Rings
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Hardening, Phase, Selection
+    from beamline.reconstruct.axis_trials import AxisRange
     from beamline.storage.readers.open import SourceOptions
 
 
@@ -30,16 +31,26 @@ def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple
     return int(match[1]), int(match[2])
 
 
-def column(ctx: click.Context, param: click.Parameter, value: str) -> float | None:
-    """A column of the detector; None for "auto"."""
+def column(ctx: click.Context, param: click.Parameter, value: str) -> float | AxisRange | None:
+    """A column of the detector, or several to try; None for "auto"."""
     if value == "auto":
         return None
+    if value.startswith("try:"):
+        from beamline.reconstruct.axis_trials import AxisRange
+
+        try:
+            first, last, step = (float(part) for part in value.split(":")[1:])
+            return AxisRange(first, last, step)
+        except ValueError as error:
+            raise click.BadParameter(f"{value!r} is not try:FIRST:LAST:STEP, e.g. try:80:90:0.5 ({error})") from error
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise click.BadParameter(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
+        raise click.BadParameter(
+            f"{value!r} is neither a column (0 is the centre of the first one), nor auto, nor try:FIRST:LAST:STEP"
+        )
     return number
 
 
@@ -83,6 +94,8 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
     from recon.prep.correct import CorrectionSettings
 
     rest = dict(said)
+    if rest["axis"] is not None and not isinstance(rest["axis"], float):
+        raise click.UsageError("--axis try is for beamline recon.")
     pixel_size_um = rest.pop("pixel_size_um")
     selection = Selection(
         views=rest.pop("views"),
@@ -196,10 +209,11 @@ _BEFORE = (
     click.option(
         "--axis",
         callback=column,
-        metavar="PX|auto",
+        metavar="PX|auto|try:A:B:STEP",
         default="auto",
         show_default=True,
-        help="Rotation axis: column of the unbinned detector (0: centre of the first column), or auto to find it.",
+        help="Rotation axis: column of the unbinned detector (0: centre of the first column), or auto to find it. "
+        "recon with try:80:90:0.5 draws one slice by each of these axes with its score (PNG), and ends.",
     ),
 )
 _AFTER = (

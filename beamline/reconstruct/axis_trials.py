@@ -1,0 +1,89 @@
+"""Axis trials: one slice by each of several rotation axes, scored, as a picture; nothing else is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event, Sink, Warnings
+from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import check_axis, cone_of, geometry_of, rows_of
+from beamline.reconstruct.options import ReconOptions
+from beamline.report.axis_sheet import AxisTrial, axis_sheet
+from drivers.clock import Clock
+from recon.base.volume import Grid
+from recon.voxels.fbp import fbp
+
+_MOST, _SHOWN = 400, 24
+
+
+@dataclass(frozen=True)
+class AxisRange:
+    """Rotation axes to try: columns of the full detector from `first` to `last`, `step` apart."""
+
+    first: float
+    last: float
+    step: float
+
+    def __post_init__(self) -> None:
+        if not (self.step > 0 and self.first < self.last < float("inf") and self.first > -float("inf")):
+            raise ValueError("expected FIRST < LAST and a STEP above 0, in columns")
+        if (n := self.columns.size) > _MOST:
+            raise ValueError(f"{n} axes are more than {_MOST}: give a larger STEP")
+
+    @property
+    def columns(self) -> NDArray[np.float64]:
+        return self.first + self.step * np.arange(np.floor((self.last - self.first) / self.step + 1e-9) + 1)
+
+
+def try_axes(options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock) -> None:
+    """Reconstruct the middle row chosen by FBP with each axis and write the sheet; the event `done` says the scores.
+
+    The score is the share of a slice below 0 within the circle that all views see: a wrong axis takes away beside
+    edges what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
+
+    Raises:
+        ConfigError, DataError: with nothing written.
+    """
+    refuse_existing(path)
+    columns = wanted.columns
+    with options.source.open() as source:
+        selection = options.selection
+        if cone_of(source, selection) is not None:
+            raise ConfigError("--axis try is for a parallel beam; of a cone, reconstruct with some axes and compare.")
+        for col in (columns[0], columns[-1]):
+            check_axis(source, float(col))
+        rows, n = rows_of(source, selection), selection.binning
+        first = rows.start + (rows.stop - rows.start) // n // 2 * n
+        selection = replace(selection, rows=(first, first + n), axis_col=float(columns[columns.size // 2]))
+        prepared = prepare_projections(source, selection, Warnings(sink, clock))
+        data, angles = prepared.projections.data, prepared.geometry.angles
+        grid = Grid.matching(prepared.geometry)
+        inside = _circle(grid.shape[1:])
+        kept = set(np.unique(np.linspace(0, columns.size - 1, min(columns.size, _SHOWN)).astype(int)).tolist())
+        trials = []
+        for i, col in enumerate(columns.tolist()):
+            geometry = replace(geometry_of(source, selection, col, angles), shifts=prepared.geometry.shifts)
+            image = fbp(data, geometry, grid, "hann")[0]
+            part = image[inside]
+            score = -float(np.minimum(part, 0).sum()) / max(float(np.abs(part).sum()), 1e-30)
+            trials.append(AxisTrial(col, score, image if i in kept else None))
+    picture = axis_sheet(trials, f"{source.path.name}, row {first}")
+    with whole_file(path) as partial, named_on_failure(path):
+        partial.write_bytes(picture)
+    best = min(trials, key=lambda trial: trial.score)
+    if best in (trials[0], trials[-1]):
+        Warnings(sink, clock)(f"The lowest score is at the end of the range, column {best.col:g}: try further.")
+    scores = {f"{trial.col:g}": trial.score for trial in trials}
+    sink(Event("done", clock.now(), {"output": str(path), "axis_col": best.col, "scores": scores}))
+
+
+def _circle(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels of a slice inside the circle that touches its sides."""
+    y, x = (np.arange(n) - (n - 1) / 2 for n in shape)
+    return np.asarray(np.hypot(y[:, None], x) < min(shape) / 2 - 1)
