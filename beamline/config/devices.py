@@ -117,6 +117,25 @@ class _BeamMonitor(Section):
     timeout_s: PositiveFloat = 2.0
     period_s: PositiveFloat = 1.0
     """Between readings while a scan runs (real time); they are kept in the scan's file."""
+    pause_below: PositiveFloat | None = None
+    """In `unit`: a scan pauses while there is less; null: it never does."""
+    resume_above: PositiveFloat | None = None
+    """In `unit`: from here on there is beam again; null: a tenth above pause_below."""
+    settle_s: Annotated[float, Field(ge=0)] = 5.0
+    """For which there must be beam again before the scan goes on."""
+
+    @model_validator(mode="after")
+    def _resumes_where_it_would_not_pause(self) -> Self:
+        if self.pause_below is None and self.resume_above is not None:
+            raise ValueError("resume_above has no meaning without pause_below: set both, or neither")
+        if self.pause_below is not None and self.resumes_at < self.pause_below:
+            raise ValueError(f"resume_above {self.resumes_at:g} is below pause_below {self.pause_below:g}")
+        return self
+
+    @property
+    def resumes_at(self) -> float:
+        """In `unit`."""
+        return self.resume_above or 1.1 * (self.pause_below or 0.0)
 
 
 class NoBeamMonitor(Section):

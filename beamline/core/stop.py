@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
@@ -45,17 +47,40 @@ class ScanAborted(ScanStopped):
 
 
 class PauseRequest:
-    """A request to pause a scan until somebody resumes it. From any thread: it is one assignment, without a lock."""
+    """A request to pause a scan, from any thread: until somebody resumes it, or until there is beam again."""
 
     def __init__(self) -> None:
-        self.reason = ""
-        """Why the scan should wait; "" where it should not."""
+        self._asked = self._beam = ""
+        self._doubt, self._lock = math.inf, threading.Lock()
+
+    @property
+    def reason(self) -> str:
+        """Why the scan should wait, and what ends that; "" where it should not."""
+        return self._asked or self._beam
 
     def pause(self, reason: str = "the operator asked for it") -> None:
-        self.reason = reason
+        self._asked = (
+            f"{reason.rstrip('.')}. Enter or `beamline resume` goes on, Ctrl-C or `beamline stop` ends the scan"
+        )
 
     def resume(self) -> None:
-        self.reason = ""
+        """End the pause that was asked for; one for want of beam goes on."""
+        self._asked = ""
+
+    def no_beam(self, reason: str, since: float) -> None:
+        """There is none, and may have been none since that time (s since the Unix epoch)."""
+        with self._lock:
+            self._doubt = min(self._doubt, since)
+        self._beam = reason
+
+    def beam_back(self) -> None:
+        self._beam = ""
+
+    def take_doubt(self) -> float:
+        """The time since which frames may have had no beam, asked once; inf where all had."""
+        with self._lock:
+            doubt, self._doubt = self._doubt, math.inf
+        return doubt
 
 
 class StopRequest:

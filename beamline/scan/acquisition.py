@@ -24,8 +24,6 @@ from drivers.protocols import CameraSettings, Devices
 
 DOUBTFUL = 0.2  # steps by which an angle may be wrong, from which that is told
 
-GO_ON = "Enter or `beamline resume` goes on, Ctrl-C or `beamline stop` ends the scan"
-
 NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DARK: "dark"}
 
 
@@ -167,9 +165,10 @@ class Acquisition:
             angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + i
             if row < 0:
                 trigger = retakes[i].trigger
-                taken.missing.remove(trigger)
-                self.recovered += 1
-            yield replace(frame, angle=angle, trigger=trigger, replaces=row)
+                if trigger in taken.missing:
+                    taken.missing.remove(trigger)
+                    self.recovered += 1
+            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, frame.replaces))
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._emit("warning", {"message": f"Frames {spans(rows)} gave no frame when they were taken again."})
 
@@ -199,11 +198,12 @@ class Acquisition:
     def _wait_while_paused(self) -> None:
         """Wait with a closed shutter as long as a pause is asked for; a stop ends it."""
         pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
-        if not pause.reason or self._stop.stopping:
+        reason = pause.reason
+        if not reason or self._stop.stopping:
             return
         self._devices.shutter.close()
         self._supervision.rest()  # what was typed before does not count
-        states.enter(State.PAUSED, f"Paused with a closed shutter: {pause.reason.rstrip('.')}. {GO_ON}")
+        states.enter(State.PAUSED, f"Paused with a closed shutter: {reason}")
         while pause.reason and not self._stop.stopping:
             if self._supervision.rest():
                 pause.resume()
@@ -248,7 +248,7 @@ class Acquisition:
 
     def _raise_outcome(self) -> None:
         of_views = [done for done in self._done if done.block.kind is FrameKind.PROJECTION and not done.again]
-        views = sum(done.taken.frames for done in of_views)
+        views = sum(len(done.taken.rows) for done in of_views)
         planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -21,10 +22,17 @@ class BeamLog:
         monitor: None: nothing is read.
         period: s of real time between readings.
         emit: takes (event, data) of `beam` and `warning`, called in the log's thread.
+        react: told each reading. Then the first one is taken before the context is entered.
     """
 
-    def __init__(self, monitor: BeamMonitor | None, period: float, emit: Emit) -> None:
-        self._monitor, self._period, self._emit = monitor, period, emit
+    def __init__(
+        self,
+        monitor: BeamMonitor | None,
+        period: float,
+        emit: Emit,
+        react: Callable[[BeamReading], None] | None = None,
+    ) -> None:
+        self._monitor, self._period, self._emit, self._react = monitor, period, emit, react
         self._readings: list[BeamReading] = []
         self._failed = 0  # failed readings in a row
         self._over = threading.Event()
@@ -37,6 +45,8 @@ class BeamLog:
 
     def __enter__(self) -> Self:
         if self._monitor is not None:
+            if self._react is not None:
+                self._read(self._monitor)
             self._thread.start()
         return self
 
@@ -50,13 +60,16 @@ class BeamLog:
     def _run(self) -> None:
         assert self._monitor is not None
         while not self._over.is_set():
-            try:
-                reading = self._monitor.reading()
-            except Exception as error:  # no failure of the beam monitor ends the scan
-                self._fail(self._monitor.name, error)
-            else:
-                self._enter(self._monitor.name, reading)
+            self._read(self._monitor)
             self._over.wait(self._period)
+
+    def _read(self, monitor: BeamMonitor) -> None:
+        try:
+            reading = monitor.reading()
+        except Exception as error:  # no failure of the beam monitor ends the scan
+            self._fail(monitor.name, error)
+        else:
+            self._enter(monitor.name, reading)
 
     def _enter(self, name: str, reading: BeamReading) -> None:
         if self._over.is_set():  # too late to be written
@@ -67,6 +80,8 @@ class BeamLog:
             self._failed = 0
         self._readings.append(reading)
         self._emit("beam", {"value": reading.value, "unit": reading.unit, "read_at": reading.time})
+        if self._react is not None:
+            self._react(reading)
 
     def _fail(self, name: str, error: Exception) -> None:
         self._failed += 1

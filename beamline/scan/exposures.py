@@ -36,6 +36,7 @@ class Taken:
 
     Attributes:
         frames: delivered, with and without a trigger.
+        rows: by trigger, counted within the block, the row and the time of its last frame.
         missing: triggers, counted within the block, that gave no frame though one was waited for.
         lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
         extra: frames that no trigger exposed.
@@ -44,6 +45,7 @@ class Taken:
     """
 
     frames: int = 0
+    rows: dict[int, tuple[int, float]] = field(default_factory=dict)
     missing: list[int] = field(default_factory=list)
     lost: int = 0
     ignored: int = 0
@@ -156,8 +158,15 @@ class Exposures:
         frames = self._fly(block, taken) if block.trains else self._one_by_one(block, taken)
         for row, (frame, trigger, angle) in enumerate(frames, first_row):
             taken.frames += 1
-            kind = FrameKind.INVALID if trigger == EXTRA else block.kind
-            yield Frame(frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure)
+            kind, replaces = block.kind, -1
+            if trigger == EXTRA:
+                kind = FrameKind.INVALID
+            else:
+                replaces, _ = taken.rows.get(trigger, (-1, 0.0))
+                taken.rows[trigger] = row, frame.time
+            yield Frame(
+                frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces
+            )
 
     def go(self, angle: float) -> bool:
         """Move to `angle` at full speed and wait; False where a stop cut the move short."""
@@ -174,18 +183,29 @@ class Exposures:
         self._wait(seconds, until_stop=False)
 
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
-        first = 0
-        for train, (start, end) in zip(block.trains, pass_ends(block), strict=True):
-            done = 0
-            while done < train.n:  # more than once only where it is paused
-                self._wait_while_paused()
-                self._supervision.states.enter(State.TAXI)
-                begin = start + float(block.angles[first + done] - block.angles[first])
-                if self._stop.stopping or not self.go(begin):
-                    return
-                ahead = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
-                done += yield from self._pass(block, taken, ahead, first + done, (begin, end))
-            first += train.n
+        ends, firsts = pass_ends(block), np.cumsum([0, *(train.n for train in block.trains)])
+        i = 0
+        while (i := self._next(i, block, taken)) < block.n:  # within a pass only after a pause
+            k = int(np.searchsorted(firsts, i, "right")) - 1
+            train, (start, end), done = block.trains[k], ends[k], i - int(firsts[k])
+            self._supervision.states.enter(State.TAXI)
+            begin = start + float(block.angles[i] - block.angles[firsts[k]])
+            if self._stop.stopping or not self.go(begin):
+                return
+            ahead = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
+            i += yield from self._pass(block, taken, ahead, i, (begin, end))
+
+    def _next(self, i: int, block: Block, taken: Taken) -> int:
+        """Wait while the scan is paused. Returns the trigger to go on with: `i`, or the first one since there may have
+        been no beam; its frame and those after it are taken again."""
+        self._wait_while_paused()
+        since = self._supervision.pause.take_doubt()
+        doubtful = [trigger for trigger, (_, time) in taken.rows.items() if time + block.exposure > since]
+        if not doubtful or block.kind is FrameKind.DARK:
+            return i
+        first = min(doubtful)
+        taken.missing[:] = [missing for missing in taken.missing if missing < first]
+        return first
 
     def _pass(
         self, block: Block, taken: Taken, train: TriggerTrain, first: int, ends: tuple[float, float]
@@ -277,9 +297,11 @@ class Exposures:
         patience = PATIENCE + block.exposure + self._camera.timing.readout
         position = self._stage.position()
         triggered, silent = -math.inf, 0
-        owed = self._stop.stopping
-        for i, angle in enumerate(block.angles):
-            self._wait_while_paused()
+        owed, i = self._stop.stopping, -1
+        while (after := self._next(i + 1, block, taken)) < block.n:
+            if after <= i:
+                self._arm_anew(block.n - after)
+            i, angle = after, block.angles[after]
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):
@@ -302,10 +324,12 @@ class Exposures:
                     f"{self._camera.name}: {silent} triggers in a row gave no frame within {patience:.3g} s each. "
                     "Check the camera. What was taken before is in the file."
                 )
-            # A late frame must not be taken for the next one: arming again discards it.
-            self._camera.disarm()
-            self._camera.arm(block.n - i)
+            self._arm_anew(block.n - i)  # a late frame must not be taken for the next one: this discards it
         self._camera.disarm()
+
+    def _arm_anew(self, n: int) -> None:
+        self._camera.disarm()
+        self._camera.arm(n)
 
     def _next_frame(self, timeout: float, until_stop: bool) -> CameraFrame | None:
         """The next frame, or None after `timeout` s (with `until_stop`, also at a request to stop or pause).

@@ -33,7 +33,7 @@ from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
-from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, Supervision
+from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, Supervision
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
@@ -365,7 +365,11 @@ class _Run:
         chosen = self.config.devices.beam_monitor
         if isinstance(chosen, NoBeamMonitor):
             return BeamLog(None, math.inf, self.emit)
-        return BeamLog(self.instrument.beam_monitor, chosen.period_s, self.emit)
+        guard = None
+        if chosen.pause_below is not None:
+            limits = BeamLimits(chosen.pause_below, chosen.resumes_at, chosen.settle_s)
+            guard = BeamGuard(limits, self.pause)
+        return BeamLog(self.instrument.beam_monitor, chosen.period_s, self.emit, guard)
 
     def _facts(self, path: Path) -> Mapping[str, Any]:
         timeline = self.ready.timeline

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +13,7 @@ from beamline.core.stop import PauseRequest, StopRequest
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.plan.retake import Retake
 from beamline.scan.states import State, StateMachine
+from drivers.protocols import BeamReading
 
 PAUSE_POLL = 0.05  # real s between looks at a paused scan
 
@@ -40,6 +42,54 @@ class Supervision:
     rest: Callable[[], bool] = _rest
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
+
+
+@dataclass(frozen=True)
+class BeamLimits:
+    """When a scan waits for the beam, in the beam monitor's unit.
+
+    Attributes:
+        pause_below: a reading below it pauses the scan.
+        resume_above: readings of at least so much are beam again.
+        settle: s for which they must be so, before the scan goes on.
+    """
+
+    pause_below: float
+    resume_above: float
+    settle: float
+
+
+class BeamGuard:
+    """Pauses a scan while readings of the beam monitor say that there is too little beam."""
+
+    def __init__(self, limits: BeamLimits, pause: PauseRequest) -> None:
+        self._limits, self._pause = limits, pause
+        self._good = -math.inf
+        """Time of the last reading with beam."""
+        self._back: float | None = None
+        """While paused: since when there is beam again."""
+        self._paused = False
+
+    def __call__(self, reading: BeamReading) -> None:
+        """Take note of the next reading, and act."""
+        limits = self._limits
+        if not self._paused:
+            if reading.value >= limits.pause_below:
+                self._good = reading.time
+                return
+            self._paused = True
+            self._pause.no_beam(
+                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {limits.pause_below:.4g}. The "
+                f"scan goes on by itself when it has read {limits.resume_above:.4g} again for {limits.settle:g} s",
+                self._good,
+            )
+        if reading.value < limits.resume_above:
+            self._back = None
+            return
+        self._back = reading.time if self._back is None else self._back
+        if reading.time - self._back >= limits.settle:
+            self._paused, self._back, self._good = False, None, reading.time
+            self._pause.beam_back()
 
 
 @dataclass(frozen=True)

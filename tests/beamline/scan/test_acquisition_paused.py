@@ -54,6 +54,7 @@ class Paused:
         if data["state"] is State.PAUSED:
             self.at_rest.append(not self.instrument.is_open and not self.instrument.stage.moving())
             self.pause.resume()
+            self.pause.beam_back()
 
     def at_frame(self, number: int) -> Paused:
         self.instrument.on_frame = lambda seen: self.pause.pause() if seen == number else None
@@ -134,6 +135,31 @@ def test_the_states_of_a_scan_that_is_paused_in_flats_and_in_views() -> None:
     assert paused.run(12).error is None
     darks, flats, taxi, views, waits = State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING, State.PAUSED
     assert paused.states == [darks, flats, waits, flats, taxi, views, waits, taxi, views]
+
+
+@pytest.mark.parametrize(("mode", "passes"), [(Mode.FLY, 1), (Mode.FLY, 4), (Mode.STEP, 1)])
+@pytest.mark.parametrize("number", [1, 3, 4, 8, 11, 16])
+def test_frames_since_the_last_beam_are_taken_again_in_their_place(mode: Mode, passes: int, number: int) -> None:
+    """Frames 0 to 2 are darks, which need no beam; 3 and 4 are flats. The last two frames may have had none."""
+    paused = Paused()
+    times: list[float] = []
+
+    def lost(seen: int) -> None:
+        times.append(paused.instrument.clock.now())
+        if len(times) - 1 == number:
+            paused.pause.no_beam("no beam", since=times[max(number - 2, 0)])
+
+    paused.instrument.on_frame = lost
+    run = paused.run(12, mode, passes, speed=20)
+    assert run.error is None
+    replaced = {frame.replaces for frame in run.frames} - {-1}
+    assert replaced == set(range(max(number - 1, FIRST if number >= FIRST else 3), number + 1)) - {0, 1, 2}
+    kept = [frame for frame in run.frames if frame.index not in replaced]
+    assert_same(
+        [replace(frame, index=i, replaces=-1) for i, frame in enumerate(kept)], whole(12, mode, passes, speed=20)
+    )
+    assert paused.states.count(State.PAUSED) == 1
+    assert_safe(paused.instrument)
 
 
 def test_lost_and_ignored_triggers_before_a_pause_are_named_and_those_after_it_are_taken() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +13,14 @@ import pytest
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.instrument.connect import Instrument
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
 from beamline.scan.states import State
-from beamline.scan.supervision import AlarmPolicy, AlarmReaction
+from beamline.scan.supervision import AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits
 from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
+from drivers.protocols import BeamReading
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
 
@@ -60,6 +64,61 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
         assert (
             text.startswith("3 frames in a row have an alarm of the monitor's beam check: Look at the beam") or acts > 1
         )
+
+
+@pytest.mark.parametrize(
+    ("readings", "paused", "since"),
+    [
+        ([60, 51, 60], [0, 0, 0], math.inf),
+        ([60, 49, 52, 54, 60, 60, 60], [0, 1, 1, 1, 1, 1, 0], 0),  # 52 and 54 are no beam yet
+        ([10, 60, 60, 60], [1, 1, 1, 0], -math.inf),  # from before the start
+        ([60, 60, 0, 60, 0, 60, 0, 60, 60, 60, 60], [0, 0, 1, 1, 1, 1, 1, 1, 1, 0, 0], 10),  # flapping
+    ],
+)
+def test_too_little_beam_pauses_until_there_has_been_enough_for_a_while(
+    readings: list[float], paused: list[bool], since: float
+) -> None:
+    pause = PauseRequest()
+    guard, seen = BeamGuard(BeamLimits(50, 55, 20), pause), []
+    for i, value in enumerate(readings):
+        guard(BeamReading(value, "mA", 10.0 * i))
+        seen.append(bool(pause.reason))
+    assert seen == [bool(one) for one in paused]
+    assert (pause.take_doubt(), pause.take_doubt()) == (since, math.inf)
+
+
+def test_a_pause_that_was_asked_for_outlasts_the_beam() -> None:
+    pause = PauseRequest()
+    pause.pause("look")
+    pause.no_beam("no beam", 0.0)
+    pause.beam_back()
+    assert pause.reason.startswith("look")
+    pause.resume()
+    assert pause.reason == ""
+
+
+def test_a_scan_without_beam_at_its_start_waits_for_it(tmp_path: Path) -> None:
+    class Returning:
+        name, at = "beam monitor", 0.0
+
+        def reading(self) -> BeamReading:
+            self.at += 10
+            return BeamReading(0.0 if self.at < 25 else 100.0, "mA", self.at)
+
+        def close(self) -> None: ...
+
+    class Guarded(FakeInstrument):
+        def connected(self) -> Instrument:
+            return replace(super().connected(), beam_monitor=Returning())
+
+    beam = (
+        "devices.beam_monitor={kind: ring_current, url: 'file:///r', pattern: '(.)', period_s: 0.01, pause_below: 50}"
+    )
+    ran = Ran(tmp_path, Guarded(), beam)
+    assert ran.error is None
+    assert ran.states[:4] == [State.PREPARING, State.DARKS, State.PAUSED, State.DARKS]
+    assert "reads 0 mA, less than 50. The scan goes on by itself" in ran.of("state")[2].data["message"]
+    ran.assert_good_file(19, "complete")
 
 
 WORDS = ("scan.angles.views=40", "monitor.act_after=2", "scan.settle_s=0")
