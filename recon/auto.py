@@ -20,9 +20,10 @@ from recon.base.method import DataUse, Depth, Method, MethodResult, Progress, Re
 from recon.base.method import TrialSettings as Trial
 from recon.base.noise import median_deviation
 from recon.base.volume import Grid, Volume
+from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out_weight import LEAST_VIEWS, busiest_rows, slab_of, split_views
+from recon.voxels.held_out_weight import LEAST_VIEWS, ONE_IN, busiest_rows, slab_of, split_views
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 from recon.voxels.unexplained import LIMIT, unexplained
@@ -33,6 +34,7 @@ F64 = NDArray[np.float64]
 ROWS = 32  # of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # of the largest line integrals
+_ENOUGH = 0.5  # of the matter in the fullest rows
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
 
 
@@ -49,28 +51,43 @@ class Score:
         at: number of its method.
         method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
+        own: the same of views that it was made from, their mean.
         hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
     """
 
     at: int
     method: Method
     residuals: F64
+    own: float = math.inf
     hides: Callable[[], bool] = lambda: False
 
     @property
     def residual(self) -> float:
+        """Of views held out."""
         return float(self.residuals.mean())
+
+    @property
+    def follows(self) -> float:
+        """By what factor it misses views held out by more than its own: above 1 it follows the noise of its own."""
+        return max(1.0, self.residual / self.own) if self.own > 0 else 1.0
+
+    @property
+    def error(self) -> float:
+        """The residual times `follows`: line integrals average over the noise that a volume follows, so that views
+        held out say too little of it (docs/exploration.md)."""
+        return self.residual * self.follows
 
 
 @dataclass(frozen=True, eq=False)
 class Auto:
     """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
 
-    The part is a slab of 32 rows where most matter is; of a cone all rows at half the resolution. One of eight views is
-    held out. Of fewer than 16 views, and of rolled or tilted ones, nothing is tried: the first candidate takes them. A
-    volume that is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so
-    neither is preferred. Where the residuals of views held out are level, the first candidate that leaves no structure
-    in its own views is taken (docs/exploration.md).
+    The part is a slab of 32 rows where most matter is; of a cone the rows in its middle, or all rows at half the
+    resolution. One of eight views is held out. Nothing is tried of fewer than 16 views, and of rolled or tilted ones:
+    the first candidate takes them; and of a sample that is wider than the field, which only a fit models. A volume that
+    is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so neither is
+    preferred. Where methods are level, the first one that leaves no structure in its own views is taken
+    (docs/exploration.md).
 
     Attributes:
         candidates: the methods, by preference.
@@ -90,14 +107,20 @@ class Auto:
             ValueError: no candidate takes these views or data.
         """
         decide = control.decide or Decisions(problem.seed)
-        at, because = decide("method", lambda: self._choose(problem, control))
+        at, because = decide("method", lambda: self.choose(problem, control))
         chosen = self.candidates[at]
         device = problem.device if chosen.traits.device else "cpu"
         found = chosen.run(replace(problem, device=device), control)
         settings = {**found.settings, "chosen_method": chosen.name, "chosen_because": because}
         return replace(found, settings=settings, method=chosen.name)
 
-    def _choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
+    def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
+        """The number of the candidate to take, and why."""
+        wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
+        some = _of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
+        if wider and leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry):
+            name = self.candidates[wider[0]].name
+            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it"
         part, where = part_of(problem)
         if part is None:
             return 0, where
@@ -130,7 +153,7 @@ def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunCon
     """
     n, geometry = part.geometry.n_views, part.geometry
     seen, unseen = split_views(geometry)
-    trial, judge = _of_views(part, seen), _of_views(part, unseen)
+    trial, judge, some = (_of_views(part, views) for views in (seen, unseen, seen[:: ONE_IN // 2]))
     scores: list[Score] = []
     refused, begin = [], control.now()
     quiet = RunControl(control.should_stop, now=control.now)
@@ -149,7 +172,8 @@ def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunCon
             continue
         if stopped():
             break
-        scores.append(Score(i, method, _residuals(volume, judge), partial(_hides, volume, trial)))
+        own = float(_residuals(volume, some).mean())
+        scores.append(Score(i, method, _residuals(volume, judge), own, partial(_hides, volume, trial)))
         if control.on_progress is not None:
             last = scores[-1].residual
             control.on_progress(
@@ -161,27 +185,43 @@ def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunCon
         raise ValueError("; ".join(refused))
     best, hiding = best_of(scores)
     told = {s.at: " (hides structure)" if s.at in hiding else "" for s in scores}
-    listed = [f"{s.method.name} {s.residual:.4g}{told[s.at]}" for s in sorted(scores, key=lambda s: s.residual)]
+    listed = [
+        f"{s.method.name} {s.residual:.4g}, {s.follows:.2f} of own views{told[s.at]}"
+        for s in sorted(scores, key=lambda s: s.residual)
+    ]
     late = [method.name for method in methods[scores[-1].at + 1 :]] if stopped() else []
-    return best.at, ", ".join(listed + [f"{name} not tried in time" for name in late])
+    return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, list[int]]:
-    """The score to prefer: of those that are level in the residual the first that hides nothing; and those that hide.
+    """The score to prefer: of those that are level the first that hides nothing; and those that hide.
 
     Level with the smallest residual are those within two of its standard errors (by its scatter over the views) and
-    4 %. The residual alone prefers a volume that lost some noise, and with it a thin crack, which few rays see; and
-    FISTA-TV to a fit that it finished, though from the fit it comes nearer to the sample (0.1 to 2.6 dB).
+    4 %, and likewise with the smallest error. The residual alone prefers a volume that lost some noise, and with it a
+    thin crack, which few rays see; and FISTA-TV to a fit that it finished, though from the fit it comes nearer to the
+    sample (0.1 to 2.6 dB). The error alone prefers what is smooth.
     """
     least = min(scores, key=lambda s: s.residual)
-    reach = min(_ERRORS * _standard_error(least.residuals), (_NEAR - 1) * least.residual)
-    level = [s for s in sorted(scores, key=lambda s: s.at) if s.residual <= least.residual + reach]
+    level = [
+        score
+        for score in sorted(scores, key=lambda s: s.at)
+        if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_error), _error)
+    ]
     hiding: list[int] = []
     for score in level if len(level) > 1 else ():
         if not score.hides():
             return score, hiding
         hiding.append(score.at)
     return least, hiding
+
+
+def _error(score: Score) -> float:
+    return score.error
+
+
+def _is_level(score: Score, least: Score, value: Callable[[Score], float]) -> bool:
+    by_scatter = _ERRORS * _standard_error(least.residuals) / least.residual if least.residual > 0 else 0.0
+    return value(score) <= value(least) * (1 + min(by_scatter, _NEAR - 1))
 
 
 def _standard_error(values: F64) -> float:
@@ -210,12 +250,36 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
         return replace(problem, projections=cut, geometry=views, grid=grid, use=use), where
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"
+    middle = _middle_rows(problem, height)
+    if middle is not None:
+        return middle
     filled = masked(data, weights)[0]
     views = geometry.binned(2)
     coarse = replace(
         problem, projections=bin_views(filled, 2), geometry=views, grid=Grid.matching(views), use=DataUse()
     )
     return coarse, "binned 2 x 2"
+
+
+def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
+    """So many rows in the middle of a cone and the box that holds their rays; None where little matter is there."""
+    geometry, grid, weights = problem.geometry, problem.grid, problem.use.weights
+    first = round(geometry.axis_row - (height - 1) / 2)
+    rows = slice(first, first + height)
+    moved = np.abs(geometry.shifts[:, 1]).max() > 1
+    if moved or first < 0 or rows.stop > geometry.detector_shape[0]:
+        return None
+    some = masked(problem.projections[:: max(1, len(problem.projections) // 8)])[0]
+    if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
+        return None
+    views = geometry.rows(rows.start, rows.stop)
+    tall = (height + 1) * geometry.sample_pitch * (1 + geometry.reach / geometry.sod)  # at the far side of the field
+    slices = math.ceil(tall / grid.spacing[0])
+    box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
+    use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, rows]))
+    cut = np.ascontiguousarray(problem.projections[:, rows])
+    part = replace(problem, projections=cut, geometry=views, grid=box, use=use)
+    return part, f"rows {rows.start} to {rows.stop - 1}"
 
 
 def _of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:

@@ -137,7 +137,8 @@ class Traits:
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
         budget: a time budget chooses its settings, see `recon.assess.plans`.
-        any_grid: its model has no voxels, so that views of binned pixels still fill the full grid.
+        any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
+            the grid is modelled, too.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
     """
 

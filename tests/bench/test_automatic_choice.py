@@ -14,6 +14,7 @@ import pytest
 import recon
 from recon.assess.metrics import psnr
 from recon.auto import Auto
+from recon.base.method import DataUse, ReconProblem, RunControl
 from tests.bench.quality_cases import OBJECTS, SLABS, Case, cone, dense_battery, slab, walnut
 
 _LOSS, _SHARE = 0.3, 0.95
@@ -39,7 +40,9 @@ def test_the_choice_is_near_the_best_of_its_candidates(shared_data: Path) -> Non
         for method in Auto().candidates:
             volume = recon.reconstruct(case.projections, case.geometry, method, grid=case.grid).volume.data
             found[method.name] = psnr(case.truth, np.maximum(volume, 0), case.peak)
-        chosen = recon.reconstruct(case.projections, case.geometry, Auto(), grid=case.grid).method
+        problem = ReconProblem(case.projections, case.geometry, case.grid, DataUse(), 0, "cpu")
+        at, _ = Auto().choose(problem, RunControl())
+        chosen = Auto().candidates[at].name
         losses.append(max(found.values()) - found[chosen])
         listed = ", ".join(f"{name} {quality:.2f}" for name, quality in found.items())
         print(f"{case.name}, {case.geometry.n_views} views: {listed} dB; {chosen}: -{losses[-1]:.2f}", flush=True)

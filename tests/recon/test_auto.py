@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.auto import Auto, Score, best_of
+from recon.auto import Auto, Score, best_of, part_of
 from recon.base.decisions import Decisions
-from recon.base.method import MethodResult, ReconProblem, RunControl
+from recon.base.method import DataUse, MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Volume
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
@@ -99,7 +99,7 @@ def test_of_level_residuals_the_first_that_hides_nothing(
     residuals: list[float], hiding: tuple[int, ...], best: int
 ) -> None:
     scatter = np.array([-0.1, 0.1, -0.1, 0.1])  # a standard error of 0.058: two are more than 4 %
-    scores = [Score(i, Fbp(), r + scatter, lambda i=i: i in hiding) for i, r in enumerate(residuals)]  # type: ignore[misc]
+    scores = [Score(i, Fbp(), r + scatter, hides=lambda i=i: i in hiding) for i, r in enumerate(residuals)]  # type: ignore[misc]
     assert best_of(scores)[0].at == best
 
 
@@ -137,14 +137,63 @@ def test_where_nothing_can_be_tried_the_first_one_runs(data: F32, views: recon.G
     assert why in found.settings["chosen_because"]
 
 
-def test_a_cone_is_tried_at_half_the_resolution() -> None:
-    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    views = recon.Geometry.cone(turn, (64, 64), 1.0, 200.0, 300.0)
+TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+
+
+@pytest.mark.parametrize(
+    ("axis_row", "slices", "where"),
+    [
+        (31.5, slice(20, 44), "rows 16 to 47"),  # the box there holds all their rays
+        (31.5, slice(0, 8), "binned 2 x 2"),  # little matter in the middle
+        (4.0, slice(20, 44), "binned 2 x 2"),  # the middle is not on the detector
+    ],
+)
+def test_a_cone_is_tried_in_its_middle_or_at_half_the_resolution(axis_row: float, slices: slice, where: str) -> None:
+    views = recon.Geometry.cone(TURN, (64, 64), 1.0, 200.0, 300.0, axis_row=axis_row)
     grid = recon.Grid.matching(views)
     ball = np.zeros(grid.shape, np.float32)
-    ball[24:40, 20:44, 22:40] = 0.02
+    ball[slices, 20:44, 22:40] = 0.02
     found = recon.reconstruct(Projector(views, grid).forward(ball), views, Auto((Scaled(factor=0.3), Scaled())))
-    assert found.settings["factor"] == 1.0 and "binned 2 x 2" in found.settings["chosen_because"]
+    assert found.settings["factor"] == 1.0
+    assert where in found.settings["chosen_because"]
+
+
+def test_no_ray_of_the_middle_rows_leaves_their_box() -> None:
+    """A sample that fills it throws the same line integrals there as one that goes on above and below."""
+    views = recon.Geometry.cone(TURN, (80, 64), 1.0, 150.0, 300.0)
+    grid = recon.Grid.matching(views)
+
+    def column(box: recon.Grid) -> F32:
+        _, y, x = np.meshgrid(*box.coordinates(), indexing="ij")
+        return np.exp(-(x**2 + y**2) / (2 * 5**2)).astype(np.float32)
+
+    data = Projector(views, grid).forward(column(grid))
+    part, _ = part_of(ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
+    assert part.grid.shape[0] * part.grid.spacing[0] < 0.7 * grid.shape[0] * grid.spacing[0]
+    found = Projector(part.geometry, part.grid).forward(column(part.grid))
+    np.testing.assert_allclose(found, part.projections, atol=0.005 * data.max())
+
+
+def test_of_two_that_predict_alike_the_one_that_follows_its_noise_is_not_taken() -> None:
+    """0.9 of the other's residual, but 1.8 times what it leaves in its own views, where the other leaves as much."""
+    scatter = np.array([-0.01, 0.01])
+    honest, follower = Score(0, Fbp(), 1.0 + scatter, own=1.0), Score(1, Fbp(), 0.9 + scatter, own=0.5)
+    assert best_of([honest, follower])[0].at == 0
+    assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, own=0.85)])[0].at == 1
+
+
+def test_a_sample_wider_than_the_field_is_left_to_the_method_that_models_what_is_beyond(data: F32) -> None:
+    @dataclass(frozen=True)
+    class Beyond(Scaled):
+        traits: ClassVar[Traits] = replace(Fbp.traits, any_grid=True)
+
+    middle = np.ascontiguousarray(data[:, :, 12:20])
+    views = recon.Geometry.parallel(VIEWS.angles, (40, 8))
+    auto = Auto((Scaled(), Beyond(factor=0.2)))
+    found = recon.reconstruct(middle, views, auto)
+    assert found.settings["factor"] == 0.2
+    assert "wider than the field" in found.settings["chosen_because"]
+    assert recon.reconstruct(data, VIEWS, auto).settings["factor"] == 1.0
 
 
 def test_a_stop_ends_the_trials(data: F32) -> None:
