@@ -312,6 +312,7 @@ def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
         recon.reconstruct(noisy[:12], VIEWS.select(range(12)), R2(steps=4), control=RunControl(resume=kept))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [FitSettings(loss="l2"), FitSettings(loss="poisson"), FitSettings(coarse=2, coarse_until=0.5),
@@ -324,6 +325,7 @@ def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, setting
     assert psnr(truth, result.volume.data) > baseline + 1
 
 
+@pytest.mark.slow
 def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phantom, noisy: np.ndarray) -> None:
     # Gamma quanta, or a flat field that was covered, in one pixel of two hundred. They weigh as rays through air do,
     # so more than rays through matter: 22.9 dB, squares alike for all 25.3; by e^3 as much it was 18.5.
@@ -336,7 +338,7 @@ def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phanto
     assert psnr(truth, likely) > psnr(truth, squares) - 3
 
 
-@pytest.mark.parametrize("start", ["fbp", "tv"])
+@pytest.mark.parametrize("start", ["fbp", pytest.param("tv", marks=pytest.mark.slow)])
 def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.initialise.Start) -> None:
     # Data of the voxel projector: nothing of the fit's own formulas.
     truth = phantom.attenuation(GRID)

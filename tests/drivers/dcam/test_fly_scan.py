@@ -127,6 +127,7 @@ class Scanned:
             ]
 
 
+@pytest.mark.slow
 def test_three_thousand_views_are_three_thousand_pulses_frames_and_rows(world, tmp_path: Path) -> None:
     views = 3000
     with FlyRig(world) as rig:

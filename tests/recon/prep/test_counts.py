@@ -138,7 +138,13 @@ def test_bad_pixels_weigh_nothing_and_do_not_spread(clean: F64) -> None:
     assert (weights == 0).sum() == 1 + VIEWS.n_views and np.isfinite(data[weights > 0]).all()
 
 
-@pytest.mark.parametrize("method", [recon.OsSirtTv(iterations=20, tv_weight=0.03), recon.R2(steps=150, gaussians=800)])
+@pytest.mark.parametrize(
+    "method",
+    [
+        recon.OsSirtTv(iterations=20, tv_weight=0.03),
+        pytest.param(recon.R2(steps=150, gaussians=800), marks=pytest.mark.slow),
+    ],
+)
 def test_the_mean_attenuation_is_unbiased_at_ten_photons(clean: F64, method: Any) -> None:
     """Within 2.5 %, which is what two scans' noise leaves; the weighed logarithm is low by a tenth."""
     flat, means = np.full(SHAPE, 10.0), []

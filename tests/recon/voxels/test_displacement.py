@@ -24,6 +24,7 @@ def views(move: Displacement) -> np.ndarray:
     return PITCH * ball_views(ANGLES, SHAPE, np.where(PARTS, move.turn, 0), pixels)
 
 
+@pytest.mark.slow
 def test_a_shift_and_a_turn_of_the_sample_are_found() -> None:
     data = views(MOVED)
     still, found = displacements(data, GEOMETRY, PARTS, KNOWN, rounds=5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -24,6 +26,7 @@ def _residual(sigma: float) -> F32:
     return np.random.default_rng(0).normal(0, sigma, (9, 40, 40)).astype(np.float32)
 
 
+@cache
 def _grains() -> tuple[F32, F32]:
     """Grains of one density with sharp edges in a disc, and their projections, from voxels of half the size."""
     rng = np.random.default_rng(8)
@@ -81,6 +84,7 @@ def test_nothing_is_changed_by_a_residual_that_says_nothing() -> None:
     assert balance.value == 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.02, 0.08])
 @pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=["fista-tv", "os-sirt-tv"])
 def test_its_volume_is_near_that_of_the_best_weight(method: FistaTv | OsSirtTv, sigma: float) -> None:

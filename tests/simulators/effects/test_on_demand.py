@@ -4,7 +4,6 @@ frame is the same whether it is computed alone or in sequence."""
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from collections import defaultdict
@@ -37,13 +36,10 @@ def test_every_effect_shows_in_some_frame(name: str) -> None:
     assert not on_demand.same(on_demand.frames(on_demand.scene([name])), on_demand.frames(on_demand.scene([])))
 
 
-def test_without_an_effect_named_its_file_is_not_read_and_the_frames_are_the_same_without_it(tmp_path: Path) -> None:
-    """For each effect: a scene with all others, with its module on the disk and without it, in one other process."""
-    shutil.copytree(CHECKOUT / "simulators", tmp_path / "simulators")  # with what numba has compiled
-    worker = Path(__file__).with_name("without_its_file.py")
-    ran = subprocess.run(
-        [sys.executable, str(worker), str(tmp_path), str(CHECKOUT)], capture_output=True, text=True, timeout=200
-    )
+def test_without_an_effect_named_its_module_is_not_imported_and_the_frames_are_the_same_without_it() -> None:
+    """For each effect: a scene with all others, with its module and without it, in one other process."""
+    program = [sys.executable, "-m", "tests.simulators.effects.without_its_module"]
+    ran = subprocess.run(program, cwd=CHECKOUT, capture_output=True, text=True, timeout=200)
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
     assert report["wrong"] == {}
