@@ -52,13 +52,13 @@ class Grid:
         With shifted views it covers every position that is seen by at least half as many views as the position seen
         most often: small alignment shifts change nothing, views that step up and down give all heights.
 
-        Where the axis of a parallel beam stands off the detector's middle (`Geometry.is_off_middle`), the box is as
-        wide as a full turn of such views sees, as in `of_field`, whatever angles there are: matter that views see and
-        that has no voxel would be put into others.
+        Where the axis stands off the detector's middle (`Geometry.is_off_middle`), the box is as wide as a full turn of
+        such views sees, as in `of_field`, whatever angles there are: matter that views see and that has no voxel would
+        be put into others.
         """
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
-        if geometry.is_off_middle and not geometry.is_cone:
-            across = max(across, math.ceil(2 * geometry.reach / geometry.sample_pitch - 1e-6))
+        if geometry.is_off_middle:
+            across = max(across, cls.of_field(geometry, geometry.sample_pitch).shape[1])
         height = geometry.middle_height + middle * geometry.sample_pitch
         return cls((down, across, across), geometry.sample_pitch, (height, 0.0, 0.0))
 

@@ -13,7 +13,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.voxels.fbp import Filter, filter_projections
 from recon.voxels.projector import volume_slices
-from recon.voxels.view_weights import circle_weights
+from recon.voxels.view_weights import circle_weights, fan_shares
 
 F64 = NDArray[np.float64]
 
@@ -69,8 +69,8 @@ def fdk(
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
     Exact in the plane of the source; above and below, values fall off with the square of the cone's angle, and flat
-    interfaces across the axis blur. The detector must see the whole width of the object: what it cuts off brightens the
-    rim. A voxel that a view does not see gets nothing from that view.
+    interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
+    both (see `fan_shares`): what it cuts off brightens the rim. A voxel that a view does not see gets nothing from it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
@@ -100,33 +100,35 @@ def fdk(
         raise ValueError(
             f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
         )
-    weights = circle_weights(geometry.angles)
+    weights, (shares, (before, after)) = circle_weights(geometry.angles), fan_shares(geometry)
     z, y, x = grid.coordinates()
     rows, cols = geometry.detector_shape
     volume = np.zeros((y.size, x.size, z.size), np.float32)
     slab = max(1, _SLAB_BYTES // (4 * rows * cols))
     for start in range(0, geometry.n_views, slab):
         part = geometry.select(slice(start, start + slab))
-        prepared = _prepared(projections[start : start + slab], part, weights[start : start + slab], filter)
+        rays = weights[start : start + slab, None] * shares
+        prepared = _prepared(projections[start : start + slab], part, rays, (before, after), filter)
         if not np.isfinite(prepared).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         _back_project(
-            prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0],
+            prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0] + before,
             part.axis_row + part.shifts[:, 1], part.sod, part.sdd, part.pixel_pitch, x, y, z, volume,
         )  # fmt: skip
     return volume_slices(volume)
 
 
-def _prepared(views: F32, geometry: Geometry, weights: F64, filter: Filter) -> F32:
-    """Views times half their angle and the cosine of each ray, filtered: [view, col + 2, row + 2], the rim twice."""
+def _prepared(views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], filter: Filter) -> F32:
+    """Views times the weights [view, col] and the cosine of each ray, with columns of zeros before and after, filtered:
+    [view, col + 2, row + 2], the rim twice."""
     rows, cols = geometry.detector_shape
-    out = np.empty((geometry.n_views, cols + 2, rows + 2), np.float32)
+    out = np.empty((geometry.n_views, sum(beyond) + cols + 2, rows + 2), np.float32)
     for view in range(geometry.n_views):
         col0, row0 = geometry.origin(view)
         u = (np.arange(cols) - col0) * geometry.pixel_pitch
         v = (np.arange(rows) - row0) * geometry.pixel_pitch
         cosine = geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
-        # The ramp is that of a detector at the rotation axis. Opposite views share a ray: half the angle each.
-        weighed = (views[view] * (weights[view] / 2 * cosine)).astype(np.float32)
+        # The ramp is that of a detector at the rotation axis.
+        weighed = np.pad((views[view] * (weights[view] * cosine)).astype(np.float32), ((0, 0), beyond))
         out[view] = np.pad(filter_projections(weighed, geometry.sample_pitch, filter).T, 1, mode="edge")
     return out

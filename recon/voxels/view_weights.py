@@ -105,19 +105,40 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     both = np.repeat(angular_weights(geometry.angles)[:, None], cols, axis=1)
     if not covers_the_circle(geometry.angles):
         return both, (0, 0)
-    opposite = _nearest(geometry.angles, geometry.angles + np.pi)
+    share, beyond = _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
+    alone = circle_weights(geometry.angles)[:, None]
+    return np.where(share <= 0.5, 2 * share * both, both + (2 * share - 1) * (alone - both)), beyond
+
+
+def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
+    """Share of each column of a cone beam's detector in a full circle, 1/2 where a ray is measured twice.
+
+    As `ray_weights` for a parallel beam (Wang 2002, Med. Phys. 29, 1634): the ray at u is measured again at -u by
+    another view of the circle. The axis of all views is taken to be their mean; near the detector's middle all is 1/2.
+
+    Returns:
+        [col], and the columns of zeros wanted before and after these.
+    """
+    cols = geometry.detector_shape[1]
+    if not geometry.is_off_middle:
+        return np.full(cols, 0.5), (0, 0)
+    axis = np.array([geometry.axis_col + geometry.shifts[:, 0].mean()])
+    share, beyond = _shares(cols, axis, axis)
+    return share[0], beyond
+
+
+def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:
+    """Shares [view, col] of views about `axis` [view], opposite ones about `opposite`; zeros before and after."""
     left, right = -0.5 - axis, cols - 0.5 - axis
-    mirrored_left, mirrored_right = -right[opposite], -left[opposite]
+    mirrored_left, mirrored_right = opposite + 0.5 - cols, opposite + 0.5
     low, high = np.maximum(left, mirrored_left), np.minimum(right, mirrored_right)
     u = np.arange(cols) - axis[:, None]
     share = 0.5 + _rise(u - high[:, None], right - mirrored_right, high - low)
     share += _rise(low[:, None] - u, mirrored_left - left, high - low)
     share[high <= low] = 1
-    alone = circle_weights(geometry.angles)[:, None]
-    weights = np.where(share <= 0.5, 2 * share * both, both + (2 * share - 1) * (alone - both))
     before, after = (math.ceil(wanted.max() - 1e-6) for wanted in (left - mirrored_left, mirrored_right - right))
     most = 2 * cols  # an axis farther off leaves a hole in the middle that no filter fills
-    return weights, (min(max(0, before), most), min(max(0, after), most))
+    return share, (min(max(0, before), most), min(max(0, after), most))
 
 
 def _rise(beyond: F64, excess: F64, overlap: F64) -> F64:

@@ -18,6 +18,8 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 
 SUFFIXES = (".tif", ".tiff")
+VOLUME = "splatline volume"
+"""Value of `format` in the facts of a file that is a volume of ours, not a scan."""
 UNREADABLE = (
     tifffile.TiffFileError,
     OSError,
@@ -76,6 +78,14 @@ def read_image(file: Path | BinaryIO) -> NDArray[Any]:
     """All pages of a TIFF; [row, col] for one page."""
     with tifffile.TiffFile(file) as tif:
         return np.asarray(tif.asarray(key=slice(None)) if pages_one_by_one(tif) else tif.asarray())
+
+
+def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
+    """Raises DataError for slices of a volume that this program wrote."""
+    if VOLUME in tif.pages.first.description:
+        raise DataError(
+            f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
+        )
 
 
 def pages_one_by_one(tif: tifffile.TiffFile) -> bool:

@@ -10,19 +10,20 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tifffile import natural_sorted
+from tifffile import TiffFile, natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.text import spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refuse_volume
 from drivers.frame import FrameKind
 
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
@@ -47,6 +48,8 @@ class TiffSeries(ScanReader):
             kinds = {name: kind_of(name) for name in images}
             series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
             _check_one_series(path, series)
+            with suppress(*UNREADABLE), TiffFile(io.BytesIO(self._bytes(series[0]))) as tif:  # damage is told below
+                refuse_volume(path, tif)
             order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
             self._files = order + series
             self.image_key = np.array([kinds[name] for name in self._files], np.int32)

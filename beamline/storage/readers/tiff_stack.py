@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, pages_one_by_one
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, pages_one_by_one, refuse_volume
 from drivers.frame import FrameKind
 
 
@@ -50,6 +50,7 @@ class TiffStack(ScanReader):
 
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
+        refuse_volume(self.path, self._tif)
         series = self._tif.series[0]
         one_by_one = pages_one_by_one(self._tif)
         if len(series.shape) not in (2, 3) or (len(self._tif.series) != 1 and not one_by_one):

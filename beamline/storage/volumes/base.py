@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.version import version
+from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
-
-MARK = "splatline volume"
-"""Value of `format` in the facts of a file that is a volume of ours, not a scan."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
     grid = record.volume.grid
     scalars = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}
     return {
-        "format": MARK,
+        "format": VOLUME,
         "program": f"splatline {version()}",
         "title": record.title,
         "sample": record.sample,
@@ -125,13 +123,13 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
 
 def marked(text: str) -> dict[str, Any] | None:
     """The facts in a description; None where it is none of ours."""
-    if MARK not in text:
+    if VOLUME not in text:
         return None
     try:
         facts = json.loads(text)
     except ValueError:
         return None
-    return facts if isinstance(facts, dict) and facts.get("format") == MARK else None
+    return facts if isinstance(facts, dict) and facts.get("format") == VOLUME else None
 
 
 def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:

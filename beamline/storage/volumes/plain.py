@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.storage.volumes.base import MARK, Slices, bare_record, facts_of, marked, record_of
+from beamline.storage.readers.tiff import VOLUME
+from beamline.storage.volumes.base import Slices, bare_record, facts_of, marked, record_of
 from beamline.storage.writers.recon_file import ReconRecord
 
 _TYPES = {32: "float", 16: "uint16", 8: "uint8"}
@@ -44,7 +45,7 @@ class Nrrd:
                 file.write(values.data)
 
     def holds(self, path: Path) -> bool:
-        return path.name.lower().endswith(self.suffixes) and path.is_file() and MARK.encode() in _header(path)[0]
+        return path.name.lower().endswith(self.suffixes) and path.is_file() and VOLUME.encode() in _header(path)[0]
 
     @contextmanager
     def open(self, path: Path) -> Iterator[ReconRecord]:

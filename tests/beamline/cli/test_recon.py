@@ -47,6 +47,9 @@ def test_the_suffix_of_the_output_is_its_format(folder: Path, name: str) -> None
     assert left(folder) == {"scan.h5", "reference.h5", name, "v.html"}
     with opened_volume(folder / name) as read, opened_volume(folder / "reference.h5") as reference:
         np.testing.assert_array_equal(read.volume.data[:], reference.volume.data[:])
+    refused = beamline("recon", name, "-m", "fbp", "-o", "again.h5")
+    assert refused.exit_code == 5 and left(folder) == {"scan.h5", "reference.h5", name, "v.html"}
+    assert "volume that this program wrote" in refused.stderr or name not in ("v.tif", "v")
     said = beamline("info", name)
     assert said.exit_code == 0 and "2 x 40 x 40" in said.stdout
     assert beamline("validate", name).exit_code == 0

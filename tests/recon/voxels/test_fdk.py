@@ -69,6 +69,19 @@ def test_a_ball_anywhere_with_offsets_shifts_and_random_angles(rng: np.random.Ge
     np.testing.assert_allclose(found, centre, atol=0.01)
 
 
+@pytest.mark.parametrize("axis_col", [14.0, 75.0])
+def test_a_detector_beside_the_axis_sees_twice_its_half(axis_col: float) -> None:
+    """A wide field: balls on the axis and where one half of the turn alone sees them, and air between them."""
+    geometry = Geometry.cone(circle(240), (24, 90), 0.1, 30.0, 40.0, axis_col)
+    grid, centre = Grid.matching(geometry), (3.2, -1.5, 0.0)
+    assert grid.shape[2] == pytest.approx(2 * 75.5, abs=1)
+    volume = fdk(ball_views(geometry, 0.7, centre) + ball_views(geometry, 0.6, (0, 0, 0)), geometry, grid)
+    for radius, at in ((0.5, centre), (0.4, (0.0, 0.0, 0.0))):
+        assert volume[inside(grid, radius, at)].mean() == pytest.approx(1.0, abs=0.015)
+    assert abs(volume[inside(grid, 0.5, (-3.2, 1.5, 0.0))].mean()) < 0.01
+    assert abs(volume[inside(grid, 0.5, (1.6, -0.75, 0.0))].mean()) < 0.02
+
+
 def test_a_far_source_is_fbp() -> None:
     angles = circle(60)
     far = Geometry.cone(angles, (9, 40), 0.1, 1e5, 1e5)
