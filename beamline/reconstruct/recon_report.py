@@ -246,10 +246,21 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, all in one grey window (1st to "
-            "99.5th percentile of these slices).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, z downwards as the camera sees "
+            "it, all in one grey window (1st to 99.5th percentile of these slices).",
             figures.orthogonal_slices(shown, unit),
-        )
+        ),
+        Picture(
+            "Slices, low contrast",
+            "The same slices, brighter: the 2nd to 90th percentile, for weak matter, streaks and noise.",
+            figures.orthogonal_slices(shown, unit, (2.0, 90.0)),
+        ),
+        Picture(
+            "Sharpest edge, and values",
+            "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
+            "artefacts. Values: narrower peaks are better, if what lies between them is none of the sample's.",
+            figures.profile_and_values(shown, unit),
+        ),
     ]
     if left is not None:
         at = len(left.significance) // 2

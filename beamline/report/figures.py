@@ -13,6 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from beamline.report.record import residual_curve
 from recon.assess.time_model import NextDecibel, duration_text, record
@@ -22,6 +23,7 @@ from recon.base.volume import Grid, Volume
 Window = tuple[float, float]
 _DPI = 110
 _WIDTH = 8.6  # inches; the report's column
+_PROFILE = 16.0  # voxels to either side of an edge
 _LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
@@ -36,7 +38,7 @@ def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: 
 
 
 def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
-    """One corrected view [row, col] with the rotation axis of the reconstruction."""
+    """One corrected view [row, col] with the rotation axis, as the camera sees it: row 0 at the top, z downwards."""
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
@@ -46,8 +48,7 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     image = axes.imshow(
         data[view],
         cmap="gray",
-        extent=(left * pitch, right * pitch, -rows / 2 * pitch, rows / 2 * pitch),
-        origin="lower",
+        extent=(left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch),
         aspect="auto" if thin else "equal",
         interpolation="nearest",
         norm=Normalize(*grey_window([data[view]])),
@@ -82,28 +83,28 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     return png(figure)
 
 
-def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window | None = None) -> bytes:
-    """Three orthogonal slices through each volume, side by side in one grey window.
+def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Window = (1.0, 99.5)) -> bytes:
+    """Three orthogonal slices through each volume, side by side in one grey window; z downwards, as the camera sees it.
 
     They intersect at the centre of mass of the bright voxels of the last volume.
 
     Args:
         volumes: by name, all on the same grid.
         unit: of length; the volumes are in 1/unit.
-        window: grey values in 1/unit; None takes the 1st to 99.5th percentile of all the slices shown.
+        percentiles: of all the values shown, which become black and white.
     """
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
     at = bright_centre(list(volumes.values())[-1].data)
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
-    window = window or grey_window([image for images in slices.values() for image in images])
+    window = grey_window([image for images in slices.values() for image in images], *percentiles)
     heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
     column = min((_WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
     size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
     figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
     z, y, x = (_edges(first.centre[i], first.shape[i], first.voxel_size) for i in range(3))
-    planes = (("x", "y", x, y), ("x", "z", x, z), ("y", "z", y, z))
+    planes = (("x", "y", x, y), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1]))
     for j, (name, images) in enumerate(slices.items()):
         for i, (image, (across, up, h_edges, v_edges)) in enumerate(zip(images, planes, strict=True)):
             axes = panels[i][j]
@@ -111,7 +112,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
             shown = axes.imshow(
                 image,
                 cmap="gray",
-                origin="lower",
+                origin="upper" if up == "z" else "lower",
                 extent=(*h_edges, *v_edges),
                 aspect="auto" if thin else "equal",
                 interpolation="nearest",
@@ -130,6 +131,39 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, window: Window |
                 axes.set_title(name, fontsize=11)
     bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
     bar.set_label(f"attenuation (1/{unit})")
+    return png(figure)
+
+
+def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
+    """Each volume along a line through the sharpest edge of the last one, and how often its values occur.
+
+    The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
+    voxel, so that single noisy voxels are no edges.
+    """
+    last = list(volumes.values())[-1].data
+    z = bright_centre(last)[0]
+    smooth = np.pad(ndimage.gaussian_filter(last[z].astype(np.float64), 1.0), 1, mode="edge")
+    down, across = (part[1:-1, 1:-1] for part in np.gradient(smooth))
+    y, x = np.unravel_index(int(np.argmax(np.hypot(down, across))), down.shape)
+    angle = math.atan2(down[y, x], across[y, x])
+    t = np.arange(-_PROFILE, _PROFILE + 0.25, 0.5)
+    figure = Figure(figsize=(_WIDTH, 3.2), dpi=_DPI, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name, volume in volumes.items():
+        at = (y + t * math.sin(angle), x + t * math.cos(angle))
+        line = ndimage.map_coordinates(volume.data[z], at, order=1, mode="constant", cval=np.nan)
+        left.plot(t * volume.grid.voxel_size, line, lw=1.2, label=name)
+        few = volume.data[tuple(slice(None, None, max(1, n // _LOOKED_AT)) for n in volume.data.shape)]
+        low, high = grey_window([few], 0.05, 99.95)
+        count, edges = np.histogram(few, bins=120, range=(low, high))
+        right.stairs(count / few.size, edges, lw=1.2, label=name)
+    left.set(xlabel=f"along the line ({unit})", ylabel=f"attenuation (1/{unit})")
+    left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
+    right.set(xlabel=f"attenuation (1/{unit})", ylabel="share of voxels", yscale="log")
+    right.set_title("Values", fontsize=9)
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
     return png(figure)
 
 

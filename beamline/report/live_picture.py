@@ -60,7 +60,7 @@ class LivePicture:
         k, j, i = (1 + n // 100 for n in data.shape)  # the middle of what is bright need not be known to a voxel
         z, y, x = np.multiply((k, j, i), bright_centre(data[::k, ::j, ::i])).tolist()
         at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
-        images = (data[z], data[:, y], data[:, :, x])
+        images = (data[z], data[::-1, y], data[::-1, :, x])  # z downwards, as the camera sees it
         window = grey_window(images)
         grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{self.unit}"
         labels = (f"x, y at z = {at[0]:.3g} {self.unit}", f"x, z at y = {at[1]:.3g}", f"y, z at x = {at[2]:.3g}")
@@ -78,7 +78,7 @@ class LivePicture:
         left = (self.view - self.render) / np.float32(noise)
         greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
         spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(left**2))):.2f}"
-        (view, render, left), _ = _sized((self.view, self.render, left))
+        (view, render, left), _ = _sized((self.view[::-1], self.render[::-1], left[::-1]))
         return [
             _Panel(view, "gray", window, "newest view", greys),
             _Panel(render, "gray", window, "the volume seen from there", "the same greys"),

@@ -75,4 +75,4 @@ def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.Monke
         figures.projection(np.random.default_rng(0).random((2, 6, 40), np.float32), geometry, 0, "mm")
     flat, cone = (figure.axes[0].get_images()[0].get_extent() for figure in drawn)
     np.testing.assert_allclose(cone, flat)
-    np.testing.assert_allclose(flat, [-18.5 * 0.5, 21.5 * 0.5, -1.5, 1.5])
+    np.testing.assert_allclose(flat, [-18.5 * 0.5, 21.5 * 0.5, 1.5, -1.5])  # z downwards

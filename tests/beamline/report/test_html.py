@@ -11,6 +11,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from jinja2 import UndefinedError
+from matplotlib.figure import Figure
 
 from beamline.core.errors import DataError
 from beamline.report import figures
@@ -126,6 +127,36 @@ def test_slices_meet_where_the_volume_is_bright() -> None:
     ball = ((z - 10) ** 2 + (y - 38) ** 2 + (x - 15) ** 2 < 16).astype(np.float32)
     assert figures.bright_centre(ball) == (10, 38, 15)
     assert figures.bright_centre(np.zeros((4, 6, 8), np.float32)) == (2, 3, 4)
+
+
+def test_z_runs_downwards_in_slices_and_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Row 0 of the detector is at the top, and the numbers beside it agree; x, y is a map with y upwards."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
+    data = np.arange(40.0, dtype=np.float32).reshape(4, 10, 1).repeat(10, axis=2)
+    figures.projection(data[:, :, 0][None], Geometry.parallel([0.0], (4, 10)), 0, "mm")
+    figures.orthogonal_slices({"v": Volume(data, Grid(data.shape, 1.0))}, "mm")
+    axes = [axes for figure in drawn for axes in figure.axes if axes.get_xlabel() in ("u (mm)", "x (mm)", "y (mm)")]
+    names = [panel.get_ylabel() for panel in axes]
+    assert names == ["z (mm)", "y (mm)", "z (mm)", "z (mm)"]
+    for panel, name in zip(axes, names, strict=True):
+        bottom, top = panel.get_ylim()
+        assert (panel.images[0].origin, top < bottom) == (("upper", True) if name == "z (mm)" else ("lower", False))
+
+
+def test_profile_and_values_of_an_edge_and_of_nothing(rng: np.random.Generator) -> None:
+    data = np.zeros((3, 30, 40), np.float32)
+    data[:, :, 20:] = 1
+    grid = Grid(data.shape, 0.5)
+    both = {
+        "sharp": Volume(data, grid),
+        "noise": Volume(data + rng.normal(0, 0.1, data.shape).astype(np.float32), grid),
+    }
+    assert _pixels(figures.profile_and_values(both, "mm")).ndim == 3
+    for shape in ((1, 1, 5), (2, 8, 8)):
+        assert _pixels(
+            figures.profile_and_values({"v": Volume(np.zeros(shape, np.float32), Grid(shape, 1.0))}, "px")
+        ).ndim
 
 
 @pytest.mark.parametrize("shape", [(1, 64, 64), (2, 8, 300), (40, 20, 20)])

@@ -51,7 +51,7 @@ def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None
     view = rng.normal(0, 0.1, (64, 64)).astype(np.float32)
     render = np.zeros((64, 64), np.float32)
     render[:32] = -0.5  # five times the noise less than the view
-    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 256, 256)
+    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 256, 256)[::-1]  # row 0 at the top
     red, _, blue = (difference[..., k].mean(axis=1) for k in range(3))
     assert blue[10:100].mean() < 0.35 < 0.8 < red[10:100].mean()
     assert blue[150:250].mean() == pytest.approx(red[150:250].mean(), abs=0.05)  # noise alone
