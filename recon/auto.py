@@ -20,6 +20,7 @@ from recon.base.method import DataUse, Depth, Method, MethodResult, Progress, Re
 from recon.base.method import TrialSettings as Trial
 from recon.base.noise import median_deviation
 from recon.base.volume import Grid, Volume
+from recon.splatting.finish import SWEEPS
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
@@ -100,6 +101,21 @@ class Auto:
 
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
+    @property
+    def spare(self) -> Method | None:
+        """A fit with more sweeps, tried where the fit is not taken, and preferred to all others.
+
+        A fit chooses its sweeps by views that it knows already, which asks for too few where it is far off.
+        """
+        first = self.candidates[0]
+        return replace(first, finish=3 * SWEEPS) if isinstance(first, R2) and first.finish is None else None
+
+    @property
+    def methods(self) -> tuple[Method, ...]:
+        """All, by preference."""
+        first, *others = self.candidates
+        return self.candidates if self.spare is None else (first, self.spare, *others)
+
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
 
@@ -108,23 +124,23 @@ class Auto:
         """
         decide = control.decide or Decisions(problem.seed)
         at, because = decide("method", lambda: self.choose(problem, control))
-        chosen = self.candidates[at]
+        chosen = self.methods[at]
         device = problem.device if chosen.traits.device else "cpu"
         found = chosen.run(replace(problem, device=device), control)
         settings = {**found.settings, "chosen_method": chosen.name, "chosen_because": because}
         return replace(found, settings=settings, method=chosen.name)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
-        """The number of the candidate to take, and why."""
-        wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
+        """Which of the methods to take, and why."""
+        wider = [n for n, method in enumerate(self.methods) if method.traits.any_grid]
         some = _of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
         if wider and leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry):
-            name = self.candidates[wider[0]].name
+            name = self.methods[wider[0]].name
             return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it"
         part, where = part_of(problem)
         if part is None:
             return 0, where
-        at, residuals = predicts_best(part, self.candidates, control)
+        at, residuals = predicts_best(part, self.methods, control, None if self.spare is None else 1)
         if at is None:
             return 0, residuals
         return at, f"residual of views held out, {where}: {residuals}"
@@ -143,10 +159,15 @@ class Auto:
         return sum(method.work(n_views, binning) for method in self.candidates)
 
 
-def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunControl) -> tuple[int | None, str]:
+def predicts_best(
+    part: ReconProblem, methods: Sequence[Method], control: RunControl, spare: int | None = None
+) -> tuple[int | None, str]:
     """Which of the methods predicts best what one of eight views shows that it has not seen; all residuals in words.
 
     None where `control` ends the trials before two are done; one that it cuts short is not judged.
+
+    Args:
+        spare: one that is tried only where one after it would be taken.
 
     Raises:
         ValueError: no method takes these views or data.
@@ -161,35 +182,42 @@ def predicts_best(part: ReconProblem, methods: Sequence[Method], control: RunCon
     def stopped() -> bool:
         return control.should_stop is not None and control.should_stop()
 
-    for i, method in enumerate(methods):
+    def attempt(at: int) -> None:
         if stopped():
-            break
+            return
+        method = methods[at]
         device = part.device if method.traits.device else "cpu"
         try:
             volume = method.run(replace(trial, device=device), quiet).volume
         except ValueError as error:
             refused.append(f"{method.name}: {error}")
-            continue
+            return
         if stopped():
-            break
+            return
         own = float(_residuals(volume, some).mean())
-        scores.append(Score(i, method, _residuals(volume, judge), own, partial(_hides, volume, trial)))
+        scores.append(Score(at, method, _residuals(volume, judge), own, partial(_hides, volume, trial)))
         if control.on_progress is not None:
-            last = scores[-1].residual
-            control.on_progress(
-                Progress(i + 1, len(methods), control.now() - begin, last, last, 0, n, unit="methods tried")
-            )
-    if len(scores) < min(2, len(methods)) and stopped():
+            last, done = scores[-1].residual, len(scores) + len(refused)
+            seconds = control.now() - begin
+            control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
+
+    regular = [at for at in range(len(methods)) if at != spare]
+    for at in regular:
+        attempt(at)
+    if spare is not None and scores and best_of(scores)[0].at > spare:
+        attempt(spare)
+    if len(scores) < min(2, len(regular)) and stopped():
         return None, "stopped before the choice"
     if not scores:
         raise ValueError("; ".join(refused))
     best, hiding = best_of(scores)
     told = {s.at: " (hides structure)" if s.at in hiding else "" for s in scores}
     listed = [
-        f"{s.method.name} {s.residual:.4g}, {s.follows:.2f} of own views{told[s.at]}"
+        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g}, {s.follows:.2f} of own views"
+        f"{told[s.at]}"
         for s in sorted(scores, key=lambda s: s.residual)
     ]
-    late = [method.name for method in methods[scores[-1].at + 1 :]] if stopped() else []
+    late = [methods[at].name for at in regular if at > max(s.at for s in scores)] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from recon.auto import Auto, Score, best_of, part_of
 from recon.base.decisions import Decisions
 from recon.base.method import DataUse, MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Volume
+from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
@@ -180,6 +181,27 @@ def test_of_two_that_predict_alike_the_one_that_follows_its_noise_is_not_taken()
     honest, follower = Score(0, Fbp(), 1.0 + scatter, own=1.0), Score(1, Fbp(), 0.9 + scatter, own=0.5)
     assert best_of([honest, follower])[0].at == 0
     assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, own=0.85)])[0].at == 1
+
+
+@dataclass(frozen=True, eq=False)
+class Fit(R2):
+    """In place of a fit: an FBP that is wrong, but for that of more sweeps."""
+
+    tried: list[int | None] = field(default_factory=list)
+
+    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        self.tried.append(self.finish)
+        return Scaled(factor=0.5 if self.finish is None else 1.0).run(problem, control)
+
+
+@pytest.mark.parametrize(("other", "taken", "tried"), [(0.7, 1.0, [None, 24, 24]), (0.1, 0.5, [None, None])])
+def test_where_a_fit_is_not_taken_it_is_tried_with_more_sweeps(
+    data: F32, other: float, taken: float, tried: list[int | None]
+) -> None:
+    fit = Fit()
+    found = recon.reconstruct(data, VIEWS, Auto((fit, Scaled(factor=other))))
+    assert found.settings["factor"] == taken
+    assert fit.tried == tried
 
 
 def test_a_sample_wider_than_the_field_is_left_to_the_method_that_models_what_is_beyond(data: F32) -> None:
