@@ -142,7 +142,7 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
 
 
 def _instrument(config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack) -> Devices:
-    chosen, wanted = config.devices.camera, config.devices.shutter
+    chosen = config.devices.camera
     if not isinstance(chosen, DcamOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
     stage = config.devices.stage.settings.connect(config.devices.stage.port, clock)
@@ -151,8 +151,13 @@ def _instrument(config: Config, clock: Clock, ask: Ask, check_stop: Callable[[],
     opened.callback(camera.close)
     if chosen.cool_s:
         wait_until_cold(camera, chosen.cool_s, clock, check_stop)
-    shutter: Shutter = ManualShutter(ask)
-    if isinstance(wanted, StageOutputShutter):
-        output = stage.digital_output(wanted.output)
-        shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
-    return Devices(stage, camera, shutter, ManualSampleMover(ask))
+    return Devices(stage, camera, shutter_of(config, stage, clock, ask), ManualSampleMover(ask))
+
+
+def shutter_of(config: Config, stage: RotationStage, clock: Clock, ask: Ask) -> Shutter:
+    """The configured shutter of a real instrument."""
+    wanted = config.devices.shutter
+    if not isinstance(wanted, StageOutputShutter):
+        return ManualShutter(ask)
+    output = stage.digital_output(wanted.output)
+    return OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)

@@ -34,6 +34,7 @@ from beamline.scan.recorder import Recorder
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, Supervision
+from beamline.scan.watchdog import watched
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
@@ -137,6 +138,8 @@ def run_scan(
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
             run = _Run(config, instrument, ready, folder, stop, emit, began)
             stack.enter_context(obeying(folder, stop, run.pause))
+            if config.simulation is None:
+                stack.enter_context(watched(folder, emit))
             return run.go(live, afterwards, release=connected.close)
 
 

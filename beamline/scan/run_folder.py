@@ -11,7 +11,7 @@ from typing import TextIO
 
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
-CONTROL = "control"
+CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:

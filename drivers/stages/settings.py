@@ -158,3 +158,11 @@ class StageSettings(Protocol):
             DeviceError, DeviceTimeout: no contact.
         """
         ...
+
+    def halt(self, url: str, clock: Clock) -> None:
+        """Stop whatever the stage does, also a move that a program began which has died; it may still slow down then.
+
+        Raises:
+            DeviceError, DeviceTimeout: no contact.
+        """
+        ...

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import closing
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -84,3 +85,11 @@ class PiGcsSettings:
         from drivers.stages.pi_gcs.stage import PiGcsStage
 
         return PiGcsStage(url, self, clock)
+
+    def halt(self, url: str, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageSettings` has it."""
+        from drivers.stages.pi_gcs.axis import STOP_ALL
+        from drivers.stages.pi_gcs.line import GcsLine
+
+        with closing(GcsLine(url, self.axis, self.wiring, clock, "stage")) as line:
+            line.stop(STOP_ALL)

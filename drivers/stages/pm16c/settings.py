@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -114,3 +115,10 @@ class PM16CSettings:
         from drivers.stages.pm16c.stage import PM16CStage
 
         return PM16CStage(url, self, clock)
+
+    def halt(self, url: str, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageSettings` has it."""
+        from drivers.stages.pm16c.channel import PM16CChannel
+
+        with closing(PM16CChannel(url, self.channel, self.wiring, clock, "stage")) as channel:
+            channel.slow_stop()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import dataclass, field
 
 from drivers.clock import Clock
@@ -93,3 +94,10 @@ class ZaberSettings:
         from drivers.stages.zaber.stage import ZaberStage
 
         return ZaberStage(url, self, clock)
+
+    def halt(self, url: str, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageSettings` has it."""
+        from drivers.stages.zaber.axis import ZaberAxis
+
+        with closing(ZaberAxis(url, self, clock, "stage")) as axis:
+            axis.stop("stop")

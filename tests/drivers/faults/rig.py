@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Set
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cache, partial
@@ -331,6 +332,7 @@ class Rig:
             serial, "serial_for_url", lambda url, **how: opens(simulated if url == PORT else url, **how)
         )
         monkeypatch.setattr(run_module, "connect", self._connect)
+        monkeypatch.setattr(run_module, "watched", lambda folder, emit: nullcontext())  # a process a scan
         monkeypatch.setattr(run_module, "Recorder", partial(_Recorder, self.at_frame))
 
     def config(self, *overrides: str) -> Config:
