@@ -83,6 +83,7 @@ def test_files_that_cannot_be_read(here: Path, name: str) -> None:
     assert result.exit_code == 5 and name in result.stderr
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_the_worst_frames_may_be_had_as_a_picture(here: Path) -> None:
     assert beamline("monitor", "scan.h5", "--sheet", "sheet.png").exit_code == 7
     assert (here / "sheet.png").read_bytes().startswith(b"\x89PNG")

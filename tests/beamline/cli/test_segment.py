@@ -43,6 +43,7 @@ def _rows(path: Path) -> list[dict[str, float]]:
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> None:
     data = can()
     grid = Grid(data.shape, VOXEL, CENTRE)  # type: ignore[arg-type]

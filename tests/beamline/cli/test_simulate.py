@@ -186,6 +186,7 @@ def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monk
     assert _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
 
 
+@pytest.mark.usefixtures("real_pictures")
 @pytest.mark.parametrize("shape", ["1,300", "300,1", "1,1"])
 def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> None:
     wanted = ("--picture", "p.png", "--truth", "t.h5", "--set", f"detector.shape=[{shape}]", "--frames", "1")

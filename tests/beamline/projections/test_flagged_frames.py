@@ -12,6 +12,8 @@ from beamline.report.contact_sheet import contact_sheet
 from beamline.storage.flag_legend import TODAY, FrameFlags, mark_of
 from tests.beamline.array_source import ArraySource
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 ONE, TWO = CHECKS[0].name, CHECKS[1].name
 REGION = (1, 3, 40, 90)
 

@@ -21,6 +21,8 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from tests.beamline.html_page import parsed_page
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 
 def _pixels(png: bytes) -> np.ndarray:
     return matplotlib.image.imread(io.BytesIO(png), format="png")
@@ -159,8 +161,7 @@ def test_profile_and_values_of_an_edge_and_of_nothing(rng: np.random.Generator) 
         ).ndim
 
 
-@pytest.mark.parametrize("shape", [(1, 64, 64), (2, 8, 300), (40, 20, 20)])
-@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize(("shape", "n"), [((1, 64, 64), 1), ((2, 8, 300), 3), ((40, 20, 20), 3)])
 def test_slices_of_any_shape(shape: tuple[int, int, int], n: int, rng: np.random.Generator) -> None:
     volume = Volume(rng.random(shape, dtype=np.float32), Grid(shape, 0.1))
     pixels = _pixels(figures.orthogonal_slices({f"v{i}": volume for i in range(n)}, "mm"))

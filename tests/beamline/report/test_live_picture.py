@@ -12,6 +12,8 @@ import pytest
 from beamline.report.live_picture import LivePicture
 from recon.base.volume import Grid, Volume
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 GAP, TOP, LINES = 14, 30, 30  # pixels: between panels, of the title, of a label
 
 

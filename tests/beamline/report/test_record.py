@@ -17,6 +17,8 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.settings import FitSettings
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 GRID = Grid((1, 1, 1))
 
 

@@ -24,6 +24,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return figures
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_they_are_png() -> None:
     points = [(FBP, 1.0, 20.0), (FIT, 30.0, 25.0), (FEW, math.nan, 1.0)]
     assert pareto_plot(points, [0, 1], "time (s)", "PSNR (dB)").startswith(b"\x89PNG")

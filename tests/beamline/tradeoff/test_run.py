@@ -75,6 +75,7 @@ def _rows(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "tradeoff.csv").read_text(encoding="utf-8").splitlines()))
 
 
+@pytest.mark.usefixtures("real_pictures")
 def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) -> None:
     events: list[Event] = []
     table = run_tradeoff(_options(tmp_path), events.append, SystemClock())

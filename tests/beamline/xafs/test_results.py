@@ -14,6 +14,8 @@ from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import Edge
 from beamline.xafs.results import XafsResult, lines, refuse_existing_results, table, write
 
+pytestmark = pytest.mark.usefixtures("real_pictures")
+
 ENERGIES = np.linspace(8.30, 8.40, 11)
 ABSORPTION = np.linspace(1.0, 2.0, 11)
 SEEN = Edge(True, "", 8.3437, 8.3485, 0.2, 0.01)

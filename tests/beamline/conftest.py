@@ -1,0 +1,33 @@
+"""Figures are drawn where a test looks at them; elsewhere drawing would take most of a report's time."""
+
+from __future__ import annotations
+
+import base64
+from typing import IO
+
+import pytest
+
+_PIXEL = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGP4DwABAQEAsTj2FAAAAABJRU5ErkJggg=="
+)
+
+
+class _Blank:
+    """A canvas that takes any figure and writes a picture of one pixel."""
+
+    def __init__(self, figure: object) -> None:
+        pass
+
+    def print_png(self, file: IO[bytes], **_: object) -> None:
+        file.write(_PIXEL)
+
+
+@pytest.fixture
+def real_pictures() -> None:
+    """For tests of what a figure shows, and one of each report as a whole."""
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "real_pictures" not in request.fixturenames:
+        monkeypatch.setattr("beamline.report.figures.FigureCanvasAgg", _Blank)
