@@ -79,7 +79,7 @@ def _late(kind: str, warm: str) -> list[str]:
     "kind",
     [
         pytest.param("parallel", marks=pytest.mark.slow),
-        "parallel, some views lean, all are shifted, weights",
+        pytest.param("parallel, some views lean, all are shifted, weights", marks=pytest.mark.slow),
         pytest.param("cone", marks=pytest.mark.slow),
         _EXACT,
     ],
@@ -88,6 +88,7 @@ def test_a_fit_after_warm_up_compiles_nothing(kind: str) -> None:
     assert _late(kind, _OF_THE_FIT) == []
 
 
+@pytest.mark.slow
 def test_a_cones_fit_would_compile_after_a_warm_up_for_a_parallel_beam() -> None:
     """That is, the count above sees what it should see."""
     found = _late(_EXACT, _OF_A_PARALLEL_BEAM)

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
-import os
-
 import numpy as np
 import pytest
-import torch
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
+from tests.recon.kernels.gpu.on_gpu import DEVICE as DEVICE
+from tests.recon.kernels.gpu.on_gpu import EXACT as EXACT
 
-if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"  # read when triton and the kernels are first imported, that is, here
-pytest.importorskip("triton", reason="the GPU kernels need triton (extra gpu, Linux)")
-
-DEVICE: torch.device = importlib.import_module("recon.kernels.gpu").require("cuda")
-SHAPE, PITCH = (17, 21), 0.5  # no multiple of a tile
+SHAPE, PITCH = (11, 13), 0.5  # no multiple of a tile
 BEAMS = {
-    "parallel": Geometry.parallel([0.7], SHAPE, PITCH, 9.3),
-    "leaning": Geometry.parallel([2.5], SHAPE, PITCH, 9.3, axis_row=7.0, roll=0.2, tilt=-0.3),
-    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, 9.3),
+    "parallel": Geometry.parallel([0.7], SHAPE, PITCH, 5.3),
+    "leaning": Geometry.parallel([2.5], SHAPE, PITCH, 5.3, axis_row=4.0, roll=0.2, tilt=-0.3),
+    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, 5.3),
 }
 GRID = Grid((5, 6, 9), 0.6, centre=(0.4, -0.8, 1.1))
-EXACT = RayModel(exact_above=0.0)
 FAR = 30.0  # px: no pixel is farther from the middle of the detector, or from a centre in it
 Shape = tuple[float, float, float]
 
