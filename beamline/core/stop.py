@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
@@ -88,15 +89,19 @@ class StopRequest:
 
     Can be set from any thread and from signal handlers: each flag is set by one assignment, without a lock, because a
     handler may interrupt another one here.
+
+    Args:
+        now: a clock in real s.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._stop = self._abort = self._enough = False
-        self._reason = ""
+        self._reason, self._now, self._asked = "", now, 0.0
 
     def stop(self, reason: str = "the operator asked for it") -> None:
         """End cleanly: pending frames and missing references are still acquired, the stage returns."""
         self._reason = self._reason or reason
+        self._asked = self._asked or self._now()
         self._stop = True
 
     def stop_as_enough(self, reason: str) -> None:
@@ -107,6 +112,7 @@ class StopRequest:
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
         self._reason = reason
+        self._asked = self._asked or self._now()
         self._abort = True
         self._stop = True
 
@@ -119,6 +125,11 @@ class StopRequest:
     def enough(self) -> bool:
         """It is stopped, and nobody asked for that but `stop_as_enough`."""
         return self._enough and not self._abort
+
+    @property
+    def seconds(self) -> float:
+        """Real s since the first request; 0 without one."""
+        return self._now() - self._asked if self._stop else 0.0
 
     @property
     def aborting(self) -> bool:

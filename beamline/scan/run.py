@@ -43,8 +43,9 @@ from drivers.manual import Ask
 SAFE = "Stage stopped, shutter closed; the last frames are being written"
 """Message of the state `finishing`."""
 
-LAST_ROUND = 5.0
-"""Real s that a live reconstruction has after a scan that was stopped, before it is asked for the volume it has."""
+LAST_ROUND = 4.0
+"""Real s from the request to stop a scan to the one to its live reconstruction for the volume that it has, so that this
+is there within 10: what the scan takes to end counts."""
 
 READY_WITHIN = 300.0
 """Real s that a scan waits for its live reconstruction before the first frame: it compiles, once on a machine."""
@@ -149,6 +150,18 @@ def _refuse_stop(stop: StopRequest) -> None:
         raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
 
 
+def gives_up(stop: StopRequest, useless: bool) -> Callable[[], bool]:
+    """Whether the live reconstruction of a scan that has ended should end with the volume that it has: after an abort,
+    a stop that comes now, LAST_ROUND after that of the scan (not where its views were enough), or with a `useless`
+    file, which is broken or has no projections."""
+    last = math.inf if stop.enough else LAST_ROUND if stop.stopping else 0.0
+
+    def ends() -> bool:
+        return useless or stop.aborting or (stop.stopping and stop.seconds >= last)
+
+    return ends
+
+
 @dataclass(frozen=True, eq=False)
 class _Run:
     config: Config
@@ -245,7 +258,7 @@ class _Run:
         self.emit("scan_done", {**asdict(result), "status": status})
         if follower is not None:
             useless = unfinished is not None or isinstance(error, ReferencesError)
-            recon = follower.finish(self._give_up(useless), lambda: self.stop.aborting)
+            recon = follower.finish(gives_up(self.stop, useless), lambda: self.stop.aborting)
             result = replace(result, recon=recon)
         if error is not None:
             raise error
@@ -258,20 +271,6 @@ class _Run:
                 if self.instrument.simulated is not None:
                     labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
-
-    def _give_up(self, useless: bool) -> Callable[[], bool]:
-        """The live reconstruction ends early, with the volume that it has, after an abort, a stop that came after the
-        scan, LAST_ROUND after a scan that was stopped (not one whose views were enough), or with a file that is broken
-        or has no projections."""
-        if self.stop.enough:
-            return lambda: useless or self.stop.aborting
-        stopped, last = self.stop.stopping, time.monotonic() + LAST_ROUND
-
-        def ends() -> bool:
-            enough = time.monotonic() >= last if stopped else self.stop.stopping
-            return useless or self.stop.aborting or enough
-
-        return ends
 
     def _worse(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
         """The error that the run ends with; a stop or lost frames yield to any other. The other becomes a warning."""

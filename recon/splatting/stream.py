@@ -1,10 +1,11 @@
 """StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
 
-The first Gaussians come from an FBP of the first well-spread views, and again when these have grown by half where there
-is time for many steps. From then on the model stays: each time the views have grown by half, a new round makes room for
-more Gaussians, which density control clones and splits where the new views ask for it. Between arrivals the model keeps
-fitting, at rates that suit any number of steps to come (`anytime`): every third step takes one of the newest views, the
-others replay all of them evenly (`arrivals`).
+The first Gaussians come from an FBP of the first well-spread views; where there is time for many steps, from the
+model's volume and an FBP of what it leaves of the views, when these have grown by half. From then on the model stays:
+each time the views have grown by half, a new round makes room for more Gaussians, which density control clones and
+splits where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any number of steps
+to come (`anytime`): a view that has come is learnt by the very next step, every third of the others takes one of the
+newest views, the rest replay all of them evenly (`arrivals`).
 """
 
 from __future__ import annotations
@@ -25,18 +26,26 @@ from recon.splatting import arrivals
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import HALF, WHILE_VIEWS_COME, average, averaged, fallen
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import leaves_the_field, place
+from recon.splatting.initialise import (
+    default_count,
+    first_volume,
+    leaves_the_field,
+    place,
+    sample_gaussians,
+    scale_to_data,
+)
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
 
 Clock = Callable[[], float]
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
-_YOUNG = 16  # a round that begins with fewer views, after so many steps, places all Gaussians anew
+_YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
 _LAST_GROWTH = 0.5  # density control ends at this share of the last round
 _AXIS_ANEW = 0.3  # px; an axis that moves by so much starts the rates anew, by less in part
 _NEW = 0.2  # weight of the newest of the views that were looked at before they were learnt
 _BLIND = 100.0  # data so many times larger than the density unit implies: the first views showed no sample
+_PLACED_FROM = 2**22  # voxels at most, for a placement in a second: views that come meanwhile wait
 _ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
 
 
@@ -84,6 +93,7 @@ class StreamingFit:
         self._now, self._start = now, now()
         self._data: list[F32] = []
         self._angles: list[float] = []
+        self._unseen: list[int] = []  # views that no step has learnt, in the order they came
         self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
         self._round_views, self._schedule_step, self._placed = 0, 0, 0
@@ -119,6 +129,7 @@ class StreamingFit:
             self._problem = extend(self._problem, images, theta)
         self._angles.extend(theta.tolist())
         if self._state is not None:
+            self._unseen += range(self.n_views - theta.size, self.n_views)
             measured, rendered = self.newest_view()
             left = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
             kept = self.unlearnt if math.isfinite(self.unlearnt) else left
@@ -156,6 +167,7 @@ class StreamingFit:
         self._problem = with_projections(replace(self._problem, geometry=self._template.at(theta)), images)
         if angles is not None:
             self._state.drawn, self._state.mean, self._schedule_step = [], None, self._state.step
+            self._unseen = []
 
     def move_axis(self, axis_col: float) -> None:
         """Move the rotation axis. The model moves to where the views have it about the new axis, and stays.
@@ -230,7 +242,9 @@ class StreamingFit:
                 fraction = first + (1 - first) * min(1.0, spent / seconds)
                 if spent >= _LAST_GROWTH * seconds:
                     settings = settled
-            view = None if finishing else arrivals.chosen(self.n_views, self._rng)
+            view: int | None = None
+            if not finishing:
+                view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
             fit.step(self._state, self._problem, settings, fraction, view)
             average(self._state, averaged_from)
             if on_progress is not None and self._now() - reported > 0.1:
@@ -257,13 +271,12 @@ class StreamingFit:
                     raise
                 self._round_views = self.n_views
                 return
-        elif self._problem is not None and (
-            (not force and self.n_views < _YOUNG and self._state.step >= HALF)
-            or max(float(image.max()) for image in self._problem.images) > _BLIND
-        ):
-            # So few views place Gaussians badly. Or the sample or the beam came later: the density unit is of noise.
-            self._data = list(self._problem.projections)
-            self._place_first()
+        elif self._problem is not None:
+            # The sample or the beam came later: the density unit is of noise. Or so few views place Gaussians badly.
+            blind = max(float(image.max()) for image in self._problem.images) > _BLIND
+            if blind or (not force and self.n_views < _YOUNG and self._state.step >= HALF):
+                self._data = list(self._problem.projections)
+                self._place_first(None if blind else self._state)
         assert self._state is not None
         # Later views need new Gaussians: early ones span a narrow angle and would use all of them for their streaks.
         most = round(self._placed * growth(self._settings))
@@ -271,12 +284,27 @@ class StreamingFit:
         self._round_views = self.n_views
         self._state.drawn = []  # draw from all views from now on
 
-    def _place_first(self) -> None:
+    def _place_first(self, known: fit.FitState | None = None) -> None:
+        """Place all Gaussians: by an FBP of the views, or by what is `known` of the sample and an FBP of the rest."""
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        field = Grid.for_fit(self._template, self._grid, wider=leaves_the_field(data, geometry))
-        placed = place(data, geometry, field, self._count, self._rng, kernel=self._settings.kernel)
+        wider = leaves_the_field(data, geometry)
+        field = Grid.for_fit(self._template, self._grid, wider=wider)
+        coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / _PLACED_FROM) / 3))
+        rough = Grid.for_fit(self._template, replace(field, voxel_size=coarser * field.voxel_size), wider=wider)
+        count = self._count or default_count(Grid.of_field(self._template, field.voxel_size))
+        kernel = self._settings.kernel
+        if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear
+            placed = place(data, geometry, rough, count, self._rng, kernel=kernel)
+        else:
+            model = averaged(known)
+            rendered: F32 = np.stack(list(fit.renders(model, self._problem, self._settings, range(self.n_views))))
+            left = first_volume(data - rendered * self._problem.scale, geometry, rough)
+            volume = Volume(fit.volume_of(model, rough, self._settings).data + left.data, rough)
+            radius = math.inf if wider else geometry.reach
+            placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
+            placed = scale_to_data(placed, data, geometry)
         self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
-        self._data = []  # the problem holds them from now on
+        self._data, self._unseen = [], []  # the problem holds them from now on

@@ -162,28 +162,6 @@ def slab(rows: int, side: int, count: int, views: int) -> tuple[F32, Geometry]:
 
 @pytest.mark.bench
 @pytest.mark.timeout(1800)
-def test_a_new_view_is_in_the_model_within_a_second() -> None:
-    """From the arrival of a view to the end of the slice of fitting that follows, at 256² and 50k Gaussians."""
-    warm_up()
-    data, geometry = slab(256, 256, 20_000, 40)
-    model = StreamingFit(geometry, gaussians=50_000, now=two_cores)
-    took = []
-    for view in range(40):
-        begin = two_cores()
-        model.add_views(data[view : view + 1], geometry.angles[view : view + 1])
-        model.advance(0.25)  # as `recon --follow` does between two looks at the file
-        took.append(two_cores() - begin)
-    started = [seconds for seconds in took if seconds > 0.2]
-    steps, count = model.progress().step, model.progress().n_gaussians
-    print(
-        f"\nview to model: median {np.median(started):.2f} s, p95 {np.percentile(started, 95):.2f} s, largest "
-        f"{max(started):.2f} s; {steps} steps, {count} Gaussians"
-    )
-    assert np.median(started) < 2
-
-
-@pytest.mark.bench
-@pytest.mark.timeout(1800)
 def test_the_volume_is_there_soon_after_the_last_view() -> None:
     """180 views a second apart, 16 rows of 256: until the last round leaves no more than a fit to all views does."""
     warm_up()

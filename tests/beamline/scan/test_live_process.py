@@ -244,6 +244,23 @@ def test_after_a_stopped_scan_the_volume_comes_soon(tmp_path: Path, monkeypatch:
     assert [event.data["output"] for event in ran.of("recon_done")] == [str(ran.folder / "recon.h5")]  # type: ignore[operator]
 
 
+def test_the_time_to_the_volume_of_a_stopped_scan_counts_from_the_signal() -> None:
+    seconds = 1e6
+    stop = StopRequest(lambda: seconds)
+    stop.stop()
+    seconds += module.LAST_ROUND - 1  # what the scan took to end
+    ends = module.gives_up(stop, useless=False)
+    stop.stop("again, by another signal")
+    assert not ends() and module.gives_up(stop, useless=True)()
+    seconds += 1
+    assert ends()
+    late = StopRequest(lambda: seconds)
+    ends = module.gives_up(late, useless=False)  # the scan is complete
+    assert not ends() and late.seconds == 0
+    late.stop()
+    assert ends()
+
+
 def test_a_scan_with_enough_views_waits_for_its_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LAST_ROUND", 0.0)
     fits = """

@@ -10,9 +10,12 @@ import pytest
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
 from recon.splatting import optimise as fit
+from recon.splatting import stream
 from recon.splatting.density_control import DensityPolicy
+from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
 from recon.splatting.settings import FitSettings
+from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -116,6 +119,71 @@ def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_e
     fractions = [fraction for _, fraction in taken]
     assert fractions == sorted(fractions) and abs(fractions[0] - rates[-1]) < 0.02 and fractions[-1] > 0.95
     assert all(view is None for view, _ in taken)
+
+
+def test_a_view_that_has_come_is_learnt_by_the_next_step(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[int | None] = []
+    step = fit.step
+
+    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
+        taken.append(view)
+        return step(state, problem, settings, fraction, view)
+
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=StepClock())
+    model.add_views(data[:20], ANGLES[:20])
+    model.advance(0.1)
+    monkeypatch.setattr(fit, "step", spy)
+    model.add_views(data[20:23], ANGLES[20:23])
+    model.add_views(data[23:24], ANGLES[23:24])
+    model.advance(0.2)
+    assert taken[:4] == [20, 21, 22, 23]
+    taken.clear()
+    model.replace_views(data[:12], ANGLES[:12])  # of others, some of which no step had learnt
+    model.add_views(data[12:13], ANGLES[12:13])
+    model.advance(0.1)
+    assert taken[0] == 12
+
+
+def test_a_large_volume_is_placed_from_a_coarser_one(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    def placed() -> tuple[Gaussians, int]:
+        model = StreamingFit(VIEWS, GRID, 0, gaussians=500, now=StepClock())
+        model.add_views(data, ANGLES)
+        model.advance(0.0)
+        assert model.gaussians is not None
+        return model.gaussians, model._placed
+
+    monkeypatch.setattr(fit, "step", lambda *_: None)
+    whole, n = placed()
+    monkeypatch.setattr(stream, "_PLACED_FROM", GRID.shape[0] * GRID.shape[1] * GRID.shape[2] // 8)
+    rough, m = placed()
+    assert n == m == 500
+    assert float(rough.scales.min()) > float(whole.scales.min())  # half a voxel, at least
+    left = [np.linalg.norm(project(g, VIEWS).numpy() - data) / np.linalg.norm(data) for g in (whole, rough)]
+    assert left[1] < 1.2 * left[0] < 0.4, left
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_second_placement_gains_by_what_the_model_knows(
+    data: np.ndarray, phantom: Phantom, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order, first = np.argsort(np.arange(40) * 0.618 % 1).argsort(), StreamingFit._place_first
+    truth, placements = phantom.attenuation(GRID), list[bool]()
+
+    def quality(seed: int, knows: bool) -> float:
+        def place(model: StreamingFit, known: fit.FitState | None = None) -> None:
+            placements.append(known is not None)
+            first(model, known if knows else None)
+
+        monkeypatch.setattr(StreamingFit, "_place_first", place)
+        model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=StepClock())
+        for views, seconds in ((order[:8], 1.4), (order[8:12], 3.0)):
+            model.add_views(data[views], ANGLES[views])
+            model.advance(seconds)
+        return psnr(truth, model.snapshot().data)
+
+    knows, forgets = (np.mean([quality(seed, known) for seed in (0, 1)]) for known in (True, False))
+    assert placements == [False, True] * 4
+    assert knows > forgets + 0.2
 
 
 def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phantom: Phantom) -> None:
