@@ -155,6 +155,10 @@ class ScanCorrection:
         self._columns.add(part.air_columns)
         return part
 
+    def newest(self) -> Projections | None:
+        """Line integrals of the newest view while it waits for the next, as if none came after it."""
+        return None if self._stream is None else self._stream.provisional()
+
     @property
     def noise(self) -> str:
         """How counts become line integrals, in words; empty where they are logarithms."""

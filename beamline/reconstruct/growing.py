@@ -52,6 +52,7 @@ class ScanFollower:
         self._axis = AxisSearch(source, options.selection, warn)
         self._correction: ScanCorrection | None = None
         self._parts: list[Projections] = []  # line integrals of the views taken: what the volume grows from
+        self._early: Projections | None = None  # the newest view, in the fit already, which waits for the next one
         self._late = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
@@ -73,7 +74,7 @@ class ScanFollower:
     @property
     def n_views_taken(self) -> int:
         """Views that have fed the fit."""
-        return sum(part.view_ids.size for part in self._parts)
+        return sum(part.view_ids.size for part in self._parts) + (self._early is not None)
 
     @property
     def has_volume(self) -> bool:
@@ -106,12 +107,26 @@ class ScanFollower:
             self._fit = self._new_fit(self.axis_col)
         new = views[views >= self._taken]
         batch = new[:_BATCH]
-        part = self._correction.feed(batch, last=ended and batch.size == new.size)
-        if part is not None:
-            self._parts.append(part)
-            self._fit.add_views(part.data, self.source.angles[part.view_ids])
+        self._feed(batch, last=ended and batch.size == new.size)
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
+
+    def _feed(self, frames: NDArray[np.int64], last: bool) -> None:
+        """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
+        assert self._correction is not None and self._fit is not None
+        part = self._correction.feed(frames, last=last)
+        if part is not None:
+            self._parts.append(part)
+            data, views, early = part.data, part.view_ids, self._early
+            if early is not None:
+                if not np.array_equal(data[0], early.data[0]):
+                    self._fit.replace_newest(data[0])
+                data, views, self._early = data[1:], views[1:], None
+            if views.size:
+                self._fit.add_views(data, self.source.angles[views])
+        if self._early is None and (newest := self._correction.newest()) is not None:
+            self._early = newest
+            self._fit.add_views(newest.data, self.source.angles[newest.view_ids])
 
     def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of the selection, by their place among all views that were taken, which later frames do not change."""
@@ -163,6 +178,7 @@ class ScanFollower:
         fit = options.streaming.stream(template, options.seed, self._clock.now)
         for part in self._parts:
             fit.add_views(part.data, self.source.angles[part.view_ids])
+        self._early = None
         return fit
 
     def _correct_again(self, usable: UsableViews) -> None:
@@ -206,7 +222,7 @@ class ScanFollower:
 
     def ask_whether_enough(self) -> None:
         """Where there is a goal, say what the views to come would add, and once that the views so far are enough."""
-        if self._enough is None or self._fit is None or self._fit.n_views < self._enough.next_look:
+        if self._enough is None or sum(part.view_ids.size for part in self._parts) < self._enough.next_look:
             return
         try:
             taken = [part.view_ids for part in self._parts]
@@ -244,6 +260,8 @@ class ScanFollower:
         """
         usable = checked_views(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
+        if self._early is not None:  # it was stopped: no other view comes
+            self._feed(np.empty(0, np.int64), last=True)
         if usable.jumps.size:
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "

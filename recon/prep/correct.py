@@ -164,6 +164,16 @@ class Correction:
         """The newest view waits for the one after it."""
         return self._waiting is not None
 
+    def provisional(self) -> Projections | None:
+        """Line integrals of the view that waits, as if none came after it; None where none waits. It goes on waiting:
+        only its two neighbours tell all its zingers."""
+        if self._waiting is None:
+            return None
+        waiting, before = self._waiting, self._before
+        found = self.line_integrals(None)
+        self._waiting, self._before = waiting, before
+        return found
+
     @property
     def air_columns(self) -> tuple[int, int]:
         """(left, right) columns of air, as far as the views surveyed tell; (0, 0) for none."""

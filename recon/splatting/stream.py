@@ -169,6 +169,26 @@ class StreamingFit:
             self._state.drawn, self._state.mean, self._schedule_step = [], None, self._state.step
             self._unseen = []
 
+    def replace_newest(self, data: F32) -> None:
+        """Other line integrals [row, col] of the newest view: its correction has changed.
+
+        Raises:
+            ValueError: as `add_views`, or there is no view; nothing is changed.
+        """
+        if not self._angles:
+            raise ValueError("there is no view to replace")
+        theta = np.asarray(self._angles)
+        images = arrivals.checked(np.asarray(data)[None], theta[-1:], self._template.detector_shape)
+        if self._problem is None:
+            self._data[-1:] = images
+            return
+        problem = self._problem
+        others = replace(
+            problem, geometry=self._template.at(theta[:-1]), images=problem.images[:-1],
+            target_maps=problem.target_maps[:-1], weights=problem.weights[:-1],
+        )  # fmt: skip
+        self._problem = extend(others, images, theta[-1:])
+
     def move_axis(self, axis_col: float) -> None:
         """Move the rotation axis. The model moves to where the views have it about the new axis, and stays.
 

@@ -276,11 +276,31 @@ def test_nothing_is_corrected_twice_where_all_references_came_first(
         return part
 
     monkeypatch.setattr(Correction, "line_integrals", count)
+    monkeypatch.setattr(Correction, "provisional", lambda self: None)  # a first look at the newest view apart
     clock = ScanClock()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     selection = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air=(3, 3)))
     follow(_options(tmp_path, selection=selection), lambda event: None, clock, RHYTHM)
     assert len(corrected) == 30 and len(set(corrected)) == 30
+
+
+def test_the_newest_view_does_not_wait_for_the_next_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, fed, arrived = ScanClock(), dict[int, float](), dict[int, float]()
+    add, append = StreamingFit.add_views, NXtomoWriter.append
+
+    def taken(model: StreamingFit, data: np.ndarray, angles: Any) -> None:
+        add(model, data, angles)
+        fed.update({model.n_views - 1 - k: clock.time for k in range(len(data))})
+
+    def written(writer: NXtomoWriter, frame: Frame, *rest: Any) -> None:
+        append(writer, frame, *rest)
+        arrived[frame.index - 4] = clock.time
+
+    monkeypatch.setattr(StreamingFit, "add_views", taken)
+    monkeypatch.setattr(NXtomoWriter, "append", written)
+    _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), period=2.0)
+    follow(_options(tmp_path), lambda event: None, clock, RHYTHM)
+    assert max(fed[view] - arrived[view] for view in range(30)) < RHYTHM.slice + RHYTHM.poll + 10 * TICK
 
 
 def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) -> None:

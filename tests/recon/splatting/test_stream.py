@@ -244,6 +244,22 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
         model.finish(0.1)
 
 
+def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
+    model = StreamingFit(VIEWS, GRID, gaussians=500, now=StepClock())
+    for first, last in ((0, 5), (5, 21), (21, 22)):  # before and after there is a model
+        model.add_views(data[first:last], ANGLES[first:last])
+        model.replace_newest(data[last - 1] + 1)
+        model.replace_newest(data[last - 1])
+        model.advance(0.0)
+    assert model.started and model._problem is not None and model.n_views == 22
+    np.testing.assert_allclose(model._problem.projections, data[:22], atol=1e-5)
+    np.testing.assert_allclose(model._problem.geometry.angles, ANGLES[:22])
+    with pytest.raises(ValueError, match="no view to replace"):
+        StreamingFit(VIEWS, GRID).replace_newest(data[0])
+    with pytest.raises(ValueError, match="nothing was changed"):
+        model.replace_newest(np.full(SHAPE, np.nan, np.float32))
+
+
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="coarse=2 begins a fit on binned pixels"):
         StreamingFit(VIEWS, GRID, settings=FitSettings(coarse=2))
