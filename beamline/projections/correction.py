@@ -157,7 +157,8 @@ class ScanCorrection:
 
     def newest(self) -> Projections | None:
         """Line integrals of the newest view while it waits for the next, as if none came after it."""
-        return None if self._stream is None else self._stream.provisional()
+        part = None if self._stream is None else self._stream.provisional()
+        return None if part is None else self._retrieved(part, None)
 
     @property
     def noise(self) -> str:

@@ -4,8 +4,8 @@ The first Gaussians come from an FBP of the first well-spread views; where there
 model's volume and an FBP of what it leaves of the views, when these have grown by half. From then on the model stays:
 each time the views have grown by half, a new round makes room for more Gaussians, which density control clones and
 splits where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any number of steps
-to come (`anytime`): a view that has come is learnt by the very next step, every third of the others takes one of the
-newest views, the rest replay all of them evenly (`arrivals`).
+to come (`anytime`): the step after its arrival learns a view, every third of the others takes one of the newest,
+the rest replay all of them evenly (`arrivals`).
 """
 
 from __future__ import annotations
