@@ -18,6 +18,7 @@ from recon.voxels.projector import project
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
 _LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
+_AS_EVEN = 1e-3  # by which the mass may vary more, of itself: noise grows, too
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
 
 
@@ -44,9 +45,15 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     The paths are those through what is brighter than the middle between matter and air; the next round's volume is of
     views corrected by the last curve, until it stays (after Krumm, Kasperl & Franz 2008, NDT & E Int. 41, 242).
 
+    A sample that is denser outside than inside looks the same in any one view. But all views of a row hold the same
+    mass (the first of the Helgason-Ludwig conditions), and a curve that is none of the beam's spoils that.
+
     Raises:
-        NoCurveError: the sample is not of one material, or the curve does not settle.
+        NoCurveError: the sample is not of one material, the curve does not settle or makes masses differ more, or the
+            beam is a cone, of which views need not hold the same mass.
     """
+    if geometry.is_cone:
+        raise NoCurveError("that takes a parallel beam, whose views all hold the same mass: state material and beam")
     n, rows, cols = views.shape
     factor = max(1, min(round(cols / _COLS), rows))
     some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
@@ -60,8 +67,23 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
         clear = (paths == 0) | (paths > _RIM * grid.voxel_size)
         curve, explained = curve_of_paths(seen[clear], paths[clear], highest)
         meant = float(np.interp(highest, curve.seen, curve.meant))
-        if abs(meant - before) < _SETTLED * meant:
-            return curve, explained
+        settled = abs(meant - before) < _SETTLED * meant
         before, now = meant, seen.copy()
         curve.linearise(now)
+        if settled:
+            uneven, after = _unevenness(seen), _unevenness(now)
+            if after > uneven + _AS_EVEN:
+                raise NoCurveError(
+                    f"corrected views agree less with each other: their mass varies by {after:.2%} instead of "
+                    f"{uneven:.2%}, as where a sample is denser outside"
+                )
+            return curve, explained
     raise NoCurveError(f"the curve does not settle in {_ROUNDS} rounds")
+
+
+def _unevenness(views: F32) -> float:
+    """How much the mass of a row varies from view to view, as a share: the median over the rows that hold some."""
+    mass = views.sum(axis=2, dtype=np.float64)
+    mean = mass.mean(axis=0)
+    filled = mean > 0.1 * mean.max()
+    return float(np.median(mass.std(axis=0)[filled] / mean[filled]))

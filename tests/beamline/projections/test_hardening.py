@@ -56,3 +56,13 @@ def test_one_energy_and_two_materials_are_left_as_they_are() -> None:
     two = Phantom.of((Cylinder(34.0, 8.0, 0.01), Cylinder(6.0, 8.0, 0.1, centre=(15.0, 8.0, 0.0))))
     curve, said = curve_of(_views(two), GEOMETRY, Hardening("fit"))
     assert curve is None and "not determined by the views (thickness explains" in said
+
+
+def test_a_body_denser_outside_is_no_hardening_and_a_cone_takes_a_stated_beam() -> None:
+    shell = Phantom.of((Box((60.0, 40.0, 8.0), 0.03), Box((48.0, 28.0, 8.0), -0.012)))
+    curve, said = curve_of(_views(shell, (30.0,)), GEOMETRY, Hardening("fit"))
+    assert curve is None and "agree less with each other" in said, said
+    cone = Geometry.cone(GEOMETRY.angles, SHAPE, 1.0, 400.0, 500.0, 49.5)
+    curve, said = curve_of(_views(ROD), cone, Hardening("fit"))
+    assert curve is None and "takes a parallel beam" in said
+    assert curve_of(_views(ROD), cone, STATED)[0] is not None
