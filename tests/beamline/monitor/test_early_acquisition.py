@@ -11,6 +11,8 @@ from beamline.monitor.check import Flag, Level, ScanContext
 from simulators.scenes.scene import load_scene
 from tests.bench.monitor_scenes import SATURATION, seen
 
+pytestmark = pytest.mark.slow
+
 SIDE = 256  # pixels: half of the scene's, twice as large
 
 

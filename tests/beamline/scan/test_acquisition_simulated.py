@@ -76,6 +76,7 @@ class FaultyInstrument:
             assert frame.angle == pytest.approx(self.line.angle_at(frame.time), abs=2 * math.pi / 36000)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(PULSES, PULSES, PULSES)
 @example(set(), {0, 17, 18, 19}, {16, 17, 18, 19})

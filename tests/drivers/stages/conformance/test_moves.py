@@ -108,6 +108,7 @@ def test_a_wait_that_is_too_short_says_so_and_leaves_it_moving(bench: StageBench
     assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
 
 
+@pytest.mark.slow
 def test_a_thousand_relative_moves_of_a_third_of_a_degree_land_on_exact_counts(kind: Kind, bench: StageBench) -> None:
     """A third of a degree is no whole count; no move may add another rounding, up, down, or at the turns."""
     stage = bench.stage
