@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,9 +53,13 @@ class Taken:
     shift: int = 0
     off: float = 0.0
 
+    def miss(self, triggers: Iterable[int]) -> None:
+        """These gave no frame. One that gave a frame before, perhaps without beam, keeps that one."""
+        self.missing += [trigger for trigger in triggers if trigger not in self.rows]
+
     def enter(self, account: Account, first: int) -> None:
         """Add a pass whose first trigger is `first`."""
-        self.missing += [first + i for i in account.missing]
+        self.miss(first + i for i in account.missing)
         self.lost += account.lost
         self.ignored += account.ignored
         self.extra += len(account.extra)
@@ -185,12 +189,12 @@ class Exposures:
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         ends, firsts = pass_ends(block), np.cumsum([0, *(train.n for train in block.trains)])
         i = 0
-        while (i := self._next(i, block, taken)) < block.n:  # within a pass only after a pause
+        while (i := self._next(i, block, taken)) < block.n and not self._stop.stopping:  # in a pass only after a pause
             k = int(np.searchsorted(firsts, i, "right")) - 1
             train, (start, end), done = block.trains[k], ends[k], i - int(firsts[k])
             self._supervision.states.enter(State.TAXI)
             begin = start + float(block.angles[i] - block.angles[firsts[k]])
-            if self._stop.stopping or not self.go(begin):
+            if not self.go(begin):
                 return
             ahead = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
             i += yield from self._pass(block, taken, ahead, i, (begin, end))
@@ -317,7 +321,7 @@ class Exposures:
                 silent = 0
                 yield frame, i, position
                 continue
-            taken.missing.append(i)
+            taken.miss([i])
             silent += 1
             if silent == SILENT_EXPOSURES:
                 raise InstrumentError(
