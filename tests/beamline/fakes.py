@@ -264,7 +264,11 @@ class Camera:
                 return self._take(self.ring[0])
             if now >= deadline:
                 raise DeviceTimeout(self.name, f"no frame within {timeout} s")
-            clock.sleep(min(deadline - now, 0.01))
+            due = [time for time, _ in self.instrument.stage.pulses if time > now]
+            due += [frame.time + delay for frame in self.ring[:1]]
+            # It looks every 10 ms; looks that would see nothing are left out.
+            looks = math.ceil((min([deadline, *due]) - now) / 0.01)
+            clock.sleep(min(deadline - now, 0.01 * max(1, looks)))
 
     def _take(self, frame: Exposed) -> CameraFrame:
         if self.instrument.faults.errors.get(frame.number, 0) > 0:
